@@ -63,8 +63,8 @@ docs: $(READY) ## write the pages that are generated from the code, and build th
 	@$(VENV)/bin/python -m sphinx -W --keep-going -q docs build/docs
 	@if [ -d build/web ]; then mkdir -p build/docs/web && cp -r build/web/. build/docs/web; fi
 
-web: $(READY) ## build the page that samples in the browser, in build/web; needs Node.js; CKPT=MODEL for another model than the package's
-	@$(VENV)/bin/python tools/web.py $(CKPT)
+web: $(READY) ## build the page that samples in the browser, in build/web; needs Node.js; CKPT=MODEL for another model than the package's; STREAM=MODEL for the page with a stream
+	@$(VENV)/bin/python tools/web.py "$(CKPT)" $(STREAM)
 
 blender: $(READY) ## build the extension of Blender in build/; PLATFORM=windows-x64, macos-arm64 or linux-x64, default: this machine
 	@$(VENV)/bin/python tools/blender.py $(PLATFORM)

@@ -43,6 +43,12 @@ def joints_of(motion: dict[str, Any]) -> np.ndarray:
     return np.array(motion["center"]) + packed * motion["step"]
 
 
+def root(block: dict[str, Any], frame: int) -> tuple[float, float]:
+    """Returns x and z of the root in a frame of a block."""
+    x, _, z = joints_of(block["motion"])[frame, 0].tolist()
+    return x, z
+
+
 def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were_not_shown(model):
     live = LiveStreams(model)
     first = live.block("", WALK, 0)
@@ -99,6 +105,25 @@ def test_a_stream_computes_no_more_blocks_than_anybody_can_watch(model):
     assert live.block(name, WALK, 240)["from"] == 240
 
 
+def test_a_block_leads_along_way_points_and_says_when_they_are_reached(model):
+    live = LiveStreams(model)
+    first = live.block("", WALK, 0)
+    name, here = first["stream"], root(first, -1)
+    block = live.block(name, WALK, 30, [here, (50.0, 50.0)])
+    assert block["reached"] == [30]
+    assert live.block(name, WALK, 60, [(50.0, 50.0)])["reached"] == []
+    assert live.block(name, WALK, 45, [root(block, 14)])["reached"] == [45]
+    with pytest.raises(UserError, match="give x and z in meters"):
+        live.block(name, WALK, 75, [(float("nan"), 0.0)])
+    assert live.block(name, WALK, 75)["from"] == 75
+
+
+def test_visitors_lead_the_person_if_the_model_walks(model, monkeypatch):
+    assert LiveStreams(model).can_lead
+    monkeypatch.setattr(making, "WALK", " ")
+    assert not LiveStreams(model).can_lead
+
+
 def test_the_last_minute_is_kept(model, monkeypatch):
     monkeypatch.setattr(making, "KEPT", 2.0)
     live = LiveStreams(model)
@@ -124,7 +149,8 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
         block = client.post("/live", json=call).json()
         assert (block["from"], block["frames"]) == (0, 30)
         name = block["stream"]
-        assert client.post("/live", json={**call, "stream": name, "begin": 30}).json()["from"] == 30
+        second = client.post("/live", json={**call, "stream": name, "begin": 30}).json()
+        assert second["from"] == 30
         assert client.get(f"/live.bvh?stream={name}").content.startswith(b"HIERARCHY")
         writers.waiting = WAITING_FILES
         busy = client.get(f"/live.bvh?stream={name}")
@@ -139,8 +165,19 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
             {"begin": -1},
             {"begin": "0"},
             {"file": "/etc/passwd"},
+            {"path": [[0.0, 1.0]] * 17},
+            {"path": [[0.0, 1.0, 2.0]]},
+            {"path": [["0", 1.0]]},
+            {"path": [[1e5, 1.0]]},
         ):
             assert client.post("/live", json=call | wrong).status_code == 400
+        nan = json.dumps(call | {"path": [[float("nan"), 0.0]]})
+        headers = {"Content-Type": "application/json"}
+        refused = client.post("/live", content=nan, headers=headers)
+        assert (refused.status_code, refused.text) == (400, "this is not a request of this page")
+        path = {"stream": name, "begin": 60, "path": [root(second, -1)]}
+        led = client.post("/live", json=call | path)
+        assert led.json()["reached"] == [60]
         unknown = client.post("/live", json=call | {"stream": "0" * 32})
         assert unknown.json() == {
             "error": "this stream has ended. Reload the page to begin another one"

@@ -1,5 +1,8 @@
 """Streams: blocks join, depend on texts and seed alone, and `generate` with the same model is a cut of a stream."""
 
+import json
+import math
+import shutil
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -7,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.fixtures import ROOT
+from support.npm import node
 from support.runs import TINY_DIP, untrained
 from torch import Tensor
 
@@ -26,6 +31,7 @@ from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
 from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 from flame_mdm.sampling.targets import errors, read_targets
+from flame_mdm.sampling.way_points import bends
 
 CONTEXT, BLOCK, FPS = 10, 30, 20.0
 
@@ -446,3 +452,123 @@ def test_a_condition_ends_in_the_frame_before_the_next_one():
     schedule.add(5, "a person jumps")
     assert [schedule.until_change(frame) for frame in (0, 3, 4, 5)] == [5, 2, 1, None]
     assert [schedule.at(frame) for frame in (4, 5)] == ["a person walks", "a person jumps"]
+
+
+# Way points -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def walking() -> MotionGenerator:
+    """A tiny model with random weights, whose motions are almost a person who glides forward at 1 m/s."""
+    return gliding(0.05)
+
+
+def gliding(step: float) -> MotionGenerator:
+    model = built()
+    still = standing(model.representation, CONTEXT).features[0]
+    model.representation.mean.copy_(torch.from_numpy(still))
+    model.representation.mean[2] = step
+    model.representation.std.fill_(0.005)
+    return model
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [(1.5, 1.0), (0.0, 3.0)],
+        # behind the person, and inside the narrowest circle that a walk describes
+        [(0.0, -2.0)],
+        [(0.5, 0.0)],
+    ],
+)
+def test_the_person_passes_way_points_in_order(walking, points):
+    running = stream(walking, "a person walks")
+    running.lead(points)
+    places = joints(islice(running, 7))[:, 0, [0, 2]]
+    assert len(running.reached) == len(points)
+    assert running.reached == sorted(running.reached)
+    for frame, point in zip(running.reached, points, strict=True):
+        assert np.linalg.norm(places[frame] - point) < 0.3
+    free = joints(islice(stream(walking, "a person walks"), 7))[:, 0, [0, 2]]
+    assert np.linalg.norm(free - points[0], axis=1).min() > 0.4
+
+
+def test_the_way_bends_no_more_than_feet_allow():
+    rng = np.random.default_rng(0)
+    for speed in (0.0, 0.01, 0.06):
+        steps = [(0.0, speed)] * 40
+        for goal in rng.uniform(-4, 4, (20, 2)).tolist():
+            added = bends([0.0] * 40, steps, 0.0, (0.0, 0.0), [tuple(goal)], FPS)
+            assert np.abs(added).max() <= min(1.3 / FPS, speed / 0.7) + 1e-9
+
+
+def test_a_person_who_stands_does_not_turn_to_a_way_point():
+    still = gliding(0.0)
+    free, led = stream(still, "a person stands"), stream(still, "a person stands")
+    led.lead([(-2.0, 0.0)])
+    places = [next(free).joints for free in (free, led)]
+    assert np.abs(places[0] - places[1]).max() < 0.2
+    assert led.reached == []
+
+
+def test_way_points_change_later_blocks_alone_and_are_ahead_again_after_going_back(walking):
+    plain, led = stream(walking, "a person walks"), stream(walking, "a person walks")
+    assert np.array_equal(next(plain).joints, next(led).joints)
+    led.lead([(0.2, 2.4)])
+    blocks = [next(led) for _ in range(2)]
+    (frame,) = led.reached
+    led.go_back((frame - 3) / FPS)
+    assert led.reached == []
+    next(led)
+    assert len(led.reached) == 1
+    led.lead([])
+    assert not np.allclose(next(plain).joints, blocks[0].joints, atol=1e-2)
+    assert not led.reached
+
+
+@pytest.mark.parametrize(
+    "point", [(1.0,), (1.0, 2.0, 3.0), (np.nan, 0.0), (np.inf, 0.0), (2e4, 0.0), ("1", 0.0)]
+)
+def test_way_points_are_two_numbers(walking, point):
+    running = stream(walking, "a person walks")
+    with pytest.raises(UserError, match=r"way point .*: give x and z in meters"):
+        running.lead([point])
+
+
+def test_every_way_point_is_reached_at_any_speed():
+    rng = np.random.default_rng(1)
+    turns = [0.0] * BLOCK
+    for speed in (0.02, 0.05, 0.15):
+        steps = [(0.0, speed)] * BLOCK
+        for goal in [(0.0, -1.0), (0.4, 0.0), *rng.uniform(-4, 4, (10, 2)).tolist()]:
+            heading, x, z, nearest = 0.0, 0.0, 0.0, math.inf
+            for _ in range(20):
+                for bend in bends(turns, steps, heading, (x, z), [(goal[0], goal[1])], FPS):
+                    x += speed * math.sin(heading)
+                    z += speed * math.cos(heading)
+                    heading += bend
+                    nearest = min(nearest, math.dist((x, z), goal))
+            assert nearest < 0.3, (speed, goal)
+
+
+@pytest.mark.tools
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+def test_the_web_page_bends_the_way_in_the_same_manner(tmp_path):
+    rng = np.random.default_rng(2)
+    cases = [
+        (
+            rng.normal(0, 0.03, BLOCK).tolist(),
+            rng.normal((0, speed), 0.01, (BLOCK, 2)).tolist(),
+            float(rng.uniform(-4, 4)),
+            rng.uniform(-3, 3, 2).tolist(),
+            rng.uniform(-3, 3, (rng.integers(1, 5), 2)).tolist(),
+            FPS,
+        )
+        for speed in (0.0, 0.02, 0.06, 0.15)
+        for _ in range(20)
+    ]
+    shutil.copy(ROOT / "tools/web/way_points.js", tmp_path)
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    (tmp_path / "cases.json").write_text(json.dumps(cases))
+    theirs = node("web_way_points.mjs", tmp_path)
+    np.testing.assert_allclose(theirs, [bends(*case) for case in cases], rtol=0, atol=1e-12)

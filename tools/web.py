@@ -51,6 +51,7 @@ from flame_mdm.formats.posture import TOES
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_npz, write_json, write_text
+from flame_mdm.sampling.streams import check_streams
 from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
 from flame_mdm.visualize.render import thumbnail
@@ -64,32 +65,47 @@ RUNTIME, INTEGRITY = (
 )
 """The npm package and the SHA-512 of its archive."""
 RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
+STREAM = "stream"  # folder of the model of the stream, if it is another one than of single motions
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
 )
 
 
-def build(model: MotionGenerator, out: Path) -> None:
-    """Writes the page of a model.
+def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None = None) -> None:
+    """Writes the page of a model, and the page with a stream.
 
-    The model must have a learned text encoder, captions of single actions and SMPL's 22 joints.
+    The models must have a learned text encoder, captions of single actions and SMPL's 22 joints.
+
+    Args:
+        model: the model of single motions.
+        out: the folder.
+        streaming: the model of the stream, which continues frames. Default: `model`, if it
+            continues frames; otherwise there is no page with a stream.
 
     Raises:
-        UserError: If the model's captions do not name single actions, or onnxruntime-web cannot be fetched.
+        UserError: If a model's captions do not name single actions, `streaming` does not continue frames, or
+            onnxruntime-web cannot be fetched.
     """
-    if not reading.Reader.fits(model.facts):
-        experiment = model.config["experiment"]
-        raise UserError(
-            f"{experiment}: its captions do not name single actions. Use a model like quickstart"
-        )
-    write_folder(model, out, half=True)
-    (out / "runner.py").unlink()
+    check_captions(model)
+    write_model(model, out)
+    stream = "" if model.denoiser.context_frames else None
+    if streaming is not None:
+        check_captions(streaming)
+        check_streams(streaming)
+        write_model(streaming, out / STREAM)
+        stream = f"{STREAM}/"
     for path in (*SOURCE.iterdir(), *LIVE):
         shutil.copy(path, out)
+    if stream is None:
+        (out / "live.html").unlink()
+    # Folder of the model of the stream, null without one
+    write_text(out / "models.js", f"export const STREAM = {json.dumps(stream)};\n")
     write_text(out / "schema.js", f"export const SCHEMA = {json.dumps(SCHEMA)};\n")
     fetch_runtime(out / "ort")
     write_language(out)
-    write_pictures(out, abilities.Abilities(model.facts).actions)
+    models = [model] if streaming is None else [model, streaming]
+    known = [action for entry in models for action in abilities.Abilities(entry.facts).actions]
+    write_pictures(out, list(dict.fromkeys(known)))
     example = flame_mdm.generate(model, model.facts["captions"][0])[0]
     for ending in ("glb", "fbx"):
         example.save(out / f"template.{ending}")
@@ -105,6 +121,21 @@ def build(model: MotionGenerator, out: Path) -> None:
     for name, content in (("player.css", style), ("player.js", code), ("player.html", page)):
         write_text(out / name, content)
     write_json(out / "figure.json", figure(example) | {"motion": json.loads(data)[0]}, indent=None)
+
+
+def check_captions(model: MotionGenerator) -> None:
+    """Raises `UserError` if the captions of a model do not name single actions."""
+    if not reading.Reader.fits(model.facts):
+        experiment = model.config["experiment"]
+        raise UserError(
+            f"{experiment}: its captions do not name single actions. Use a model like quickstart"
+        )
+
+
+def write_model(model: MotionGenerator, folder: Path) -> None:
+    """Writes the graphs of a model and `model.json`."""
+    write_folder(model, folder, half=True)
+    (folder / "runner.py").unlink()
 
 
 def write_language(out: Path) -> None:
@@ -239,8 +270,9 @@ def fetch_runtime(folder: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        name = sys.argv[1] if len(sys.argv) > 1 else "quickstart"
-        build(flame_mdm.load(name), Path("build/web"))
+        name, streaming = (*sys.argv[1:], "", "")[:2]
+        single = flame_mdm.load(name or "quickstart")
+        build(single, Path("build/web"), flame_mdm.load(streaming) if streaming else None)
         say("written: build/web. To see it: python3 -m http.server -d build/web")
     except UserError as error:
         say(f"error: {error}", error=True)

@@ -29,6 +29,7 @@ from flame_mdm.generator import FADE, MotionGenerator
 from flame_mdm.processes import Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.progress import ProgressBar
+from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import atomic_folder, sha256, write_json
 from flame_mdm.sampler_options import SamplerOptions
@@ -112,6 +113,8 @@ def description(model: MotionGenerator) -> dict[str, Any]:
             "begin": pose.start,
             "end": pose.stop,
         }
+        if isinstance(representation, HumanML):
+            context["root"] = root_units(representation)
     content = {
         "format": FORMAT,
         "experiment": model.config["experiment"],
@@ -140,6 +143,19 @@ def description(model: MotionGenerator) -> dict[str, Any]:
             f"{wrong[0]}: not within the limits of an exported model, which docs/export.md lists"
         )
     return content | {"sha256": {}}
+
+
+def root_units(representation: HumanML) -> list[list[float]]:
+    """Returns the mean and standard deviation of each of the first three features.
+
+    They are the turn of the root in radians, and its steps to the left and forward in meters.
+    """
+    scale = representation.mean.new_ones(3)
+    scale[0] = representation.turn_unit
+    scale[1:] /= representation.units_per_metre
+    return torch.stack(
+        [representation.mean[:3] * scale, representation.std[:3] * scale], 1
+    ).tolist()
 
 
 class Probe:

@@ -99,6 +99,7 @@ SCHEMA = _object(
         begin=_number(0, 2000),
         end=_number(0, 2000),
     ),
+    root=_array(_array(_number(-1e9, 1e9, "number"), 2, 2), 3, 3),
     skeleton=_object(
         ["joints", "parents", "feet"],
         joints=_array({"type": "string"}, 1000, 1),

@@ -141,7 +141,9 @@ def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
         waiting += 1
         try:
             call = LiveCall.model_validate_json(await web.body())
-            content = await run_in_threadpool(live.block, call.stream, call.text, call.begin)
+            content = await run_in_threadpool(
+                live.block, call.stream, call.text, call.begin, call.path
+            )
             return JSONResponse(content)
         except NotUnderstood as error:
             return JSONResponse({"error": error.message, "nearest": list(error.nearest)}, 400)

@@ -1,10 +1,14 @@
-// A stream of motion on a page: clock, buffer, texts. A source makes the blocks: a server, or a worker on the visitor's device.
+// A stream of motion on a page: clock, buffer, texts, way points. A source makes the blocks: a server, or a worker on the visitor's device.
 const AHEAD = 1; // seconds that are left when the next block is asked for
-const SLOW = 0.3; // seconds that are left when the clock begins to slow down
+const SLOW = 0.15; // seconds that are left when the clock begins to slow down
 const EASE = 0.15; // seconds in which the clock gets back to its speed
 const LEAD = 0.25; // least number of seconds from a new text to the first frame that follows it
 const STEP = 0.1; // longest step of the clock in seconds; a hidden page pauses the stream
 const CHIPS = 6; // texts that can be clicked again
+const TIMED = 5; // blocks whose median time tells how long the next one takes
+const MOST_POINTS = 16;
+const GOES = /\b(walk|run|jog|march|stride|stroll|skip|sneak|limp|strafe|stagger|tiptoe|crawl)(s|ing)?\b/i; // texts that way points keep
+const HINT = "Click on the floor: the person goes there";
 
 /** A clock that slows down before it reaches the end of the buffer, so that no frame is missing and none is skipped. */
 export class Clock {
@@ -28,32 +32,44 @@ export class Clock {
  * A stream in a container.
  *
  * @param container element that gets the form, the player and the buttons.
- * @param source `block({ text, from })` returns a promise of { from, frames, motion }: the frames from number `from` on,
- *   in the format of the player. `file(ending)` returns a promise of a file of the last minute.
+ * @param source `block({ text, from, path })` returns a promise of { from, frames, reached, motion }: the frames from number
+ *   `from` on, in the format of the player, which lead along the way points `path`, and the numbers of the frames that reach
+ *   the first of these. `cancel()`, if there is one, makes the promise of a block fail. `file(ending)` returns a promise of a
+ *   file of the last minute.
  * @param page `player(motion)` returns the page of the player that shows a motion; `read(text)` returns what the source
- *   reads for a text, or throws an error with the texts `nearest` in meaning; `fps`, and a first `text`.
+ *   reads for a text, or throws an error with the texts `nearest` in meaning; `fps`; a first `text`, in which the person
+ *   stands; and a text `walk` for the way to way points, null if there are none.
  */
 export class Live {
   constructor(container, source, page) {
-    Object.assign(this, { source, page, clock: new Clock(), end: 0, texts: [], text: page.text, pending: null, busy: false });
-    this.seconds = 0; // that a block takes, on average
+    Object.assign(this, { source, page, clock: new Clock(), end: 0, texts: [], text: page.text });
+    this.pending = null; // the change that was not asked for yet, or whose answer has not arrived: { text, from, entry }
+    this.busy = false; // a block is being made
+    this.times = []; // seconds that the last blocks took
+    this.points = []; // way points: { place, reached }, the number of the frame that reaches it or null
     this.log = []; // for each new text, when it was typed and when its first frame was shown
     container.innerHTML = `<form><input maxlength="300" autocomplete="off" aria-label="What the person does next"
         placeholder="What the person does next"><button>Go</button></form>
       <div class="texts" role="group" aria-label="Last texts"></div><p role="status"></p>
       <iframe title="The stream"></iframe>
       <div class="tools"><button type="button" class="pause">Pause</button>
+      <button type="button" class="clear" hidden>Clear way points</button>
       <button type="button" class="bvh">Save BVH</button><button type="button" class="glb">Save GLB</button>
       <span>of the last minute</span></div>`;
     this.find = (selector) => container.querySelector(selector);
     this.find("form").addEventListener("submit", (event) => { event.preventDefault(); this.change(this.find("input").value.trim()); });
     this.find(".pause").addEventListener("click", () => this.pause(!this.clock.paused));
+    this.find(".clear").addEventListener("click", () => this.removePoints(0, this.points.length));
     for (const ending of ["bvh", "glb"]) this.find(`.${ending}`).addEventListener("click", () => this.save(ending));
+    addEventListener("message", ({ source: sender, data }) => {
+      if (sender !== this.find("iframe").contentWindow) return;
+      if (data.floor) this.addPoint(data.floor);
+      else if (data.point !== undefined) this.removePoints(data.point, 1);
+    });
   }
 
   async start() {
-    const begin = performance.now(), block = await this.source.block({ text: this.page.read(this.text), from: 0 });
-    this.seconds = (performance.now() - begin) / 1000;
+    const block = await this.timed({ text: this.page.read(this.text), from: 0, path: [] });
     this.end = block.from + block.frames;
     const loaded = new Promise((done) => this.find("iframe").addEventListener("load", done, { once: true }));
     this.find("iframe").srcdoc = this.page.player({ ...block.motion, live: true });
@@ -72,34 +88,69 @@ export class Live {
   get fps() { return this.page.fps; }
   get frame() { return Math.floor(this.clock.time * this.fps); }
 
+  /** Seconds that a block takes: the lower median of the last ones, since the very first is slow. */
+  get seconds() { return [...this.times].sort((a, b) => a - b)[(this.times.length - 1) >> 1]; }
+
+  /** The text of the last frames, once the pending change is made. */
+  get next() { return this.pending?.text ?? this.text; }
+
+  async timed(request) {
+    const begin = performance.now(), block = await this.source.block(request);
+    this.times = [...this.times, (performance.now() - begin) / 1000].slice(-TIMED);
+    return block;
+  }
+
   advance(seconds) {
     const end = this.pending?.from ?? this.end; // frames from `from` on are about to be replaced
     this.clock.advance(seconds, (end - 1) / this.fps);
     this.send({ frame: this.frame });
     for (const entry of this.log) if (entry.from !== undefined && entry.from <= this.frame) entry.shown ??= performance.now();
-    const left = this.end / this.fps - this.clock.time;
-    if (!this.busy && (this.pending || left < this.clock.speed * Math.max(AHEAD, 1.5 * this.seconds))) this.ask();
+    const left = this.points.filter(({ reached }) => reached === null || reached > this.frame);
+    if (left.length < this.points.length) this.showPoints(left);
+    const ahead = this.end / this.fps - this.clock.time;
+    if (!this.busy && (this.pending || ahead < this.clock.speed * Math.max(AHEAD, 1.5 * this.seconds))) this.ask();
   }
 
   async ask() {
     this.busy = true;
-    const change = this.pending, from = change ? change.from : this.end, begin = performance.now();
+    const change = this.pending, from = change ? change.from : this.end;
+    // Frames that reach way points are replaced, too.
+    const path = this.points.filter(({ reached }) => reached === null || reached >= from);
+    this.isSpare = !change;
     try {
-      const block = await this.source.block({ text: this.page.read(change?.text ?? this.text), from });
-      this.seconds += 0.3 * ((performance.now() - begin) / 1000 - this.seconds);
+      const text = this.page.read(change?.text ?? this.text);
+      const block = await this.timed({ text, from, path: path.map(({ place }) => place) });
       this.end = block.from + block.frames;
       this.send({ from: block.from, motion: block.motion });
-      if (change) {
-        this.text = change.text;
-        change.entry.from = block.from;
-      }
+      path.forEach((point, k) => { point.reached = block.reached[k] ?? null; });
+      if (change) this.follow(change, block.from);
     } catch (error) {
-      this.say(error.message.split("\n")[0], error.nearest);
-      if (!change) this.pause(true);
+      if (!this.isCanceled) this.refuse(change, error);
     }
+    this.isCanceled = false;
     if (this.pending === change) this.pending = null;
     else if (this.pending) this.pending.from = Math.min(this.pending.from, this.end);
     this.busy = false;
+    if (!this.pending) this.stopAtLast();
+  }
+
+  /** Takes over the text of a change whose frames have arrived. */
+  follow({ text, entry }, from) {
+    if (text !== this.text) this.remember(text);
+    this.text = text;
+    if (entry) entry.from = from;
+  }
+
+  refuse(change, error) {
+    this.say(error.message.split("\n")[0], error.nearest);
+    if (!change) this.pause(true);
+    else if (!this.find("input").value) this.find("input").value = change.text;
+  }
+
+  /** Lets a person who goes stop where the last way point is reached. */
+  stopAtLast() {
+    const last = this.points.at(-1)?.reached ?? null;
+    if (last !== null && GOES.test(this.text)) this.replace(this.page.text, undefined, last + 1);
   }
 
   /** Changes the text from the first frame on that can still be made in time. */
@@ -112,13 +163,49 @@ export class Live {
       return;
     }
     this.say("");
-    const lead = Math.ceil(this.fps * this.clock.speed * Math.max(LEAD, 1.5 * this.seconds));
     const entry = { text, typed: performance.now() };
     this.log.push(entry);
-    this.pending = { text, from: Math.min(this.end, this.frame + 1 + lead), entry };
-    this.remember(text);
+    this.replace(text, entry);
     this.find("input").value = "";
     this.pause(false);
+  }
+
+  /** Asks for other frames from number `least` on, or from the first one on that can still be made in time. */
+  replace(text, entry = undefined, least = 0) {
+    if (this.busy && this.isSpare && this.source.cancel) {
+      this.isCanceled = true;
+      this.source.cancel();
+    }
+    // The clock does not slow down if the block takes as long as the ones before.
+    const lead = Math.ceil(this.fps * this.clock.speed * Math.max(LEAD, this.seconds + SLOW));
+    this.pending = { text, from: Math.min(this.end, Math.max(least, this.frame + 1 + lead)), entry };
+  }
+
+  /** Adds a way point; the person goes there as the text says, or walks if the text does not say that they go. */
+  addPoint(place) {
+    if (!this.page.walk) return;
+    if (this.points.length >= MOST_POINTS) {
+      this.say(`A path has at most ${MOST_POINTS} way points. Click one to remove it`);
+      return;
+    }
+    this.say("");
+    this.showPoints([...this.points, { place, reached: null }]);
+    this.reroute(GOES.test(this.next) ? this.next : this.page.walk);
+  }
+
+  removePoints(first, count) {
+    this.showPoints(this.points.filter((_, k) => k < first || k >= first + count));
+    this.reroute(this.points.length || !GOES.test(this.next) ? this.next : this.page.text);
+  }
+
+  reroute(text) {
+    this.replace(text, text === this.pending?.text ? this.pending.entry : undefined);
+  }
+
+  showPoints(points) {
+    this.points = points;
+    this.find(".clear").hidden = !points.length;
+    this.send({ points: points.map(({ place }) => place) });
   }
 
   pause(paused) {
@@ -139,7 +226,8 @@ export class Live {
   }
 
   say(text, nearest = []) {
-    this.find("[role=status]").textContent = nearest.length ? `${text}. Nearest in meaning: ` : text;
+    const shown = text || (this.page.walk ? HINT : "");
+    this.find("[role=status]").textContent = nearest.length ? `${text}. Nearest in meaning: ` : shown;
     this.find("[role=status]").append(...nearest.map((other) => this.button(other)));
   }
 

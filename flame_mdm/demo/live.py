@@ -3,7 +3,7 @@
 import secrets
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -14,6 +14,7 @@ import numpy as np
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampling.streams import Stream, read_text, stream
 from flame_mdm.visualize.player import packed_motion
 
@@ -25,6 +26,8 @@ BURST, RATE = 8.0, 2.0
 KEPT = 60.0  # duration in seconds of the part of a stream that can be downloaded
 BEFORE = 10  # number of frames before a block on which the rotations of its first frames depend
 ENDINGS = (".bvh", ".glb")
+STAND, WALK = "a person stands", "a person walks forward"
+"""First text of a stream, and its text on the way to a way point."""
 
 
 @dataclass
@@ -59,13 +62,28 @@ class LiveStreams:
         self._streams: dict[str, LiveStream] = {}
         self._working = Lock()
 
-    def block(self, name: str, text: str, begin: int) -> dict[str, Any]:
+    @property
+    def can_lead(self) -> bool:
+        """Whether the model walks, so that visitors may lead the person along way points."""
+        if not isinstance(self.model.representation, HumanML):
+            return False
+        try:
+            read_text(self.model, WALK)
+        except UserError:
+            return False
+        return True
+
+    def block(
+        self, name: str, text: str, begin: int, path: Sequence[tuple[float, float]] = ()
+    ) -> dict[str, Any]:
         """Returns the frames of a stream, starting at frame `begin`, in the format of the player.
 
         Args:
             name: name of the stream; "" = begin a new stream, whose name is in the result.
             text: description of the motion.
             begin: number of the first frame. Frames that the stream has after it are dropped.
+            path: way points that are ahead in frame `begin`, x and z in meters. `reached` in the
+                result lists the numbers of the frames in which the first way points are reached.
 
         Raises:
             UserError: If the text is not understood, the stream has ended, or a limit is reached.
@@ -75,6 +93,7 @@ class LiveStreams:
             name, live = self._opened(name, text)
             self._count(live)
             first = live.stream.frames - len(live.joints)
+            live.stream.lead(path)
             if begin != live.stream.frames:
                 live.stream.go_back(begin / self.model.representation.fps)
             if text != live.text:
@@ -87,7 +106,13 @@ class LiveStreams:
         context = before[-BEFORE:]
         joints = np.concatenate([context, block.joints])
         motion = packed_motion(Motion(joints, block.fps, block.skeleton, text), len(context))
-        return {"stream": name, "from": begin, "frames": len(block.joints), "motion": motion}
+        return {
+            "stream": name,
+            "from": begin,
+            "frames": len(block.joints),
+            "reached": live.stream.reached,
+            "motion": motion,
+        }
 
     def file(self, name: str, ending: str) -> bytes:
         """Returns a motion file of the last minute of a stream.

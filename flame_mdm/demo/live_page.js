@@ -10,8 +10,8 @@
     throw Object.assign(new Error(refusal.error), { nearest: refusal.nearest });
   };
   const source = {
-    async block({ text, from }) {
-      const headers = { "Content-Type": "application/json" }, body = JSON.stringify({ stream: name, text, begin: from });
+    async block({ text, from, path }) {
+      const headers = { "Content-Type": "application/json" }, body = JSON.stringify({ stream: name, text, begin: from, path });
       const block = await (await answered(await fetch("live", { method: "POST", headers, body }))).json();
       name = block.stream;
       return block;
@@ -26,7 +26,8 @@
       const html = await (await answered(await fetch("live.html"))).text();
       const player = (motion) => html.replace(DATA, (_, begin, end) => begin + JSON.stringify([motion]).replaceAll("<", "\\u003c") + end);
       name = "";
-      window.live = new Live(element, source, { read: (text) => text, text: "a person stands", fps: +element.dataset.fps, player });
+      const { fps, stand: text, walk = null } = element.dataset;
+      window.live = new Live(element, source, { read: (text) => text, text, walk, fps: +fps, player });
       await window.live.start();
     } catch (error) {
       element.textContent = error.message.split("\n")[0];

@@ -21,6 +21,7 @@ from flame_mdm.conditions.language.reading import NotUnderstood
 from flame_mdm.conditions.language.tables import actions
 from flame_mdm.data.synthetic import example, prompts
 from flame_mdm.demo.chips import chips
+from flame_mdm.demo.live import STAND, WALK, LiveStreams
 from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query, query_pairs
 from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text, one_line
@@ -108,7 +109,7 @@ def build_page(studio: Studio) -> gr.Blocks:
         return [_buttons(_examples(model)), samplers, _vocabulary(model)]
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
-        ui = _with_live(studio) if studio.live else _layout(studio)
+        ui = _with_live(studio, studio.live) if studio.live else _layout(studio)
         fields = [vars(ui)[name] for name in FORM]
         edit = [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
         quick: dict[str, Any] = {
@@ -153,17 +154,18 @@ def build_page(studio: Studio) -> gr.Blocks:
     return blocks
 
 
-def _with_live(studio: Studio) -> SimpleNamespace:
+def _with_live(studio: Studio, live: LiveStreams) -> SimpleNamespace:
     """Places the components of the page in a tab,
     next to the tab of the stream, and returns them.
     """
-    fps = studio.model(next(iter(studio.files))).representation.fps
+    fps = live.model.representation.fps
+    walk = f'data-walk="{WALK}"' if live.can_lead else ""
     with gr.Tabs():
         with gr.Tab("Motion"):
             ui = _layout(studio)
         with gr.Tab("Live"):
             gr.HTML(
-                f'<div id="live" class="live" data-fps="{fps:g}">'
+                f'<div id="live" class="live" data-fps="{fps:g}" data-stand="{STAND}" {walk}>'
                 '<button type="button" class="start">Begin a stream</button></div>'
             )
     return ui

@@ -156,6 +156,22 @@ class HumanML(Representation):
             / self.units_per_metre
         )
 
+    @property
+    def turn_unit(self) -> float:
+        """Radians to the left per unit of the column `turn`."""
+        return -2.0 if self.legacy else 1.0
+
+    def root_steps(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns turns (..., F) and steps (..., F, 2) of the root to the next frame.
+
+        Turns are in radians to the left. Steps are in meters, to the left of the body and forward.
+
+        Args:
+            features: (..., F, D) in the data's units.
+        """
+        turn = features[..., self.slices["turn"].start] * self.turn_unit
+        return turn, features[..., self.slices["root_velocity"]] / self.units_per_metre
+
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Equals MDM's `HML_LOWER_BODY_MASK` for the lower body, including the root."""
         part = self.joint_mask(joints)
@@ -253,7 +269,7 @@ class HumanML(Representation):
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Returns heading (..., F) and position (..., F, 3) of the root in the features' unit."""
         turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
-        heading = -2 * turn if self.legacy else turn
+        heading = self.turn_unit * turn
         x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)
         step = torch.stack([x, torch.zeros_like(x), z], -1)
         step = rotation.rotate_y(step, heading[..., 1:] if self.legacy else heading[..., :-1])

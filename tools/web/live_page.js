@@ -2,6 +2,8 @@
 import { Live } from "./live.js";
 import { languageFiles, openLanguage } from "./language.js";
 
+const WALK = "a person walks forward"; // what the person does on the way to a way point
+
 const worker = new Worker("live_worker.js", { type: "module" }), waiting = new Map();
 worker.addEventListener("message", ({ data: { id, result, error } }) => {
   const { done, fail } = waiting.get(id);
@@ -30,8 +32,18 @@ const source = {
     if (frames.length > 3000) frames.fill(null, 0, frames.length - 3000);
     return block;
   },
+  cancel: () => worker.postMessage({ call: "cancel" }),
   file: (ending) => call("file", { ending }),
 };
+
+/** Returns the caption that the model has for walking; null if it has none, or if its way cannot bend. */
+function walking(read, content) {
+  try {
+    return content.root ? read(WALK) : null;
+  } catch {
+    return null;
+  }
+}
 
 async function open() {
   const status = document.getElementById("status");
@@ -46,7 +58,7 @@ async function open() {
       return captions.length === 1 ? captions[0] : text;
     };
     const text = content.captions.find((caption) => /\bstands still\b/.test(caption)) ?? "a person stands";
-    const page = { read, text, fps: content.fps, player: (motion) => player.replace("__DATA__", () => JSON.stringify([motion]).replaceAll("<", "\\u003c")) };
+    const page = { read, text, walk: walking(read, content), fps: content.fps, player: (motion) => player.replace("__DATA__", () => JSON.stringify([motion]).replaceAll("<", "\\u003c")) };
     window.live = new Live(document.getElementById("live"), source, page);
     await window.live.start();
     status.hidden = true;

@@ -1,6 +1,7 @@
 // The page: form, player, downloads, and a link that holds the request.
 import { Sampler, json, words } from "./sampling.js";
 import { longestOf } from "./check.js";
+import { STREAM } from "./models.js";
 import { NotUnderstood } from "./language_reading.js";
 import { chips, languageFiles, openLanguage } from "./language.js";
 import { bvh, glb, shown } from "./figure.js";
@@ -100,7 +101,7 @@ async function open() {
     [sampler, figure, page, files] = await Promise.all([Sampler.open(), json("figure.json"), fetch("player.html"), languageFiles()]);
     player = await page.text();
     language = openLanguage(sampler.content, files);
-    element("stream").hidden = !sampler.content.start;
+    element("stream").hidden = STREAM === null;
     const { fps, captions } = sampler.content, longest = longestOf(sampler.content), request = new URLSearchParams(location.hash.slice(1));
     Object.assign(element("seconds"), { min: 2 / fps, max: longest / fps, value: Math.min(3, longest / fps) });
     element("text").value = captions.find((caption) => caption.startsWith("a person")) ?? captions[0] ?? "";

@@ -1,6 +1,7 @@
 // Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed give the same motion.
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { check, frameCount } from "./check.js";
+import { bends, reached } from "./way_points.js";
 
 ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
 ort.env.wasm.numThreads = 1; // threads need headers that a static server does not send
@@ -91,18 +92,19 @@ export async function json(name) {
 }
 
 export class Sampler {
-  // The graph of rotations is opened when it is first used.
-  static async open() {
+  // Opens the model in a folder. The graph of rotations is opened when it is first used.
+  static async open(folder = "") {
     if (!globalThis.crypto?.subtle) throw new Error("this page needs https, or http://localhost");
     const sampler = new Sampler();
-    sampler.content = await json("model.json");
+    sampler.folder = folder;
+    sampler.content = await json(`${folder}model.json`);
     check(sampler.content);
     [sampler.denoiser, sampler.joints] = await Promise.all(["denoiser.onnx", "joints.onnx"].map((name) => sampler.graph(name)));
     return sampler;
   }
 
   async graph(name) {
-    const bytes = await download(name), hash = Array.from(await digest(bytes), (b) => b.toString(16).padStart(2, "0")).join("");
+    const bytes = await download(this.folder + name), hash = Array.from(await digest(bytes), (b) => b.toString(16).padStart(2, "0")).join("");
     if (hash !== this.content.sha256[name]) throw new Error(`${name} has changed since it was exported`);
     try { return await ort.InferenceSession.create(bytes); } catch { throw new Error(`${name} is damaged`); }
   }
@@ -122,8 +124,8 @@ export class Sampler {
     return x.slice(0, frames * features);
   }
 
-  // Normalized features (padded * D) of frames that are sampled together, from noise of a key.
-  async sample(text, padded, frames, key, more = {}, progress = () => {}) {
+  // Normalized features (padded * D) of frames that are sampled together, from noise of a key. `guide` changes clean estimates.
+  async sample(text, padded, frames, key, more = {}, progress = () => {}, guide = () => {}) {
     const { features, steps, clip_x0: clip, buckets, max_words: most } = this.content;
     const seen = new Set(this.content.vocabulary);
     const read = seen.size ? words(text).map((word) => knownForm(word, seen)).filter(Boolean) : words(text);
@@ -132,17 +134,18 @@ export class Sampler {
     const fixed = { lengths: integers([frames], [1]), counts: integers([count], [1]), condition: integers(rows.flat(), [1, rows.length, 2]), ...more };
     const shape = [1, padded, features];
     let x = normal(key, 0, padded, features), draw = 1;
-    const before = new Float32Array(x.length);
+    let before = new Float32Array(x.length);
     for (const [number, [t, p, q, a, b, c, d]] of steps.entries()) {
       const inputs = { x_t: new ort.Tensor("float32", x, shape), t: new ort.Tensor("float32", [t], [1]), ...fixed };
-      const y = (await this.denoiser.run(inputs)).output.data, noise = d ? normal(key, draw++, padded, features) : before;
-      x = x.map((value, i) => {
-        const clean = p * value + q * y[i], x0 = clip ? Math.min(1, Math.max(-1, clean)) : clean;
-        const next = a * value + b * x0 + c * before[i] + d * noise[i];
-        before[i] = x0;
-        return next;
+      const y = (await this.denoiser.run(inputs)).output.data, noise = d ? normal(key, draw++, padded, features) : null;
+      const x0 = x.map((value, i) => {
+        const clean = p * value + q * y[i];
+        return clip ? Math.min(1, Math.max(-1, clean)) : clean;
       });
-      progress((number + 1) / steps.length);
+      guide(x0);
+      x = x.map((value, i) => a * value + b * x0[i] + c * before[i] + (noise ? d * noise[i] : 0));
+      before = x0;
+      await progress((number + 1) / steps.length);
     }
     if (!x.every(Number.isFinite)) throw new Error("the model returned non-finite numbers");
     return x;
@@ -153,8 +156,12 @@ export class Sampler {
     return (await this.joints.run({ x: new ort.Tensor("float32", x, [1, x.length / features, features]) })).joints.data;
   }
 
-  async rotations(joints) { // offsets (22 * 3) of the rest pose and local quaternions (frames * 22 * 4), w first
+  async openPoses() { // the graph of rotations
     this.poses ??= await this.graph("poses.onnx");
+  }
+
+  async rotations(joints) { // offsets (22 * 3) of the rest pose and local quaternions (frames * 22 * 4), w first
+    await this.openPoses();
     const { offsets, quaternions } = await this.poses.run({ joints: new ort.Tensor("float32", joints, [joints.length / 66, 22, 3]) });
     return { offsets: offsets.data, quaternions: quaternions.data };
   }
@@ -172,26 +179,50 @@ export class Stream {
   }
 
   // Normalized features of the next block.
-  async features(text, progress) {
+  async features(text, progress, guide) {
     const { sampler, size, context, width } = this;
     this.name ??= `${text}#0`;
     const key = await noiseKey(this.seed, `${this.name}\x1f${this.number}`);
     const prefix = { prefix: new ort.Tensor("float32", this.prefix, [1, context, width]) };
-    const x = await sampler.sample(text, size, size, key, prefix, progress);
+    const sampled = await sampler.sample(text, size, size, key, prefix, progress, guide);
+    const x = joined(this.prefix.subarray(-2 * width), sampled, width, sampler.content.fade);
     this.blocks = [...this.blocks.slice(1 - HELD), { begin: this.frames, number: this.number, prefix: this.prefix, x, world: this.world }];
     this.#continueAfter(size);
     return x;
   }
 
-  // Joints of the next block in the world.
-  async block(text) {
-    const { width, world: before } = this, last = this.prefix.slice(-width), x = await this.features(text);
+  // Joints of the next block in the world, which leads to way points, and the numbers of the frames that reach them.
+  async block(text, points = [], progress = undefined) {
+    const { width, world: before, frames } = this, last = this.prefix.slice(-width);
+    const guide = points.length ? await this.#guide(points) : undefined;
+    const x = await this.features(text, progress, guide);
     const joints = await this.sampler.decode(Float32Array.of(...last, ...x)), one = joints.length / (this.size + 1);
     let placed = before ? inPlace(joints, one, before) : (await this.sampler.decode(x)).slice();
     if (before) placed = placed.subarray(one);
     this.blocks.at(-1).joints = placed;
     this.world = placed.slice(-one);
-    return placed;
+    return { joints: placed, reached: reached(points, placed, one, frames) };
+  }
+
+  // A function that bends the way in clean estimates.
+  async #guide(points) {
+    const { width, size, sampler } = this, { root, fps } = sampler.content, { heading, place } = await this.#start();
+    const [turn, side, ahead] = root, units = ([mean, std], value) => mean + std * value;
+    return (x0) => {
+      const rows = Array.from({ length: size }, (_, k) => x0.subarray(k * width, k * width + 3));
+      const steps = rows.map((row) => [units(side, row[1]), units(ahead, row[2])]);
+      const added = bends(rows.map((row) => units(turn, row[0])), steps, heading, place, points, fps);
+      rows.forEach((row, k) => { row[0] += added[k] / turn[1]; });
+    };
+  }
+
+  // Heading and place of the root in the first frame of the next block: one step after the last frame.
+  async #start() {
+    const { width, world, sampler } = this, last = this.prefix.slice(-width), [[mean, std]] = sampler.content.root;
+    if (!world) return { heading: 0, place: [0, 0] };
+    const joints = await sampler.decode(Float32Array.of(...last, ...last)), one = joints.length / 2;
+    const next = inPlace(joints, one, world).subarray(one);
+    return { heading: turnTo(joints.subarray(0, one), world).turn + mean + std * last[0], place: [next[0], next[2]] };
   }
 
   // Drops the frames from a frame on: the next block continues the frames before.
@@ -214,17 +245,36 @@ export class Stream {
   }
 }
 
-// Joints of frames whose first one is moved, about the vertical and over the floor, to a pose of the world.
-function inPlace(joints, one, world) {
-  const mean = (pose, k) => pose.reduce((sum, value, i) => (i % 3 === k ? sum + value : sum), 0) / (one / 3);
-  const first = joints.subarray(0, one), [ax, az, bx, bz] = [mean(first, 0), mean(first, 2), mean(world, 0), mean(world, 2)];
+// A block (frames * width) whose first frames are moved to continue the frames before it (2 * width): `joined` in flame_mdm/generator.py.
+function joined(before, x, width, fade) {
+  if (!fade) return x;
+  const moved = x.slice(), frames = Math.min(fade.frames, x.length / width);
+  for (let k = fade.begin; k < fade.end; k++) {
+    const jump = before[width + k] + (before[width + k] - before[k] + x[width + k] - x[k]) / 2 - x[k];
+    for (let frame = 0; frame < frames; frame++) {
+      const share = frame / fade.frames;
+      moved[frame * width + k] += (1 - share) ** 2 * (1 + 2 * share) * jump;
+    }
+  }
+  return moved;
+}
+
+// The turn about the vertical that moves a pose to a pose of the world, and the centers of both.
+function turnTo(pose, world) {
+  const mean = (joints, k) => joints.reduce((sum, value, i) => (i % 3 === k ? sum + value : sum), 0) / (joints.length / 3);
+  const [ax, az, bx, bz] = [mean(pose, 0), mean(pose, 2), mean(world, 0), mean(world, 2)];
   let sine = 0, cosine = 0;
-  for (let i = 0; i < one; i += 3) {
-    const [x, z, u, v] = [first[i] - ax, first[i + 2] - az, world[i] - bx, world[i + 2] - bz];
+  for (let i = 0; i < pose.length; i += 3) {
+    const [x, z, u, v] = [pose[i] - ax, pose[i + 2] - az, world[i] - bx, world[i + 2] - bz];
     sine += z * u - x * v;
     cosine += x * u + z * v;
   }
-  const turn = Math.atan2(sine, cosine), [s, c] = [Math.sin(turn), Math.cos(turn)];
+  return { turn: Math.atan2(sine, cosine), from: [ax, az], to: [bx, bz] };
+}
+
+// Joints of frames whose first one is moved, about the vertical and over the floor, to a pose of the world.
+function inPlace(joints, one, world) {
+  const { turn, from: [ax, az], to: [bx, bz] } = turnTo(joints.subarray(0, one), world), [s, c] = [Math.sin(turn), Math.cos(turn)];
   const placed = new Float32Array(joints);
   for (let i = 0; i < joints.length; i += 3) {
     const [x, z] = [joints[i] - ax, joints[i + 2] - az];

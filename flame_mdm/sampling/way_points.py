@@ -1,0 +1,177 @@
+"""Way points on the floor for streams.
+
+The path of the person bends toward the way points, and the text says how the person moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.errors import UserError
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.sampling.placement import Placement
+
+Point = tuple[float, float]
+"""x and z in meters in the world."""
+
+# The page that samples in the browser has the same numbers and loop (tools/web/way_points.js).
+NEAR = 0.3  # distance in meters from the root at which a way point is reached
+# Largest bend in radians per second. With faster bends, feet on the floor would visibly slide.
+FASTEST = 1.3
+# Least radius of a bend in meters. It keeps a person who stands from turning.
+TIGHTEST = 0.7
+# Size of the circle within which way points are too near, relative to the narrowest circle that
+# the person can walk. A bend begins slowly, so that with 1 a runner would circle a way point.
+ROOM = 1.2
+PATIENCE = 0.4  # time constant in seconds with which deviations disappear
+SMOOTHING = (
+    0.3  # weight of a frame in the moving average of steps, which removes the sway of a walk
+)
+FARTHEST = 1e4  # largest coordinate of a way point in meters
+
+
+def bends(
+    turns: Sequence[float],
+    steps: Sequence[Point],
+    heading: float,
+    place: Point,
+    points: Sequence[Point],
+    fps: float,
+) -> list[float]:
+    """Returns the angles in radians to add to the turns of the root so that it passes way points.
+
+    The direction of travel approaches the direction of the next way point. The angle is bounded
+    per second and per meter of the path. If a way point is too near beside the person, the path
+    stays straight until there is room for a curve.
+
+    Args:
+        turns: (F) turns in radians from each frame to the next, positive to the left.
+        steps: (F, 2) steps of the root to the next frame in meters, to the left of the body and
+            forward.
+        heading: direction of the body in the first frame in radians, as in `Placement.turn`.
+        place: position of the root in the first frame.
+        points: way points in order.
+        fps: frames per second.
+
+    Example:
+        >>> straight = [0.0] * 20, [(0.0, 0.05)] * 20
+        >>> added = bends(*straight, heading=0.0, place=(0.0, 0.0), points=[(3.0, 3.0)], fps=20)
+        >>> 0 < sum(added) < math.pi / 4  # left, towards +x
+        True
+    """
+    left = list(points)
+    x, z = place
+    added = []
+    side, ahead = steps[0]
+    for turn, step in zip(turns, steps, strict=True):
+        while left and math.hypot(left[0][0] - x, left[0][1] - z) < NEAR:
+            left.pop(0)
+        side += SMOOTHING * (step[0] - side)
+        ahead += SMOOTHING * (step[1] - ahead)
+        travel = heading + math.atan2(side, ahead)
+        bend = _bend(travel, math.hypot(side, ahead), (x, z), left[0], fps) if left else 0.0
+        added.append(bend)
+
+        sine, cosine = math.sin(heading), math.cos(heading)
+        x += cosine * step[0] + sine * step[1]
+        z += cosine * step[1] - sine * step[0]
+        heading += turn + bend
+    return added
+
+
+def _bend(travel: float, length: float, place: Point, goal: Point, fps: float) -> float:
+    """Returns the angle to add in a frame.
+
+    Args:
+        travel: direction of the step to the next frame in radians.
+        length: length of this step in meters.
+        place: position of the root.
+        goal: the next way point.
+        fps: frames per second.
+    """
+    most = min(FASTEST / fps, length / TIGHTEST)
+    off = math.atan2(goal[0] - place[0], goal[1] - place[1]) - travel
+    off = math.remainder(off, 2 * math.pi)
+
+    radius = ROOM * max(TIGHTEST, length * fps / FASTEST)
+    to_side = travel + math.copysign(math.pi / 2, off)
+    center = place[0] + radius * math.sin(to_side), place[1] + radius * math.cos(to_side)
+    if math.dist(center, goal) < radius - NEAR / 2:
+        return 0.0
+    return max(-most, min(most, off / (PATIENCE * fps)))
+
+
+@dataclass(frozen=True)
+class WayGuide:
+    """Bends the path of a block at each sampling step; a `flame_mdm.batch.Guide`.
+
+    The denoiser sees the bent path in the next steps and adapts the rest of the body to it.
+    """
+
+    representation: HumanML
+    placement: Placement
+    points: Sequence[Point]
+
+    def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        """Returns the noisy motion `x_t` unchanged."""
+        return x_t
+
+    def reach(self, x0_hat: Tensor) -> Tensor:
+        """Returns the clean estimate (1, F, D) with a path that bends to the way points."""
+        representation, column = self.representation, self.representation.slices["turn"].start
+        turns, steps = representation.root_steps(representation.denormalize(x0_hat[0].float()))
+        added = bends(
+            turns.tolist(),
+            steps.tolist(),
+            float(self.placement.turn[0]),
+            (float(self.placement.shift[0, 0]), float(self.placement.shift[0, 2])),
+            self.points,
+            representation.fps,
+        )
+        scale = representation.std[column] * representation.turn_unit
+        bent = x0_hat.clone()
+        bent[0, :, column] += torch.tensor(added).to(x0_hat) / scale
+        return bent
+
+
+class WayPoints:
+    """Way points of a stream, and when they were reached.
+
+    Attributes:
+        points: all way points in order.
+        reached: numbers of the frames of the stream in which the first way points were reached.
+
+    Raises:
+        UserError: If a point is not two finite numbers, or is too far away.
+    """
+
+    def __init__(self, points: Sequence[Sequence[float]] = ()):
+        for point in points:
+            numbers = [x for x in point if isinstance(x, float | int) and not isinstance(x, bool)]
+            if len(point) != 2 or len(numbers) != 2 or not all(abs(x) <= FARTHEST for x in numbers):
+                raise UserError(
+                    f"way point {point}: give x and z in meters, within {FARTHEST:g} of the start"
+                )
+        self.points: list[Point] = [(float(x), float(z)) for x, z in points]
+        self.reached: list[int] = []
+
+    @property
+    def left(self) -> list[Point]:
+        """Way points that are still ahead."""
+        return self.points[len(self.reached) :]
+
+    def follow(self, begin: int, roots: np.ndarray) -> None:
+        """Notes which way points the root (F, 3) reaches; its first frame has the number `begin`."""
+        for frame, (x, _, z) in enumerate(roots, begin):
+            while self.left and math.dist(self.left[0], (x, z)) < NEAR:
+                self.reached.append(frame)
+
+    def go_back(self, frame: int) -> None:
+        """Makes the way points that were reached from a frame on lie ahead again."""
+        self.reached = [number for number in self.reached if number < frame]

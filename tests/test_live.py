@@ -105,7 +105,7 @@ def test_a_stream_computes_no_more_blocks_than_anybody_can_watch(model):
     assert live.block(name, WALK, 240)["from"] == 240
 
 
-def test_a_block_leads_along_way_points_and_says_when_they_are_reached(model):
+def test_a_block_leads_along_waypoints_and_says_when_they_are_reached(model):
     live = LiveStreams(model)
     first = live.block("", WALK, 0)
     name, here = first["stream"], root(first, -1)

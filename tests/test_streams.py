@@ -31,7 +31,7 @@ from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
 from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 from flame_mdm.sampling.targets import errors, read_targets
-from flame_mdm.sampling.way_points import bends
+from flame_mdm.sampling.waypoints import bends
 
 CONTEXT, BLOCK, FPS = 10, 30, 20.0
 
@@ -454,7 +454,7 @@ def test_a_condition_ends_in_the_frame_before_the_next_one():
     assert [schedule.at(frame) for frame in (4, 5)] == ["a person walks", "a person jumps"]
 
 
-# Way points -----------------------------------------------------------------------------------------------------------
+# Waypoints -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -481,7 +481,7 @@ def gliding(step: float) -> MotionGenerator:
         [(0.5, 0.0)],
     ],
 )
-def test_the_person_passes_way_points_in_order(walking, points):
+def test_the_person_passes_waypoints_in_order(walking, points):
     running = stream(walking, "a person walks")
     running.lead(points)
     places = joints(islice(running, 7))[:, 0, [0, 2]]
@@ -502,7 +502,7 @@ def test_the_way_bends_no_more_than_feet_allow():
             assert np.abs(added).max() <= min(1.3 / FPS, speed / 0.7) + 1e-9
 
 
-def test_a_person_who_stands_does_not_turn_to_a_way_point():
+def test_a_person_who_stands_does_not_turn_to_a_waypoint():
     still = gliding(0.0)
     free, led = stream(still, "a person stands"), stream(still, "a person stands")
     led.lead([(-2.0, 0.0)])
@@ -511,7 +511,7 @@ def test_a_person_who_stands_does_not_turn_to_a_way_point():
     assert led.reached == []
 
 
-def test_way_points_change_later_blocks_alone_and_are_ahead_again_after_going_back(walking):
+def test_waypoints_change_later_blocks_alone_and_are_ahead_again_after_going_back(walking):
     plain, led = stream(walking, "a person walks"), stream(walking, "a person walks")
     assert np.array_equal(next(plain).joints, next(led).joints)
     led.lead([(0.2, 2.4)])
@@ -529,13 +529,13 @@ def test_way_points_change_later_blocks_alone_and_are_ahead_again_after_going_ba
 @pytest.mark.parametrize(
     "point", [(1.0,), (1.0, 2.0, 3.0), (np.nan, 0.0), (np.inf, 0.0), (2e4, 0.0), ("1", 0.0)]
 )
-def test_way_points_are_two_numbers(walking, point):
+def test_waypoints_are_two_numbers(walking, point):
     running = stream(walking, "a person walks")
-    with pytest.raises(UserError, match=r"way point .*: give x and z in meters"):
+    with pytest.raises(UserError, match=r"waypoint .*: give x and z in meters"):
         running.lead([point])
 
 
-def test_every_way_point_is_reached_at_any_speed():
+def test_every_waypoint_is_reached_at_any_speed():
     rng = np.random.default_rng(1)
     turns = [0.0] * BLOCK
     for speed in (0.02, 0.05, 0.15):
@@ -567,8 +567,8 @@ def test_the_web_page_bends_the_way_in_the_same_manner(tmp_path):
         for speed in (0.0, 0.02, 0.06, 0.15)
         for _ in range(20)
     ]
-    shutil.copy(ROOT / "tools/web/way_points.js", tmp_path)
+    shutil.copy(ROOT / "tools/web/waypoints.js", tmp_path)
     (tmp_path / "package.json").write_text('{"type": "module"}')
     (tmp_path / "cases.json").write_text(json.dumps(cases))
-    theirs = node("web_way_points.mjs", tmp_path)
+    theirs = node("web_waypoints.mjs", tmp_path)
     np.testing.assert_allclose(theirs, [bends(*case) for case in cases], rtol=0, atol=1e-12)

@@ -17,7 +17,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from flame_mdm.demo.request import MAX_TEXT, MAX_WAY_POINTS, PLAIN
+from flame_mdm.demo.request import MAX_TEXT, MAX_WAYPOINTS, PLAIN
 
 MAX_BODY = 64 * 1024  # maximum number of bytes in the body of a request, counted as they arrive
 BODY_TIME = 10.0  # maximum number of seconds until the body has arrived
@@ -88,7 +88,7 @@ class LiveCall(Post):
     stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
     text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]
     begin: Annotated[int, Field(ge=0, le=10_000_000)]
-    path: Annotated[list[tuple[Meters, Meters]], Field(max_length=MAX_WAY_POINTS)] = []
+    path: Annotated[list[tuple[Meters, Meters]], Field(max_length=MAX_WAYPOINTS)] = []
 
 
 POSTS: dict[str, type[Post]] = {

@@ -1,4 +1,4 @@
-// A stream of motion on a page: clock, buffer, texts, way points. A source makes the blocks: a server, or a worker on the visitor's device.
+// A stream of motion on a page: clock, buffer, texts, waypoints. A source makes the blocks: a server, or a worker on the visitor's device.
 const AHEAD = 1; // seconds that are left when the next block is asked for
 const SLOW = 0.15; // seconds that are left when the clock begins to slow down
 const EASE = 0.15; // seconds in which the clock gets back to its speed
@@ -7,7 +7,7 @@ const STEP = 0.1; // longest step of the clock in seconds; a hidden page pauses 
 const CHIPS = 6; // texts that can be clicked again
 const TIMED = 5; // blocks whose median time tells how long the next one takes
 const MOST_POINTS = 16;
-const GOES = /\b(walk|run|jog|march|stride|stroll|skip|sneak|limp|strafe|stagger|tiptoe|crawl)(s|ing)?\b/i; // texts that way points keep
+const GOES = /\b(walk|run|jog|march|stride|stroll|skip|sneak|limp|strafe|stagger|tiptoe|crawl)(s|ing)?\b/i; // texts that waypoints keep
 const HINT = "Click on the floor: the person goes there";
 
 /** A clock that slows down before it reaches the end of the buffer, so that no frame is missing and none is skipped. */
@@ -33,12 +33,12 @@ export class Clock {
  *
  * @param container element that gets the form, the player and the buttons.
  * @param source `block({ text, from, path })` returns a promise of { from, frames, reached, motion }: the frames from number
- *   `from` on, in the format of the player, which lead along the way points `path`, and the numbers of the frames that reach
+ *   `from` on, in the format of the player, which lead along the waypoints `path`, and the numbers of the frames that reach
  *   the first of these. `cancel()`, if there is one, makes the promise of a block fail. `file(ending)` returns a promise of a
  *   file of the last minute.
  * @param page `player(motion)` returns the page of the player that shows a motion; `read(text)` returns what the source
  *   reads for a text, or throws an error with the texts `nearest` in meaning; `fps`; a first `text`, in which the person
- *   stands; and a text `walk` for the way to way points, null if there are none.
+ *   stands; and a text `walk` for the way to waypoints, null if there are none.
  */
 export class Live {
   constructor(container, source, page) {
@@ -46,14 +46,14 @@ export class Live {
     this.pending = null; // the change that was not asked for yet, or whose answer has not arrived: { text, from, entry }
     this.busy = false; // a block is being made
     this.times = []; // seconds that the last blocks took
-    this.points = []; // way points: { place, reached }, the number of the frame that reaches it or null
+    this.points = []; // waypoints: { place, reached }, the number of the frame that reaches it or null
     this.log = []; // for each new text, when it was typed and when its first frame was shown
     container.innerHTML = `<form><input maxlength="300" autocomplete="off" aria-label="What the person does next"
         placeholder="What the person does next"><button>Go</button></form>
       <div class="texts" role="group" aria-label="Last texts"></div><p role="status"></p>
       <iframe title="The stream"></iframe>
       <div class="tools"><button type="button" class="pause">Pause</button>
-      <button type="button" class="clear" hidden>Clear way points</button>
+      <button type="button" class="clear" hidden>Clear waypoints</button>
       <button type="button" class="bvh">Save BVH</button><button type="button" class="glb">Save GLB</button>
       <span>of the last minute</span></div>`;
     this.find = (selector) => container.querySelector(selector);
@@ -114,7 +114,7 @@ export class Live {
   async ask() {
     this.busy = true;
     const change = this.pending, from = change ? change.from : this.end;
-    // Frames that reach way points are replaced, too.
+    // Frames that reach waypoints are replaced, too.
     const path = this.points.filter(({ reached }) => reached === null || reached >= from);
     this.isSpare = !change;
     try {
@@ -147,7 +147,7 @@ export class Live {
     else if (!this.find("input").value) this.find("input").value = change.text;
   }
 
-  /** Lets a person who goes stop where the last way point is reached. */
+  /** Lets a person who goes stop where the last waypoint is reached. */
   stopAtLast() {
     const last = this.points.at(-1)?.reached ?? null;
     if (last !== null && GOES.test(this.text)) this.replace(this.page.text, undefined, last + 1);
@@ -181,11 +181,11 @@ export class Live {
     this.pending = { text, from: Math.min(this.end, Math.max(least, this.frame + 1 + lead)), entry };
   }
 
-  /** Adds a way point; the person goes there as the text says, or walks if the text does not say that they go. */
+  /** Adds a waypoint; the person goes there as the text says, or walks if the text does not say that they go. */
   addPoint(place) {
     if (!this.page.walk) return;
     if (this.points.length >= MOST_POINTS) {
-      this.say(`A path has at most ${MOST_POINTS} way points. Click one to remove it`);
+      this.say(`A path has at most ${MOST_POINTS} waypoints. Click one to remove it`);
       return;
     }
     this.say("");

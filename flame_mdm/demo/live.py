@@ -27,7 +27,7 @@ KEPT = 60.0  # duration in seconds of the part of a stream that can be downloade
 BEFORE = 10  # number of frames before a block on which the rotations of its first frames depend
 ENDINGS = (".bvh", ".glb")
 STAND, WALK = "a person stands", "a person walks forward"
-"""First text of a stream, and its text on the way to a way point."""
+"""First text of a stream, and its text on the way to a waypoint."""
 
 
 @dataclass
@@ -64,7 +64,7 @@ class LiveStreams:
 
     @property
     def can_lead(self) -> bool:
-        """Whether the model walks, so that visitors may lead the person along way points."""
+        """Whether the model walks, so that visitors may lead the person along waypoints."""
         if not isinstance(self.model.representation, HumanML):
             return False
         try:
@@ -82,8 +82,8 @@ class LiveStreams:
             name: name of the stream; "" = begin a new stream, whose name is in the result.
             text: description of the motion.
             begin: number of the first frame. Frames that the stream has after it are dropped.
-            path: way points that are ahead in frame `begin`, x and z in meters. `reached` in the
-                result lists the numbers of the frames in which the first way points are reached.
+            path: waypoints that are ahead in frame `begin`, x and z in meters. `reached` in the
+                result lists the numbers of the frames in which the first waypoints are reached.
 
         Raises:
             UserError: If the text is not understood, the stream has ended, or a limit is reached.

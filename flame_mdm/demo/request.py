@@ -28,7 +28,7 @@ MAX_STEPS = 1000
 MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
 MAX_FIELDS = 50  # maximum number of fields of a query string
-MAX_WAY_POINTS, FAR = 16, 20.0  # limits of a path: number of waypoints, and meters along x and z
+MAX_WAYPOINTS, FAR = 16, 20.0  # limits of a path: number of waypoints, and meters along x and z
 PLUS = " + "  # separator between the names of a model and its adapter
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
 """Text without control characters and without characters that change the direction of writing."""
@@ -45,7 +45,7 @@ RULES = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 Path = Annotated[
     tuple[tuple[Coordinate, Coordinate], ...],
-    Field(max_length=MAX_WAY_POINTS),
+    Field(max_length=MAX_WAYPOINTS),
     BeforeValidator(lambda value: read_path(value) if isinstance(value, str) else value),
     PlainSerializer(lambda path: " ".join(f"{x},{z}" for x, z in path)),
 ]

@@ -33,7 +33,7 @@ from flame_mdm.sampling.motion_request import check_length
 from flame_mdm.sampling.placement import Placement, step_after
 from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.targets import Targets
-from flame_mdm.sampling.way_points import WayGuide, WayPoints
+from flame_mdm.sampling.waypoints import Route, RouteGuide
 
 # Number of blocks of a stream that can be cut, for example because a page has not shown them yet
 HELD = 4
@@ -145,33 +145,33 @@ class Stream(Iterator[Motion]):
         self._streams.texts[condition] = text
         self._streams.schedules[0].add(frame, condition)
 
-    def lead(self, way_points: Sequence[Sequence[float]]) -> None:
-        """Leads the person along way points from the next block on.
+    def lead(self, waypoints: Sequence[Sequence[float]]) -> None:
+        """Leads the person along waypoints from the next block on.
 
-        The path bends toward the next way point, and the text says how the person moves. A person
-        who stands does not move. After the last way point, the path no longer bends.
+        The path bends toward the next waypoint, and the text says how the person moves. A person
+        who stands does not move. After the last waypoint, the path no longer bends.
 
         Args:
-            way_points: x and z in meters in the world, in order. They replace all earlier way
-                points. Empty = no way points.
+            waypoints: x and z in meters in the world, in order. They replace all earlier way
+                points. Empty = no waypoints.
 
         Raises:
-            UserError: If a way point is not two finite numbers, or the representation is not
+            UserError: If a waypoint is not two finite numbers, or the representation is not
                 `HumanML`.
         """
-        self._streams.lead(WayPoints(way_points))
+        self._streams.lead(Route(waypoints))
 
     @property
     def reached(self) -> list[int]:
-        """Numbers of the frames in which the first way points were reached, in order."""
-        return list(self._streams.way_points.reached)
+        """Numbers of the frames in which the first waypoints were reached, in order."""
+        return list(self._streams.waypoints.reached)
 
     def go_back(self, at: float) -> None:
         """Drops frames that were not used yet, from a time on. The next block continues there.
 
         A new text is then visible at once, although blocks were computed ahead. The result is the
         stream whose text changes at that time. Later changes of the text are dropped, too.
-        Way points that were reached later are ahead again.
+        Waypoints that were reached later are ahead again.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
@@ -303,7 +303,7 @@ class Streams(Iterator[list[Motion]]):
         frames: number of frames of each stream so far.
         targets: positions that a single stream reaches. The guidance of sampling leads to them
             and, if the model was trained with targets, also its own condition. None = no targets.
-        way_points: way points along which a single stream without targets is led.
+        waypoints: waypoints along which a single stream without targets is led.
     """
 
     def __init__(
@@ -340,7 +340,7 @@ class Streams(Iterator[list[Motion]]):
         )
         self.texts = {condition: condition for condition in conditions}
         self.targets: Targets | None = None
-        self.way_points = WayPoints()
+        self.waypoints = Route()
         self._root = [0.0, 0.0]  # x and z in the world of the first stream's last frame
         self._encoded: tuple[list[str], Condition] | None = None
         self._past: deque[PastBlock] = deque(maxlen=HELD)
@@ -358,15 +358,15 @@ class Streams(Iterator[list[Motion]]):
             for row, (count, condition) in enumerate(zip(kept, conditions, strict=True))
         ]
 
-    def lead(self, way_points: WayPoints) -> None:
-        """Leads a single stream along way points, as `Stream.lead` does."""
+    def lead(self, waypoints: Route) -> None:
+        """Leads a single stream along waypoints, as `Stream.lead` does."""
         representation = self.model.representation
-        if way_points.points and not isinstance(representation, HumanML):
+        if waypoints.points and not isinstance(representation, HumanML):
             raise UserError(
                 f"representation {representation.name} has no column for the turn of the root, "
-                "which leads to way points. Use humanml3d"
+                "which leads to waypoints. Use humanml3d"
             )
-        self.way_points = way_points
+        self.waypoints = waypoints
 
     def go_back(self, frame: int) -> None:
         """Drops the frames of a single stream from `frame` on, and later changes of its text.
@@ -375,7 +375,7 @@ class Streams(Iterator[list[Motion]]):
             UserError: If the frame is not in one of the last `HELD` blocks.
         """
         self.schedules[0].drop(frame)
-        self.way_points.go_back(frame)
+        self.waypoints.go_back(frame)
         if frame == self.frames[0]:
             return
         blocks = [block for block in self._past if block.begin < frame]
@@ -449,7 +449,7 @@ class Streams(Iterator[list[Motion]]):
         if len(self.frames) == 1:
             self._past.append(PastBlock(self.frames[0], number, prefix, x, joints))
             roots = joints[0, : kept[0], 0]
-            self.way_points.follow(self.frames[0], roots.cpu().numpy())
+            self.waypoints.follow(self.frames[0], roots.cpu().numpy())
         self.frames = [frame + new for frame, new in zip(self.frames, kept, strict=True)]
         return x, joints
 
@@ -473,13 +473,13 @@ class Streams(Iterator[list[Motion]]):
         return cond, edit
 
     def _led(self) -> Edit | None:
-        """Returns the edit that leads the next block to the way points; None without way points."""
-        representation, points = self.model.representation, self.way_points.left
+        """Returns the edit that leads the next block to the waypoints; None without waypoints."""
+        representation, points = self.model.representation, self.waypoints.left
         if not points or not isinstance(representation, HumanML):
             return None
         frames = self.model.block_frames
         nothing = torch.zeros(1, frames, representation.features, device=self.model.device)
-        guide = WayGuide(representation, self.placement, points)
+        guide = RouteGuide(representation, self.placement, points)
         return Edit(nothing, torch.zeros_like(nothing, dtype=torch.bool), guide=guide)
 
     @torch.no_grad()

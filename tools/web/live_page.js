@@ -2,7 +2,7 @@
 import { Live } from "./live.js";
 import { languageFiles, openLanguage } from "./language.js";
 
-const WALK = "a person walks forward"; // what the person does on the way to a way point
+const WALK = "a person walks forward"; // what the person does on the way to a waypoint
 
 const worker = new Worker("live_worker.js", { type: "module" }), waiting = new Map();
 worker.addEventListener("message", ({ data: { id, result, error } }) => {

@@ -1,7 +1,7 @@
 // Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed give the same motion.
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { check, frameCount } from "./check.js";
-import { bends, reached } from "./way_points.js";
+import { bends, reached } from "./waypoints.js";
 
 ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
 ort.env.wasm.numThreads = 1; // threads need headers that a static server does not send
@@ -191,7 +191,7 @@ export class Stream {
     return x;
   }
 
-  // Joints of the next block in the world, which leads to way points, and the numbers of the frames that reach them.
+  // Joints of the next block in the world, which leads to waypoints, and the numbers of the frames that reach them.
   async block(text, points = [], progress = undefined) {
     const { width, world: before, frames } = this, last = this.prefix.slice(-width);
     const guide = points.length ? await this.#guide(points) : undefined;

@@ -1,6 +1,6 @@
-"""Way points on the floor for streams.
+"""Waypoints on the floor for streams.
 
-The path of the person bends toward the way points, and the text says how the person moves.
+The path of the person bends toward the waypoints, and the text says how the person moves.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from flame_mdm.sampling.placement import Placement
 Point = tuple[float, float]
 """x and z in meters in the world."""
 
-# The page that samples in the browser has the same numbers and loop (tools/web/way_points.js).
-NEAR = 0.3  # distance in meters from the root at which a way point is reached
+# The page that samples in the browser has the same numbers and loop (tools/web/waypoints.js).
+NEAR = 0.3  # distance in meters from the root at which a waypoint is reached
 # Largest bend in radians per second. With faster bends, feet on the floor would visibly slide.
 FASTEST = 1.3
 # Least radius of a bend in meters. It keeps a person who stands from turning.
 TIGHTEST = 0.7
-# Size of the circle within which way points are too near, relative to the narrowest circle that
-# the person can walk. A bend begins slowly, so that with 1 a runner would circle a way point.
+# Size of the circle within which waypoints are too near, relative to the narrowest circle that
+# the person can walk. A bend begins slowly, so that with 1 a runner would circle a waypoint.
 ROOM = 1.2
 PATIENCE = 0.4  # time constant in seconds with which deviations disappear
 SMOOTHING = (
     0.3  # weight of a frame in the moving average of steps, which removes the sway of a walk
 )
-FARTHEST = 1e4  # largest coordinate of a way point in meters
+FARTHEST = 1e4  # largest coordinate of a waypoint in meters
 
 
 def bends(
     turns: Sequence[float],
     steps: Sequence[Point],
     heading: float,
-    place: Point,
+    position: Point,
     points: Sequence[Point],
     fps: float,
 ) -> list[float]:
-    """Returns the angles in radians to add to the turns of the root so that it passes way points.
+    """Returns the angles in radians to add to the turns of the root so that it passes waypoints.
 
-    The direction of travel approaches the direction of the next way point. The angle is bounded
-    per second and per meter of the path. If a way point is too near beside the person, the path
+    The direction of travel approaches the direction of the next waypoint. The angle is bounded
+    per second and per meter of the path. If a waypoint is too near beside the person, the path
     stays straight until there is room for a curve.
 
     Args:
@@ -55,18 +55,18 @@ def bends(
         steps: (F, 2) steps of the root to the next frame in meters, to the left of the body and
             forward.
         heading: direction of the body in the first frame in radians, as in `Placement.turn`.
-        place: position of the root in the first frame.
-        points: way points in order.
+        position: position of the root in the first frame.
+        points: waypoints in order.
         fps: frames per second.
 
     Example:
         >>> straight = [0.0] * 20, [(0.0, 0.05)] * 20
-        >>> added = bends(*straight, heading=0.0, place=(0.0, 0.0), points=[(3.0, 3.0)], fps=20)
+        >>> added = bends(*straight, heading=0.0, position=(0.0, 0.0), points=[(3.0, 3.0)], fps=20)
         >>> 0 < sum(added) < math.pi / 4  # left, towards +x
         True
     """
     left = list(points)
-    x, z = place
+    x, z = position
     added = []
     side, ahead = steps[0]
     for turn, step in zip(turns, steps, strict=True):
@@ -85,30 +85,30 @@ def bends(
     return added
 
 
-def _bend(travel: float, length: float, place: Point, goal: Point, fps: float) -> float:
+def _bend(travel: float, length: float, position: Point, goal: Point, fps: float) -> float:
     """Returns the angle to add in a frame.
 
     Args:
         travel: direction of the step to the next frame in radians.
         length: length of this step in meters.
-        place: position of the root.
-        goal: the next way point.
+        position: position of the root.
+        goal: the next waypoint.
         fps: frames per second.
     """
     most = min(FASTEST / fps, length / TIGHTEST)
-    off = math.atan2(goal[0] - place[0], goal[1] - place[1]) - travel
+    off = math.atan2(goal[0] - position[0], goal[1] - position[1]) - travel
     off = math.remainder(off, 2 * math.pi)
 
     radius = ROOM * max(TIGHTEST, length * fps / FASTEST)
     to_side = travel + math.copysign(math.pi / 2, off)
-    center = place[0] + radius * math.sin(to_side), place[1] + radius * math.cos(to_side)
+    center = position[0] + radius * math.sin(to_side), position[1] + radius * math.cos(to_side)
     if math.dist(center, goal) < radius - NEAR / 2:
         return 0.0
     return max(-most, min(most, off / (PATIENCE * fps)))
 
 
 @dataclass(frozen=True)
-class WayGuide:
+class RouteGuide:
     """Bends the path of a block at each sampling step; a `flame_mdm.batch.Guide`.
 
     The denoiser sees the bent path in the next steps and adapts the rest of the body to it.
@@ -123,7 +123,7 @@ class WayGuide:
         return x_t
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (1, F, D) with a path that bends to the way points."""
+        """Returns the clean estimate (1, F, D) with a path that bends to the waypoints."""
         representation, column = self.representation, self.representation.slices["turn"].start
         turns, steps = representation.root_steps(representation.denormalize(x0_hat[0].float()))
         added = bends(
@@ -140,12 +140,12 @@ class WayGuide:
         return bent
 
 
-class WayPoints:
-    """Way points of a stream, and when they were reached.
+class Route:
+    """Waypoints of a stream, and when they were reached.
 
     Attributes:
-        points: all way points in order.
-        reached: numbers of the frames of the stream in which the first way points were reached.
+        points: all waypoints in order.
+        reached: numbers of the frames of the stream in which the first waypoints were reached.
 
     Raises:
         UserError: If a point is not two finite numbers, or is too far away.
@@ -156,22 +156,22 @@ class WayPoints:
             numbers = [x for x in point if isinstance(x, float | int) and not isinstance(x, bool)]
             if len(point) != 2 or len(numbers) != 2 or not all(abs(x) <= FARTHEST for x in numbers):
                 raise UserError(
-                    f"way point {point}: give x and z in meters, within {FARTHEST:g} of the start"
+                    f"waypoint {point}: give x and z in meters, within {FARTHEST:g} of the start"
                 )
         self.points: list[Point] = [(float(x), float(z)) for x, z in points]
         self.reached: list[int] = []
 
     @property
     def left(self) -> list[Point]:
-        """Way points that are still ahead."""
+        """Waypoints that are still ahead."""
         return self.points[len(self.reached) :]
 
     def follow(self, begin: int, roots: np.ndarray) -> None:
-        """Notes which way points the root (F, 3) reaches; its first frame has the number `begin`."""
+        """Notes which waypoints the root (F, 3) reaches; its first frame has the number `begin`."""
         for frame, (x, _, z) in enumerate(roots, begin):
             while self.left and math.dist(self.left[0], (x, z)) < NEAR:
                 self.reached.append(frame)
 
     def go_back(self, frame: int) -> None:
-        """Makes the way points that were reached from a frame on lie ahead again."""
+        """Makes the waypoints that were reached from a frame on lie ahead again."""
         self.reached = [number for number in self.reached if number < frame]

@@ -1,8 +1,8 @@
-// Bends the way of a stream toward way points on the floor: flame_mdm/sampling/way_points.py in JavaScript, with the same numbers.
-export const NEAR = 0.3; // meters from the root at which a way point is reached
+// Bends the way of a stream toward waypoints on the floor: flame_mdm/sampling/waypoints.py in JavaScript, with the same numbers.
+export const NEAR = 0.3; // meters from the root at which a waypoint is reached
 const FASTEST = 1.3; // radians per second
 const TIGHTEST = 0.7; // meters, the least radius of a bend
-const ROOM = 1.2; // a way point inside a circle larger by this factor is approached from farther away
+const ROOM = 1.2; // a waypoint inside a circle larger by this factor is approached from farther away
 const PATIENCE = 0.4; // seconds
 const SMOOTHING = 0.3; // share of a frame in the average of steps
 
@@ -35,7 +35,7 @@ function bend(travel, length, place, goal, fps) {
   return Math.max(-most, Math.min(most, off / (PATIENCE * fps)));
 }
 
-/** Returns the numbers of the frames in which the first way points are reached, of joints (frames * one) from number `begin` on. */
+/** Returns the numbers of the frames in which the first waypoints are reached, of joints (frames * one) from number `begin` on. */
 export function reached(points, joints, one, begin) {
   const numbers = [];
   for (let at = 0; at < joints.length; at += one) {

@@ -1,7 +1,7 @@
 # pyright: standard
 """Shares the work of an evaluation among processes.
 
-Without a process group, there is one process.
+Without a process group, everything runs in one process.
 """
 
 import os

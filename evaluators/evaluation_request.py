@@ -61,7 +61,9 @@ class EvaluationKeys:
         False, "two replications of 64 motions, to check that everything works; noted in the result"
     )
     force: bool = option(
-        False, "generate even if real motions do not have the expected values; noted in the result"
+        False,
+        "generate motions even if the metrics of the real motions differ from the values that "
+        "the protocol expects; the result is marked as not valid",
     )
     method: str | None = same_option(EditRequest, "method")
     until: float | None = same_option(EditRequest, "until")

@@ -186,8 +186,8 @@ class Edit:
             code): the result contains the model's version of the known motion.
         resample: for "x_t", how many times each step is repeated, after noise is added again
             (RePaint, algorithm 1).
-        guide: for "x0", leads the motion to a goal in each step, before the kept part overwrites
-            the clean estimate.
+        guide: for "x0", a goal that the clean estimate is made to meet at each step, before the
+            kept part overwrites it. None: no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
             with the noise of the first of these steps (SDEdit). MDM's code gives the number of
             skipped steps instead: of N steps, `skip_timesteps` = (1 - strength) N. None: sampling

@@ -2,6 +2,7 @@
 
 import importlib.util
 import shutil
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -386,6 +387,16 @@ def test_damage_is_found_and_repaired_aloud(models, tmp_path, subtests):
         encoder.load_cache(CAPTIONS[:1], tmp_path)
 
 
+def with_narrow_projection(clip: str, folder: Path) -> str:
+    """A copy of a CLIP whose pooled vectors have width 6, unlike its tokens."""
+    import transformers as tf
+
+    config = tf.CLIPTextConfig.from_pretrained(clip, projection_dim=6)
+    tf.CLIPTextModelWithProjection(config).save_pretrained(folder)
+    tf.AutoTokenizer.from_pretrained(clip).save_pretrained(folder)
+    return str(folder)
+
+
 def test_bad_options_batches_and_models_are_refused(models, tmp_path):
     def encoder(
         model: str, features: int = 4, pooling: Any = "mean", **options: Any
@@ -399,13 +410,19 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path):
     weights = load_file(partial / "model.safetensors")
     del weights[weight]
     save_file(weights, partial / "model.safetensors", metadata={"format": "pt"})
+    narrow = with_narrow_projection(models["clip"], tmp_path / "narrow")
     absent, texts = "openai/clip-not-here", batch_of(CAPTIONS)
     cases = [
         (lambda: LearnedTokens(16, heads=2)(batch_of()), "no captions"),
         (lambda: ActionLabels(4, 2)(batch_of()), "choose data with labels"),
         (lambda: encoder("some/model")(batch_of()), "some/model: this batch has no captions"),
         (lambda: ActionLabels(4, 0), "action labels"),
-        (lambda: encoder(models["bert"])(texts), rf"features=4: .*{WIDTH}"),
+        (lambda: encoder(models["bert"])(texts), rf"features=4 .* Set condition\.features={WIDTH}"),
+        (
+            lambda: encoder(narrow, WIDTH, "projection")(texts),
+            rf"pooled vectors .* width 6, but .* width {WIDTH}\. "
+            rf"Set condition\.pooling=mean condition\.features={WIDTH}",
+        ),
         (lambda: encoder(str(partial), WIDTH)(texts), rf"missing.*{weight}"),
         (
             lambda: encoder(absent, revision="abc0" * 10)(texts),

@@ -350,8 +350,8 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
     kick.save(tmp_path / "mixamo.glb", rig="mixamo")
     hero = tmp_path / "hero.glb"
     for change, message in (
-        (unskinned, "0 skeletons with a skin"),
-        (lambda d: with_joint(d, "other", 1), "2 skeletons with a skin"),
+        (unskinned, "one skeleton with a skin, but found 0"),
+        (lambda d: with_joint(d, "other", 1), "one skeleton with a skin, but found 2"),
         (
             lambda d: with_joint(d, "mixamorig:LeftLeg", 0),
             r"2 joints for left_knee: mixamorig:LeftLeg, mixamorig:L",

@@ -329,7 +329,8 @@ def test_values_of_wrong_kinds_are_refused_when_a_model_is_loaded(attacked, trai
         attacked("sample", f"ckpt={path}", TEXT, says="increasing steps")
     attacked("evaluate", f"ckpt={changed(config__data=3)}", "extractor=none", "quick=true")
     refuses(
-        model_file(bad / "x.safetensors", trained, text='{"a":' * 100_000), "x.safetensors: damaged"
+        model_file(bad / "x.safetensors", trained, text='{"a":' * 100_000),
+        "x.safetensors is damaged",
     )
 
 

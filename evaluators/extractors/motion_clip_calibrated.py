@@ -72,7 +72,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """Returns features (B, E) of length `LENGTH` of captions."""
+        """Returns the features (B, E) of captions, scaled to the norm `LENGTH`."""
         return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:

@@ -57,11 +57,11 @@ def read_model_file(path: Path) -> dict[str, Any]:
         number = content["format"]
         model = {name: content[name] for name in ("config", "facts", "origin")}
     except (ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path}: damaged: its recipe cannot be read") from error
+        raise UserError(f"{path} is damaged: its recipe cannot be read") from error
     check_format(path, number)
     if metadata.get("sha256") != content_sha256(text, state):
         raise UserError(
-            f"{path}: damaged: it has changed since it was written. Download or export it again"
+            f"{path} is damaged: it has changed since it was written. Download or export it again"
         )
     return checked(path, model | {"state_dict": state})
 
@@ -172,7 +172,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
     }
     check_plain(metadata, _Metadata, path)
     if not isinstance(content["state_dict"], dict):
-        raise UserError(f"{path}: damaged: its weights are not a mapping of tensors")
+        raise UserError(f"{path} is damaged: its weights are not a mapping of tensors")
     check_weights(content["state_dict"], path)
     return content | {"config": renamed(content["config"])}
 
@@ -195,12 +195,12 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
         if not is_dense or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
             shown = f"{str(name)[:80]} is {getattr(value, 'dtype', type(value).__name__)}"
             raise UserError(
-                f"{path}: damaged: its weights are not dense tensors of real numbers by name: {shown}"
+                f"{path} is damaged: its weights are not dense tensors of real numbers by name: {shown}"
             )
     # The factor 2 allows for tensors that two names share, since the file holds them only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())
     if size > 2 * path.stat().st_size:
-        raise UserError(f"{path}: damaged: its weights are declared to be larger than the file")
+        raise UserError(f"{path} is damaged: its weights are declared to be larger than the file")
 
 
 def write_model_file(

@@ -31,11 +31,15 @@ class AuditSettings(DataSettings):
         model_source,
     )
     protocol: str | None = option(
-        None, "protocol whose metrics are audited; default: synthetic or text_to_motion"
+        None,
+        "protocol whose metrics are audited; default: synthetic for data=synthetic, otherwise "
+        "text_to_motion",
     )
     split: Literal["train", "val", "test"] = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all motions of the split")
-    resamples: int = option(100, "number of bootstrap resamples of motions, for the intervals")
+    resamples: int = option(
+        100, "number of bootstrap resamples of the motions for the confidence intervals"
+    )
     cards: list[str] | None = option(
         None, "one card (.json) to render again, or two cards to render side by side"
     )

@@ -26,8 +26,8 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
     Converts a motion file, or all motion files in a folder and its subfolders. The nearest
     skeleton.yaml, in the folder of the file or above it, applies (docs/own-data.md).
 
-    Inputs: .npz of `make sample` and of AMASS, .bvh, animations in .fbx, .glb, .vrm and .vrma,
-    .amc with its .asf, .json, and .npy with joint positions.
+    Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from `make
+    sample` or AMASS; .json; and .npy with joint positions.
 
     Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines, .vrma for VRM
     avatars, .npz in the layout of AMASS, .json and .npy with joint positions, and .mp4 and .gif

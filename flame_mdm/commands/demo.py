@@ -23,7 +23,7 @@ class DemoSettings:
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(
-        list, "adapters of the first model, separated by spaces, from which users choose"
+        list, "adapters of the first model that users can choose from, separated by spaces"
     )
     host: str = option(
         "127.0.0.1",

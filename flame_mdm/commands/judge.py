@@ -38,7 +38,9 @@ class JudgeSettings(BodySettings, FileSettings):
     motion: str = required(
         "a motion file with SMPL's 22 joints, or a folder of motion files", existing
     )
-    text: str | None = option(None, "the sentence; default: the text in each motion file")
+    text: str | None = option(
+        None, "sentence to check the motions against; default: the text in each motion file"
+    )
     out: str | None = option(None, "HTML file; default runs/judge/<name>.html")
     clips: int = option(
         24, "maximum number of motions in the player, which shows the worst motions", above_zero

@@ -75,7 +75,8 @@ class SampleSettings(OutputSettings, WritingSettings):
     format: str | None = option(None, "format of a set's files: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(
         None,
-        "chooses the candidate that fits the text best: claims, or a motion-CLIP",
+        "how the candidate that fits the text best is chosen: claims (most true "
+        "and fewest false claims, see docs/referee.md), or a motion-CLIP (run or file)",
         scorer_source,
     )
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")

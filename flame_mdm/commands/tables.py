@@ -45,7 +45,9 @@ class TablesSettings:
     )
     batch_size: int = option(64, "motions per batch")
     force: bool = option(
-        False, "generate even if real motions do not have the values that the protocol expects"
+        False,
+        "generate motions even if the metrics of the real motions differ from the values that "
+        "the protocol expects; the result is marked as not valid",
     )
     data_root: str = option(
         "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"

@@ -45,8 +45,8 @@ def read_prompt(
         facts: facts of the model.
         max_words: maximum number of words that the model reads in a caption; None = no limit.
         splits: whether a sentence of several actions becomes one part per action; for texts of a single part.
-        check_words: whether the model's words for actions replace the words of the text, and a text is refused if
-            the model knows no word of it that says what happens.
+        check_words: whether the model's words for actions replace the words of the text, and a
+            text is refused if the model knows none of its content words.
 
     Raises:
         UserError: If the model does not know what a part says.

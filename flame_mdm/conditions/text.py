@@ -221,10 +221,18 @@ class PretrainedText(ConditionEncoder):
             first = (hidden * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
         else:
             first = hidden[:, 0]
-        if first.shape[1] != self.features or hidden.shape[2] != self.features:
-            widths = f"vectors of width {first.shape[1]} and tokens of width {hidden.shape[2]}"
+        pooled_width, token_width = first.shape[1], hidden.shape[2]
+        if pooled_width != token_width:
             raise UserError(
-                f"condition.features={self.features}: set it to the width of the text encoder, which has {widths}"
+                f"condition.pooling={self.pooling}: the pooled vectors of this text encoder have "
+                f"width {pooled_width}, but its tokens have width {token_width}. Set "
+                f"condition.pooling=mean condition.features={token_width}"
+            )
+        if self.features != token_width:
+            raise UserError(
+                f"condition.features={self.features} does not match the text encoder, whose "
+                f"vectors and tokens have width {token_width}. Set "
+                f"condition.features={token_width}"
             )
         token_mask = torch.ones_like(mask) if self.attend_padding else mask
         size = hidden.shape[1] if self.tokens else 0

@@ -132,15 +132,15 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
 
 def check_known(text: str, facts: Mapping[str, Any]) -> None:
-    """Checks that a model knows a word of a text that says what happens.
+    """Checks that a model knows at least one content word of a text.
 
     Raises:
-        UserError: If it knows no such word.
+        UserError: If it knows none of them.
     """
     if facts.get("vocabulary") and unknown_words(text, facts) == _content(text):
         instead = _suggested(text, facts) or " Use words of its training captions"
         raise UserError(
-            f"'{shortened(text, 60)}': the model knows no word of it that says what happens.{instead}"
+            f"'{shortened(text, 60)}': the model knows none of its content words.{instead}"
         )
 
 

@@ -189,7 +189,10 @@ class LessonData(MotionDataModule):
         ]
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
-        """Returns the endless batches of a process; see `MotionDataModule.training_batches`."""
+        """Returns an endless stream of batches for one rank.
+
+        See `MotionDataModule.training_batches`.
+        """
         halves, smaller = self.halves(), self.batch_size // 2
         sizes = (self.batch_size - smaller, smaller)
         streams = [

@@ -77,7 +77,10 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
     show_as(str(folder), str(path))
     for name, content in members(path, is_wanted):
         if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
-            raise UserError(f"{path}: {name[:80]} leads out of the archive")
+            raise UserError(
+                f"{path}: the file {name[:80]} would be unpacked outside the "
+                f"folder. Remove it from the archive"
+            )
         with naming(path, OSError, ValueError, prefix="cannot be unpacked: "):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)

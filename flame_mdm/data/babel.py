@@ -26,7 +26,7 @@ LENGTH, STRIDE = 128, 10
 Segment = tuple[str, list[str] | None, float | None, float | None]
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
-# Files of each part. In files called extra, only the labels of the first annotator are used.
+# Files of each part. In the `extra_*` files, only the labels of the first annotator are used.
 PARTS = {
     "train": ("train", "extra_train"),
     "val": ("val", "extra_val"),
@@ -61,8 +61,8 @@ class Babel(MotionSource):
     ends before the clip.
 
     Both splits train on BABEL's entire train part and test on 20 % of its val part. Our split
-    draws 20 % of the motions, so no motion is in two splits. FLAME's split takes every fifth
-    clip, so overlapping windows are in both val and test.
+    draws 20 % of the motions, not of the clips, so no motion is in both val and test. FLAME's
+    split takes every fifth clip, so overlapping windows are in both val and test.
 
     Args:
         path: folder of BABEL v1.0.

@@ -50,7 +50,7 @@ class LiveStream:
 
 
 class LiveStreams:
-    """The streams of all visitors on one model.
+    """The streams of all visitors, generated with one model.
 
     Args:
         model: a model that continues frames.

@@ -133,7 +133,8 @@ def read_skinned(path: Path) -> Character:
         ]
     if len(skeletons) != 1:
         raise UserError(
-            f"{path}: {len(skeletons)} skeletons with a skin, not one. Export one mesh with its armature"
+            f"{path}: expected one skeleton with a skin, but found {len(skeletons)}. Export "
+            f"one mesh with its armature"
         )
     joints = identify(path, {joint: file.names[joint] for joint in sorted(skeletons[0])})
     worlds, corners = _rest(file, joints["pelvis"])

@@ -137,7 +137,7 @@ def read(path: Path) -> Record:
     except (ValueError, struct.error, zlib.error, UnicodeDecodeError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(f"{path}: a damaged FBX file: {error}") from error
+        raise UserError(f"{path}: damaged FBX file ({error})") from error
 
 
 class _Reader:

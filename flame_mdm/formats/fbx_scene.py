@@ -128,7 +128,7 @@ class _Model:
 
     name: str
     properties: dict[str, tuple[float, ...]]
-    parent: int = 0  # id of the model above; 0 = the scene
+    parent: int = 0  # id of the parent model; 0 = the scene
     curves: dict[str, dict[int, Curve]] = field(default_factory=dict)
 
     def vector(self, name: str, default: tuple[float, float, float] = ZERO) -> np.ndarray:
@@ -195,7 +195,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except (ValueError, TypeError, IndexError, OverflowError) as error:
-        raise UserError(f"{path}: a damaged FBX file: {error}") from error
+        raise UserError(f"{path}: damaged FBX file ({error})") from error
 
 
 def animations(path: Path) -> list[str]:
@@ -204,7 +204,7 @@ def animations(path: Path) -> list[str]:
     try:
         return [name for name, _ in _Scene(root).takes()]
     except (ValueError, TypeError, IndexError) as error:
-        raise UserError(f"{path}: a damaged FBX file: {error}") from error
+        raise UserError(f"{path}: damaged FBX file ({error})") from error
 
 
 class _Scene:

@@ -327,7 +327,7 @@ def slide(motion: GroundedMotion) -> float:
 def pivot(motion: GroundedMotion) -> float:
     """Returns the maximum angle in degrees by which a foot turns during one contact.
 
-    The angle is about the vertical.
+    The angle is measured about the vertical axis.
     """
     joints = motion.world()
     angles = [0.0]

@@ -48,7 +48,7 @@ class Process(nn.Module, ABC):
     #: Samplers by name.
     samplers: Mapping[str, Sampler] = {}
 
-    #: Whether losses are averaged over the padded length, with noise 0 in the padding.
+    #: Whether losses are averaged over the padded length, with zero noise in the padding.
     average_padding: bool = False
 
     @abstractmethod

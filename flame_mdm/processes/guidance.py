@@ -107,8 +107,8 @@ def steer(
     """Leads noisy motions toward positions in the world.
 
     Each step follows the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
-    sampling"), so the entire body adapts in the way that the denoiser prefers. The step has
-    Polyak's length, but at most `STEERING_LIMIT`.
+    sampling"), so the entire body moves with the joints in a way that is plausible to the
+    denoiser. The step has Polyak's length, but at most `STEERING_LIMIT`.
 
     Args:
         clean: returns the clean estimate (B, F, D) of a noisy motion.

@@ -345,9 +345,9 @@ def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     """Integrates with adaptive steps of order 5 (Dormand and Prince 1980).
 
-    As in MFM, rtol = atol = 1e-5. The error is measured over the entire batch, so a motion
-    depends on the rest of its batch, up to the tolerance. The last step may go beyond the last
-    time; the solver then interpolates back.
+    As in MFM, rtol = atol = 1e-5. The error is measured over the entire batch, so a motion varies
+    with the other motions in its batch, but only within the tolerance. The last step may go
+    beyond the last time; the solver then interpolates back.
 
     Args:
         x: (B, F, D) motion at time t.

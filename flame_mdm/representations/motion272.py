@@ -95,7 +95,7 @@ class Motion272(Representation):
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes velocity, turn and positions of features to joints (..., F, 22, 3).
+        """Decodes the velocity, turn and positions in the features into joints (..., F, 22, 3).
 
         Features are (..., F, 272). The decoding is differentiable.
         """
@@ -123,7 +123,8 @@ class Motion272(Representation):
         """
         inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1
-        while step < features.shape[-2]:  # computes all products of turns in log2(F) steps
+        # Computes the cumulative products of the turns in log2(F) steps.
+        while step < features.shape[-2]:
             inverse = torch.cat(
                 [inverse[..., :step, :, :], inverse[..., step:, :, :] @ inverse[..., :-step, :, :]],
                 -3,

@@ -20,8 +20,9 @@ ADULT = (
 )
 """Position of each of SMPL's 24 joints relative to its parent in the rest pose, in meters.
 
-In the rest pose, the arms are out, and the body faces +z, y up. The positions replace the
-licensed model files. They are bone lengths of HumanML3D's reference clip, rounded and symmetric.
+In the rest pose, the arms are stretched out to the sides, the body faces +z, and y points up. The
+positions replace the licensed model files. They are bone lengths of HumanML3D's reference clip,
+rounded and symmetric.
 """
 
 

@@ -476,7 +476,8 @@ def check_members(count: int) -> None:
     """Raises `UserError` if an archive has too many members."""
     if count > MAX_MEMBERS:
         raise UserError(
-            f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and name the folder"
+            f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and give the path "
+            f"of the folder instead"
         )
 
 

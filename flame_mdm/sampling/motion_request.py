@@ -59,7 +59,7 @@ class EditRequest:
     """The part of a motion to resample, and the method: keywords of `flame_mdm.edit`.
 
     Raises:
-        UserError: If a value is invalid for every motion.
+        UserError: If a value is invalid regardless of the motion.
 
     Example:
         >>> EditRequest(region_seconds=[[0, 1], [3, 4]], joints="left_arm").ranges
@@ -178,8 +178,9 @@ class SamplingRequest:
     actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
     seconds: float | Sequence[float] | None = option(
         None,
-        "length of the motion, or a list with one length per text. In a sequence, it is the length of each part "
-        "without seconds in the text. Default: 3, or the longest motion in training if that is shorter",
+        "length of the motion in seconds, or a list with one length per text. In a sequence, the "
+        "length of each part whose text does not state one (@2). Default: 3, or the longest "
+        "motion in training if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
         None, "length in frames, or a list of lengths, instead of seconds"

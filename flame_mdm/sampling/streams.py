@@ -131,8 +131,7 @@ class Stream(Iterator[Motion]):
             at: time in seconds since the start of the stream. Default: the end of the last block.
 
         Raises:
-            UserError: If the model knows no word of the text that says what happens, or the time
-                has passed.
+            UserError: If the model knows no content word of the text, or the time has passed.
         """
         fps = self._streams.model.representation.fps
         frame = self.frames if at is None else round(at * fps)
@@ -298,8 +297,8 @@ class Streams(Iterator[list[Motion]]):
 
     Attributes:
         schedules: conditions of each stream over its frames.
-        texts: texts as they were typed, by condition. They name the blocks. A missing condition
-            is its own text.
+        texts: the text as it was typed, by condition; used to name the blocks. A condition
+            without an entry is used as its own name.
         frames: number of frames of each stream so far.
         targets: positions that a single stream reaches. The guidance of sampling leads to them
             and, if the model was trained with targets, also its own condition. None = no targets.

@@ -87,7 +87,8 @@ class DistillationTask(GeneratorTask):
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
         self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
-        # In lists, since they are not submodules of the student.
+        # The networks are kept in lists, so that they are not registered as submodules of the
+        # student.
         denoiser = self.generator.denoiser
         self.teacher, self.target = [copy.deepcopy(denoiser).requires_grad_(False)], [denoiser]
 

@@ -43,9 +43,10 @@ def write_gif(
 ) -> None:
     """Writes a looping animation of motions side by side, with captions below.
 
-    Each motion has a panel of `size` pixels. The animation has the highest frame rate of the
-    motions, but at most 50 frames per second, the limit of the format. A motion that ends earlier
-    stays at its last frame. `body` is the body to draw; None = the mannequin.
+    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second: the frame
+    rate is the highest frame rate of the motions, divided by the smallest whole number that
+    gives 50 or less. For example, 60 fps become 30, and 120 fps become 40. A motion that ends
+    earlier stays at its last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)

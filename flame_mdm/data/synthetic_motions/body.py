@@ -136,8 +136,8 @@ class Body:
     def joints(self) -> np.ndarray:
         """Returns joint positions (F, 22, 3) in meters, y up."""
         # Footprints are fixed first, so that feet never slide. The pelvis is placed above them.
-        # The legs reach from the hips to the feet by inverse kinematics. Spine, head and arms
-        # follow from angles.
+        # Inverse kinematics connects the hips to the feet. Spine, head and arms follow from
+        # angles.
         out = np.empty((len(self.t), 22, 3))
         yaw, (pitch, twist, roll) = self.heading, self.pelvis
         pelvis = rotation(1, yaw) @ rotation(1, twist) @ rotation(0, pitch) @ rotation(2, -roll)

@@ -23,7 +23,7 @@ SHORTEST = 0.4
 END = 0.6
 # Seconds for which the posture must be held there
 HELD = 0.2
-# Maximum break, in seconds, of something that lasts
+# Maximum interruption, in seconds, of a state or activity whose duration is measured
 BREAK = 0.5
 
 
@@ -251,7 +251,7 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 
 
 def _duration(body: Body, claim: Claim) -> Reading:
-    """Measures how long a claim is true, without a break of more than `BREAK` seconds.
+    """Measures how long a claim is true, without an interruption of more than `BREAK` seconds.
 
     The score is minus the difference from the claimed seconds, in doublings. It is undecided if
     the claim without its duration is not true.

@@ -27,6 +27,7 @@ from flame_mdm.batch import Condition, length_mask
 from flame_mdm.checkpoints import onnx_export as onnx
 from flame_mdm.checkpoints import runner
 from flame_mdm.conditions import vocabulary
+from flame_mdm.data.standing import standing
 from flame_mdm.errors import UserError
 from flame_mdm.formats import fbx_scene
 from flame_mdm.formats.poses import solve
@@ -349,9 +350,21 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def gliding() -> MotionGenerator:
+    """A tiny model with random weights that reads the words of the package's model; the person glides forward."""
+    model = untrained(TINY_DIP, 40, "synthetic/dip")
+    model.add_facts(flame_mdm.load("quickstart").facts | {"max_frames": 40})
+    still = standing(model.representation, 10).features[0]
+    model.representation.mean.copy_(torch.from_numpy(still))
+    model.representation.mean[2] = 0.05
+    model.representation.std.fill_(0.01)
+    return model
+
+
+@pytest.fixture(scope="module")
+def folder(gliding: MotionGenerator, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("web") / "page"
-    script("tools/web.py").build(flame_mdm.load("quickstart"), out)
+    script("tools/web.py").build(flame_mdm.load("quickstart"), out, gliding)
     return out
 
 
@@ -509,3 +522,111 @@ def test_the_length_in_a_link_is_checked(served: tuple[Path, str], tmp_path: Pat
     with browser(tmp_path / "profile") as tab:
         tab.open(f"{served[1]}#seconds=1e9")
         assert tab.wait(DONE, 60) == "seconds=1000000000: give 0.1 to 3 seconds"
+
+
+# The page of a stream -------------------------------------------------------------------------------------------------
+
+STREAM_TEXTS = ("a person waves with the right hand", "a person sits down", "a person jumps")
+RECORD = """
+window.requests = []
+const { source } = live, { block } = source
+source.block = (request) => { requests.push(request); return block(request) }
+"""
+
+
+def streamed(model: MotionGenerator, first: str, requests: list[dict[str, Any]]) -> np.ndarray:
+    """Returns the joints (F, J, 3) of a stream of the package that gets the requests of the page after the first."""
+    running = flame_mdm.stream(model, first, seed=5)
+    joints = next(running).joints
+    for request in requests:
+        running.lead(request["path"])
+        running.go_back(request["from"] / 20)
+        running.change(request["text"])
+        joints = np.concatenate([joints[: request["from"]], next(running).joints])
+    return joints
+
+
+def click_floor(tab: Tab, right: float, down: float) -> None:
+    """Clicks in the player, at shares of its width and height."""
+    rectangle = "(r => [r.x, r.y, r.width, r.height])(document.querySelector('#live iframe').getBoundingClientRect())"
+    x, y, width, height = tab.run(rectangle)
+    for kind in ("mousePressed", "mouseReleased"):
+        place = {"x": x + right * width, "y": y + down * height}
+        tab.send("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **place)
+
+
+@of_page
+def test_the_page_streams_the_motion_of_the_package_while_texts_are_typed(
+    gliding: MotionGenerator, served: tuple[Path, str], tmp_path: Path
+) -> None:
+    with browser(tmp_path / "profile") as tab:
+        tab.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        tab.open(f"{served[1]}live.html#seed=5")
+        failed = "document.querySelector('#status.error')?.textContent"
+        assert tab.wait(f"document.body?.dataset.ready || {failed}", 120) == "true"
+        first = tab.run(f"{RECORD}; live.page.read(live.text)")
+        for number, text in enumerate(STREAM_TEXTS):
+            before = tab.run("joints().slice(0, live.frame + 1)")
+            tab.type("#live input", text)
+            tab.click("#live form button")
+            tab.wait(f"live.log[{number}]?.shown", 60)
+            assert tab.run(f"joints().slice(0, {len(before)})") == before, "shown frames stay"
+        tab.type("#live input", "xyzzy plugh")
+        tab.click("#live form button")
+        assert "Nearest in meaning" in tab.wait("document.querySelector('#live p').textContent")
+        chips = "[...document.querySelectorAll('.texts button')].map((e) => e.textContent)"
+        assert tab.run(chips)[:3] == list(STREAM_TEXTS[::-1])
+
+        # The person goes to a waypoint, which is drawn until then, and stops.
+        click_floor(tab, 0.4, 0.9)
+        tab.wait("live.text === live.page.walk && live.points.length === 1")
+        tab.wait("!live.points.length && live.text === live.page.text", 60)
+        assert tab.run("requests.some(({ path }) => path.length)")
+
+        # Frames do not run out.
+        tab.run("live.clock.slowest = 1; void 0")
+        begin = tab.run("live.frame")
+        tab.wait(f"live.frame > {begin + 120}", 60)
+        assert tab.run("live.clock.slowest") > 0.5
+
+        tab.click("#live .pause")
+        tab.wait("!live.busy && live.clock.paused")
+        requests, shown = tab.run("requests"), np.array(tab.run("joints()")).reshape(-1, 22, 3)
+        expected = streamed(gliding, first, requests)
+        assert shown.shape == expected.shape
+        assert np.abs(shown - expected).max() < 0.002
+        plain = streamed(gliding, first, [request | {"text": first} for request in requests])
+        assert np.abs(plain - expected).max() > 0.01, "texts change the motion"
+
+        steps = np.linalg.norm(np.diff(shown, axis=0), axis=-1).max(1)
+        seams = np.isin(np.arange(1, len(shown)), [request["from"] for request in requests])
+        assert steps[seams].max() < 1.5 * steps[~seams].max()
+
+        tab.click("#live .bvh")
+        while not (tmp_path / "stream.bvh").exists():  # until the time of the test is up
+            tab.run("new Promise((done) => setTimeout(done, 50))")
+        saved = read(tmp_path / "stream.bvh").joints
+        assert np.abs(saved - shown[-len(saved) :]).max() < 0.05
+        assert tab.errors == []
+
+
+@of_page
+def test_a_click_on_a_waypoint_removes_it(served: tuple[Path, str], tmp_path: Path) -> None:
+    with browser(tmp_path / "profile") as tab:
+        tab.open(f"{served[1]}live.html")
+        tab.wait("document.body?.dataset.ready", 120)
+        tab.run("live.pause(true)")
+        click_floor(tab, 0.2, 0.8)
+        click_floor(tab, 0.8, 0.8)
+        tab.wait("live.points.length === 2")
+        click_floor(tab, 0.2, 0.05)  # above the horizon
+        places = tab.run("live.points.map(({ place }) => place)")
+        click_floor(tab, 0.2, 0.8)
+        tab.wait("live.points.length === 1")
+        assert tab.run("live.points[0].place") == places[1]
+        tab.click("#live .clear")
+        assert tab.run("live.points.length") == 0
+        tab.run("for (let k = 0; k < 17; k++) live.addPoint([k, 1])")
+        assert tab.run("live.points.length") == 16
+        assert "at most 16" in tab.run("document.querySelector('#live p').textContent")
+        assert tab.errors == []

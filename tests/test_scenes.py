@@ -120,7 +120,9 @@ def test_a_key_acts_on_scenes_or_is_refused(tmp_path: Path):
     lying = read(file, up="z")
     assert any("lying" in note for note in lying.notes)
     synthetic("kick").save(tmp_path / "kick.npz")
-    with pytest.raises(UserError, match=r"animation=Walk has no effect, \.npz files have one"):
+    with pytest.raises(
+        UserError, match=r"animation=Walk has no effect, because \.npz files have one animation"
+    ):
         read(tmp_path / "kick.npz", animation="Walk")
 
 

@@ -29,20 +29,25 @@ class EvaluationKeys:
     )
     extractor: str | None = option(
         None,
-        "motion-CLIP or another extractor that the protocol requires: a path; none = no extractor",
+        "path of the motion-CLIP or other extractor that the protocol requires; none = no "
+        "extractor",
     )
     smpl: str | None = option(
         lambda: os.environ.get("FLAME_MDM_SMPL"),
         "SMPL's model file (.pkl or .npz), to compute joints",
     )
     from_samples: str | None = option(
-        None, "a folder with the motions of another system, instead of ckpt; needs data="
+        None,
+        "folder with the motions of another system, which are evaluated instead of "
+        "ckpt; needs data=",
     )
     baseline: str | None = option(
-        None, "real, shuffled, noisy or static motions, instead of ckpt; needs data="
+        None,
+        "baseline to evaluate instead of ckpt: real, shuffled, noisy or static "
+        "motions; needs data=",
     )
-    split: Literal["train", "val", "test"] = option("test", "train, val or test")
-    seed: int = option(0, "seed of the noise and of the drawn motions")
+    split: Literal["train", "val", "test"] = option("test", "split to evaluate: train, val or test")
+    seed: int = option(0, "seed of the noise and of the random choice of motions")
     replications: int | None = option(
         None, "repetitions of the evaluation, instead of the protocol's number; noted in the result"
     )
@@ -51,8 +56,7 @@ class EvaluationKeys:
     )
     resamples: int = option(
         0,
-        "number of sets of motions, such as 200, that are drawn with replacement for 95 % "
-        "intervals",
+        "number of bootstrap resamples of the motions, such as 200, for 95 % confidence intervals",
     )
     multimodality: bool = option(
         True, "false = skip metrics that need several samples per prompt; noted in the result"
@@ -71,7 +75,7 @@ class EvaluationKeys:
     batch_size: int | None = option(
         None, "motions per batch; default: 64, or the protocol's number if it measures time"
     )
-    device: str | None = option(None, "default: cuda if available")
+    device: str | None = option(None, "cpu or cuda; default: cuda if available")
     data_root: str = option(
         "", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA"
     )

@@ -211,10 +211,10 @@ class WritingSettings:
     """Keys of written motion files."""
 
     rig: str | None = option(
-        None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style"
+        None, "skeleton of OUT: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style"
     )
     root_motion: bool = option(
-        False, "true = with rig=unreal or rig=soma, the root follows the hips on the floor"
+        False, "for rig=unreal or rig=soma: true = the root bone follows the hips on the floor"
     )
     resample: float | None = option(
         None, "frames per second of OUT; default: the frame rate of the motion"

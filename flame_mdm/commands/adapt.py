@@ -31,8 +31,8 @@ class AdaptSettings(ModelSettings):
     force: bool = option(False, "true = accept clips that drift upward or float")
     rank: int = option(
         8,
-        "rank of the changes of the weights; increase it for motions that differ much from the "
-        "model's training data",
+        "rank of the low-rank changes to the weights; increase it for motions that differ "
+        "much from the model's training data",
         above_zero,
     )
     data_root: str = option(usual_data_root, "folder of the prepared data sets")

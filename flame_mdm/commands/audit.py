@@ -26,8 +26,8 @@ class AuditSettings(DataSettings):
     OBJECTS: ClassVar = ("data", "extractor")
     extractor: str | None = option(
         None,
-        "motion-CLIP or another extractor that the protocol requires: a path; none = "
-        "metrics of joints",
+        "path of the motion-CLIP or other extractor that the protocol requires; none = audit "
+        "the metrics of joints",
         model_source,
     )
     protocol: str | None = option(
@@ -35,7 +35,9 @@ class AuditSettings(DataSettings):
         "protocol whose metrics are audited; default: synthetic for data=synthetic, otherwise "
         "text_to_motion",
     )
-    split: Literal["train", "val", "test"] = option("test", "train, val or test")
+    split: Literal["train", "val", "test"] = option(
+        "test", "split whose motions are used: train, val or test"
+    )
     samples: int | None = option(None, "number of motions; default: all motions of the split")
     resamples: int = option(
         100, "number of bootstrap resamples of the motions for the confidence intervals"

@@ -28,12 +28,12 @@ class BrowseSettings(BodySettings, DataSettings):
     source: str | None = option(
         None, "source folder or archive, if the data set is not prepared yet and requires a source"
     )
-    split: Split | None = option(None, "train, val or test; default: all")
+    split: Split | None = option(None, "split: train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
     clips: int = option(
         200,
-        "maximum number of clips, which are evenly spaced; mirrored copies come with their "
-        "originals",
+        "maximum number of clips, taken at even intervals; mirrored copies are shown with "
+        "their originals",
         above_zero,
     )
     motions: str | None = option(None, "also write the shown clips to this folder, as motion files")

@@ -52,7 +52,8 @@ class CompareSettings(BodySettings):
     )
     prompts: str | None = option(
         None,
-        "a file with one prompt per line, which each last.ckpt samples; default: the captions "
+        "file with one prompt per line, for which the last.ckpt of each run is sampled; "
+        "default: the captions "
         "of the first folder of motion files or, without such a folder, the newest samples of "
         "each run",
     )
@@ -66,7 +67,9 @@ class CompareSettings(BodySettings):
         False,
         "write a rating page that compares motions of the first run with motions of each other run",
     )
-    ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")
+    ratings: list[str] | None = option(
+        None, "files that the rating page saved; their ratings are counted"
+    )
     out: str | None = option(
         None, "file to write; default: runs/compare.html, runs/rate.html or runs/ratings.json"
     )

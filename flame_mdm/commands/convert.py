@@ -46,10 +46,10 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
         ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; or .mp4 or .gif to watch"
     )
     format: str | None = option(
-        None, "if MOTION is a folder: ending of the files in the folder OUT"
+        None, "if MOTION is a folder: extension of the files in the folder OUT"
     )
     rest_pose: bool = option(
-        False, "true = a .bvh file begins with a frame of the rest pose, with the arms out"
+        False, "true = the first frame of a .bvh file is the rest pose, with the arms stretched out"
     )
 
 

@@ -27,7 +27,7 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     )
     samples: int = same_option(SamplingRequest, "samples", default=3)
     cut: Sequence[float] | None = option(
-        None, "[begin, end] in seconds: use only this part of the motion"
+        None, "part of the motion to use: [begin, end] in seconds; default: the whole motion"
     )
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
     out: str | None = option(

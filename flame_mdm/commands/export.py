@@ -20,7 +20,8 @@ class ExportSettings(AdaptedSettings):
     OBJECTS: ClassVar = ("ckpt", "out")
     out: str = required("a .safetensors file or a folder; with format=onnx, a folder")
     format: Literal["safetensors", "onnx"] = option(
-        "safetensors", "safetensors, or onnx (graphs for onnxruntime, with a script that samples)"
+        "safetensors",
+        "format: safetensors, or onnx (graphs for onnxruntime, with a script that samples)",
     )
     half: bool = option(False, "true = weight matrices in half precision")
 

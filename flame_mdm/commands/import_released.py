@@ -32,7 +32,7 @@ class ImportSettings:
         True, "false = use the raw weights if the file also contains averaged weights"
     )
     num_heads: int | None = option(
-        None, "number of attention heads, if it differs from the released models"
+        None, "number of attention heads, if it differs from the number in the released models"
     )
     time_token: bool = option(
         False,

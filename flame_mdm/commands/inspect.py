@@ -51,7 +51,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     clips: int = option(
         24, "maximum number of motions in the player, which shows the worst motions", above_zero
     )
-    split: str | None = option(None, "train, val or test of a data set; default: all")
+    split: str | None = option(None, "split of a data set: train, val or test; default: all")
 
     def __post_init__(self) -> None:
         name = self.motion

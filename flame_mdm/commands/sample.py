@@ -59,7 +59,7 @@ class SampleSettings(OutputSettings, WritingSettings):
 
     OBJECTS: ClassVar = ("ckpt", "out")
     prompts: str | None = option(
-        None, "instead of text: a file with one prompt per line; each prompt gets its own folder"
+        None, "file with one prompt per line, instead of text; each prompt gets its own folder"
     )
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
@@ -70,7 +70,8 @@ class SampleSettings(OutputSettings, WritingSettings):
     candidates: int = same_option(SamplingRequest, "candidates")
     set: str | None = option(
         None,
-        "instead of text: locomotion, or a .yaml file; see docs/sampling.md#sets-for-game-engines",
+        "set of clips to sample, instead of text: locomotion, or a .yaml file; see "
+        "docs/sampling.md#sets-for-game-engines",
     )
     format: str | None = option(None, "format of a set's files: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(

@@ -86,7 +86,7 @@ class EditRequest:
         "overwrites the early part of the flow's path. Default: mdm for diffusion, mfm for flow matching",
     )
     until: float | None = option(
-        None, "for mfm: flow time up to which the path is overwritten, default 0.2"
+        None, "for mfm: last flow time at which the path is overwritten; default: 0.2"
     )
     resample: int = option(
         1, "for flame and flame_code: how many times each sampling step is taken"
@@ -188,12 +188,12 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "motions generated for each motion that is kept: the best motion without faults, or the best of all if all "
-        "have faults",
+        "number of motions generated for each motion that is kept. Keeps the best motion "
+        "without faults, or the best of all if all have faults",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(
-        None, "FILE or dataset:id: a motion that the result continues"
+        None, "motion that the result continues: FILE or dataset:id"
     )
     split: bool = option(
         True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
@@ -202,15 +202,18 @@ class SamplingRequest:
         False, "true = the last frame leads to the first one, for motions that are repeated"
     )
     targets: str | Path | Mapping[str, Any] | None = option(
-        None, "a JSON file of waypoints, joint positions and poses to reach: docs/targets.md"
+        None, "JSON file with waypoints, joint positions and poses to reach; see docs/targets.md"
     )
     path: str | Waypoints | None = option(
         None, 'waypoints on the floor, x,z in meters, instead of targets: "0,1 0.5,2"'
     )
     shared_noise: bool = option(
-        False, "the same noise for all motions, which then differ only by text and length"
+        False,
+        "true = use the same noise for all motions, so that they differ only by text and length",
     )
-    cleanup: bool = option(False, "smooth motions, constant bone lengths, feet that do not slide")
+    cleanup: bool = option(
+        False, "true = smooth the motions, keep bone lengths constant, and keep feet from sliding"
+    )
     options: SamplerOptions = field(default_factory=SamplerOptions)
     editing: EditRequest | None = None
 

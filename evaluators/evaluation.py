@@ -174,8 +174,8 @@ class Evaluation:
     ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
         """Measures real motions, and returns them for comparisons with the source's motions.
 
-        The comparisons of each replication have two entries: the real motions of the same clips,
-        and a set of real motions for comparisons of sets.
+        Each replication has two references: the real motions of the same clips, and a set of real
+        motions for metrics that compare sets.
         """
         scores = []
         real_sets = []

@@ -42,7 +42,7 @@ class _MotionEncoder(nn.Module):
 
 
 class MARDMClip(nn.Module):
-    """Embeds the essential features of motions, and captions, as vectors of length 1.
+    """Embeds the essential features of motions, and captions, as vectors of norm 1.
 
     `mean` and `std` (67,) normalize the features.
     """

@@ -38,7 +38,7 @@ class MotionCLIP(nn.Module):
     """A transformer over [CLS, length, frame 1, frame 2, ...],
     and a linear map of the pooled text vector.
 
-    The features are not scaled to length 1, since Fréchet distance and MID use unscaled features.
+    The features are not scaled to norm 1, since Fréchet distance and MID use unscaled features.
     The temperature is learned; its initial value is 0.07.
 
     Args:
@@ -160,7 +160,7 @@ class PooledLoss(SampleMetric):
     states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
-        """Adds features of length 1 and the inverse temperature `scale`, a scalar tensor."""
+        """Adds features of norm 1 and the inverse temperature `scale`, a scalar tensor."""
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:

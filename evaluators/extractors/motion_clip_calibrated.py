@@ -42,7 +42,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     - Texts: motions of clips with the same captions or attributes are not negatives of each
       other's captions. Near-miss captions (see `near_misses`) are additional negatives.
     - Motions: half of them have a noisy copy. The strength of its noise is drawn from [0, 1],
-      small values more often. The distance between motion and copy, both scaled to length 1, is
+      small values more often. The distance between motion and copy, both scaled to norm 1, is
       trained to be this strength. One half of the copies has white noise on the joints and is
       encoded again, like motions from files. The other half has noise on normalized features,
       like generated motions.
@@ -68,7 +68,10 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return super().parts(config, representation, actions)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of length `LENGTH` of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Returns the features (B, E) of motions, scaled to the norm `LENGTH`.
+
+        The motions (B, F, D) are in the data's units and have the mask (B, F).
+        """
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
     def text(self, captions: Sequence[str]) -> Tensor:
@@ -141,7 +144,7 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
     """Returns the mean absolute difference between distances
     of features (B, E) and `strength` (B,).
 
-    Features are scaled to length 1 before their distance is computed.
+    Features are scaled to norm 1 before their distance is computed.
     """
     distance = torch.linalg.vector_norm(
         F.normalize(motion, dim=-1) - F.normalize(copy, dim=-1), dim=-1

@@ -160,7 +160,7 @@ class MotionsForText(RPrecision):
     Args:
         pool: number of motions in a pool, including the own motion.
         seed: seed of the pools.
-        normalize: whether to scale features to length 1 first, which ranks by cosine. An
+        normalize: whether to scale features to norm 1 first, which ranks by cosine. An
             extractor trained with cosines, such as motion-CLIP, does not constrain lengths: the
             motions with the shortest features would be nearest to every text.
 
@@ -213,7 +213,7 @@ class MultimodalDistance(SampleMetric):
     (B, E), `text` (B, E) and `keys` (B,).
 
     Args:
-        normalize: whether to scale features to length 1 first, for extractors trained with
+        normalize: whether to scale features to norm 1 first, for extractors trained with
             cosines. The value is then in [0, 2].
 
     Example:

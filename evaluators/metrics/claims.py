@@ -27,7 +27,8 @@ def claims_of(caption: str) -> tuple[Claim, ...]:
 
 
 class ClaimAccuracy(Timed, MotionMean):
-    """Share of the decided claims of captions that are true of the motions. A metric of this project.
+    """Fraction of decided claims that are true. Claims are made by the captions and checked on
+    the motions. A metric of this project.
 
     The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each on
     the joints. The values are shares in [0, 1] for each group of claims, such as "side" and
@@ -110,8 +111,8 @@ class ClaimAccuracy(Timed, MotionMean):
         return {"positions": positions, "frames": frames}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the numbers of true and of decided claims (N, 2) of each motion,
-        by the name of the value.
+        """Returns the numbers of true and decided claims (N, 2) per motion, by the name of the
+        value.
         """
         pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for packed, frames, caption in zip(

@@ -122,7 +122,7 @@ class PairedMultimodality(SampleMetric):
     uses two sets of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
 
     Args:
-        samples: number of motions of each of the two sets per text.
+        samples: number of motions per text in each of the two sets.
 
     Example:
         >>> metric = PairedMultimodality(samples=1)

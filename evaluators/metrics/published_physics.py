@@ -71,8 +71,8 @@ class PublishedPhysics(Timed, JointMean):
 class MBenchQuality(PublishedPhysics):
     """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, only at 20 frames per second.
 
-    - `jitter_degree`: mean length of the second difference of joint positions, plus the mean
-      length of the second difference of positions relative to the root.
+    - `jitter_degree`: mean norm of the second difference of the joint positions, plus the same
+      mean for positions relative to the root.
     - `dynamic_degree`: the same for the first difference of the positions; higher = more motion.
     - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, otherwise 0.
     - `foot_sliding`: mean step over the ground of toes in contact.
@@ -366,10 +366,10 @@ class PhysicalFootContact(PublishedPhysics):
     acceleration without a planted foot.
 
     The score is the mean over frames of a product of three factors: the step of each foot over
-    the ground, in meters per frame, and the acceleration of the root, divided by its largest
-    value. Downward accelerations count as 0. The step of a foot is the smaller step of its ankle
-    and its toe. Motions without acceleration have no value; EDGE's code averages their NaN. Lower
-    is better.
+    the ground in meters per frame (two factors), and the acceleration of the root divided by its
+    largest value. Downward accelerations count as 0. The step of a foot is the smaller step of
+    its ankle and its toe. Motions without acceleration have no value; EDGE's code averages their
+    NaN. Lower is better.
 
     Args:
         fps: frames per second of the motions; at other rates than 30, `compute` raises

@@ -35,7 +35,7 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of a caption, of length 1;
+    """Returns the vector (C,) of a caption, of norm 1;
     `config` is the JSON of an encoder's mapping.
 
     The caption is encoded alone, not in a batch.
@@ -156,7 +156,7 @@ class MultiPositiveRPrecision(CaptionMetric):
             text.
         pool: number of motions in a pool, as in `MotionsForText`.
         seed: seed of the pools.
-        normalize: whether to scale features to length 1 first, which ranks by cosine.
+        normalize: whether to scale features to norm 1 first, which ranks by cosine.
 
     Example:
         >>> metric, features = MultiPositiveRPrecision(pool=3), torch.eye(3)

@@ -314,7 +314,7 @@ class MotionMean(SampleMetric):
 
 
 class JointMean(MotionMean):
-    """Base class of means of values that are measured on the joints of one motion at a time."""
+    """Base class of metrics that average values measured on the joints of single motions."""
 
     sees_meaning = False
 

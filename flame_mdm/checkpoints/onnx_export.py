@@ -177,8 +177,8 @@ class Probe:
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1)
-        of a draw of noise or of a clean estimate.
+        """Returns the unit vector (1, 1, 2 * calls + 1) that stands for one draw of noise or one
+        clean estimate.
         """
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
@@ -283,9 +283,9 @@ class Call(nn.Module):
     without a learned variance.
 
     Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
-    condition. The condition consists of actions (B,) int64, or of rows of the word table (B, S,
-    2) int64 with the number of tokens `counts` (B,) of each caption. `ContinuingCall` also reads
-    the frames before the motion.
+    condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)
+    int64 and `counts` (B,), the number of tokens of each caption. `ContinuingCall` also reads the
+    frames before the motion.
     """
 
     def __init__(self, model: MotionGenerator):

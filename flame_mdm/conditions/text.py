@@ -48,7 +48,7 @@ class PretrainedText(ConditionEncoder):
             then the folder in the package.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
-        normalize: scale the pooled vector to length 1.
+        normalize: scale the pooled vector to norm 1.
         tokens: return the last hidden states as tokens. Otherwise, there are 0 tokens.
         attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME
             and MFM do.

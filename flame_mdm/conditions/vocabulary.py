@@ -21,7 +21,7 @@ FUNCTION_WORDS = frozenset(
         "boy girl guy lady someone somebody will"
     )
 )
-"""Words that do not say what happens.
+"""Function words, which do not say what happens.
 
 A text of only these words says nothing. A model that does not know them gives no warning.
 """

@@ -80,7 +80,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         )
 
     def start(config: Config, task: Sequence[str]) -> int:
-        # Lightning starts further processes with these words of the command line.
+        # Lightning starts further processes with these command-line arguments.
         sys.argv = [sys.argv[0], "train", name, *task, quoted(f"run.dir={config['run']['dir']}")]
         codes.append(guarded(lambda: command(config), INTERRUPT))
         return codes[-1]

@@ -66,7 +66,7 @@ def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Pa
     members is returned.
 
     Raises:
-        UserError: As `members`, and if the name of a member leads out of the folder.
+        UserError: As `members`, and if a member would be unpacked outside the folder.
     """
     if not path.is_file():
         return path

@@ -290,7 +290,10 @@ class MotionDataModule(LightningDataModule):
         )
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
-        """Returns the endless batches of a process; see `TrainingBatches` for the arguments."""
+        """Returns an endless stream of batches for one rank.
+
+        See `TrainingBatches` for the arguments.
+        """
         return TrainingBatches(self.train.lengths, self.batch_size, **of_process)
 
     def val_dataloader(self) -> Loader:

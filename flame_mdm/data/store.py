@@ -209,7 +209,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        # This process holds the lock, so files of a process that is just ending are removed, too.
+        # This process holds the lock, so files of another process that is just ending are
+        # removed, too.
         remove_abandoned(folder.parent, folder, is_locked=True)
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():

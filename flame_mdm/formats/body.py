@@ -23,7 +23,7 @@ WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)
 # Limits of the scale of the other parts' lengths, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
-ORTHONORMAL = 0.1  # maximum error of the products of two rows of a rotation matrix
+ORTHONORMAL = 0.1  # maximum error of the dot products between rows of a rotation matrix
 LIMBS = tuple(
     JOINT[f"{side}_{name}"]
     for side in ("left", "right")

@@ -23,7 +23,7 @@ It is its own inverse.
 """
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
-"""Joint of SMPL at the same point of the body, for joints of KIT-ML with other names."""
+"""SMPL joint at the same point of the body, by KIT-ML joint; only joints with different names."""
 LEGS = tuple(
     SMPL22.joints.index(f"{side}_{name}")
     for side in ("left", "right")

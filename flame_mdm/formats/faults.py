@@ -247,5 +247,5 @@ def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Returns vectors (..., 3) scaled to length 1. A vector without length becomes 0."""
+    """Returns vectors (..., 3) scaled to norm 1. A vector without length becomes 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

@@ -90,7 +90,7 @@ class GroundedMotion:
 
 
 def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
-    """Turns points (..., 3) about the vertical by angles (...)."""
+    """Rotates points (..., 3) about the vertical axis by angles (...)."""
     cosine, sine = np.cos(angles), np.sin(angles)
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([cosine * x + sine * z, y + 0 * cosine, cosine * z - sine * x], -1)

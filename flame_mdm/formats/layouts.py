@@ -242,7 +242,8 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout of a file of `read_tree`, and the names of its joints in the layout.
+    """Returns the layout of a file that `read_tree` read, and the names of its joints in this
+    layout.
 
     `fields` of `Layout` override the known fields. Known skeletons with arrays in meters are in
     centimeters in BVH files, as written by `flame_mdm.formats`.

@@ -62,7 +62,7 @@ def spellings(name: str, opposite: str) -> list[str]:
 
 
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Returns the name of each of the `spellings` of some names.
+    """Returns a mapping from every spelling that `spellings` returns to its name.
 
     If two names have the same spelling, it means the name that is spelled exactly like it.
 

@@ -29,7 +29,8 @@ SPINE = {
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
 """For hips and shoulders: z of the direction in which knee or elbow bends in the rest pose."""
 STRAIGHT = 0.15
-"""Sine of the bend of a knee or elbow at which two cues of the limb's twist have the same weight.
+"""Sine of the bend angle of a knee or elbow at which two cues of the limb's twist have the same
+weight.
 
 The cues are the bend and the rotation of the parent. Weights are squared, so that a clear bend
 dominates.

@@ -155,8 +155,8 @@ class RiggedClip:
 
         Args:
             path: (F, 2), x and z.
-            heading: (F,), rotations about the vertical in radians; positive angles turn to the
-                left.
+            heading: (F,), rotations about the vertical axis in radians; positive angles turn to
+                the left.
         """
         joint = self.root if self.root >= 0 else max(self.moves)
         facing = np.tile(np.eye(3), (len(heading), 1, 1))
@@ -271,7 +271,7 @@ def _with_root_motion(
     """Moves the path and the direction of the hips on the floor to the root above the hips.
 
     The direction is the heading of the hips relative to the first frame's axes, a rotation about
-    the vertical.
+    the vertical axis.
     """
     root, joint = skeleton.parents[skeleton.hips], skeleton.hips
     above = skeleton.turns[root]

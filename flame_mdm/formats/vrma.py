@@ -3,8 +3,8 @@
 Source: VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A
 .vrma file is a .glb file without a mesh. It declares which nodes are the bones of a humanoid. Its
 rest pose is VRM's T-pose: limbs along the axes, feet straight ahead, soles on the floor. Programs
-apply the rotations relative to this pose, and scale the path of the hips by the ratio of the
-heights of the hips.
+apply the rotations relative to this pose, and scale the path of the hips by the ratio of the two
+hip heights.
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ def rest_rig(poses: Poses) -> Rig:
             toward = np.array(direction, float) * [sign, 1, 1]
             neutral[joint] = shortest_turns(toward[None], offsets[child][None])[0]
             offsets[child] = toward * np.linalg.norm(offsets[child])
-        # The foot turns about the vertical, so its sole stays flat.
+        # The foot turns about the vertical axis, so its sole stays flat.
         ankle, toes = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
         sideways, down, ahead = offsets[toes]
         angle = np.arctan2(sideways, ahead)

@@ -36,9 +36,9 @@ class GaussianDiffusion(Process):
         vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is
             learned. L_vlb is a sum over T steps, so it is T times the term of one step. The value
             0.001 at T = 1000 (Nichol and Dhariwal) is 1 in FLAME's code.
-        average_padding: average losses over the padded length with noise 0 in the padding, as in
-            FLAME's code. Short motions then have less weight. The denoiser must return 0 in the
-            padding.
+        average_padding: average losses over the padded length with zero noise in the padding, as
+            in FLAME's code. Short motions then have less weight. The denoiser must return 0 in
+            the padding.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
         timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
         skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the

@@ -308,7 +308,7 @@ def _facts_of(card: AuditCard, metric: str) -> AuditedMetric:
 def _cell(
     card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
 ) -> tuple[str, str]:
-    """Returns the text of a cell of the summary, and the CSS class of the cell."""
+    """Returns the text and the CSS class of a cell in the summary."""
     response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
     if perturbation is None or metric not in card.metrics:
         return "not computed", "faint"

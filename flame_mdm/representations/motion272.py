@@ -133,7 +133,8 @@ class Motion272(Representation):
         x, z = features[..., self.slices["root_velocity"]].unbind(-1)
         velocity = torch.stack([x, torch.zeros_like(x), z], -1)
         world = (velocity[..., 1:, None, :] @ inverse[..., :-1, :, :])[..., 0, :]
-        level = world * world.new_tensor([1.0, 0.0, 1.0])  # generated turns may not be about y
+        # generated turns are not always about the y axis
+        level = world * world.new_tensor([1.0, 0.0, 1.0])
         return inverse, torch.cat([velocity[..., :1, :], level], -2).cumsum(-2)
 
     def rebase(self, features: Features) -> Features:

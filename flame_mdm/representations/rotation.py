@@ -281,7 +281,7 @@ def continuous(quaternion: Tensor, dim: int) -> Tensor:
 
 
 def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
-    """Rotates vectors (..., 3) about the vertical by `angle` (...).
+    """Rotates vectors (..., 3) about the vertical axis by `angle` (...) in radians.
 
     Positive angles turn +z toward +x, to the left.
     """

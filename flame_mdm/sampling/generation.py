@@ -24,7 +24,7 @@ from flame_mdm.sampling.sequences import overlap, windows
 from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 
 BATCH = 32
-STAGES = 10  # number of shown clean estimates of a sampling run, as in figure 5 of MFM
+STAGES = 10  # number of clean estimates that are shown per sampling run, as in figure 5 of MFM
 Score = Callable[[Sequence[Motion]], Sequence[float]]
 """A function that scores motions, such as the candidates for a text. Higher is better."""
 
@@ -68,7 +68,7 @@ def generate(
 
     Raises:
         UserError: If the request is invalid, the model cannot do what is requested, or the model
-            knows no word of a text that says what happens.
+            knows no content word of a text.
 
     Example:
         >>> import flame_mdm

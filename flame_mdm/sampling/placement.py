@@ -13,7 +13,8 @@ from flame_mdm.representations.rotation import rotate_y
 
 @dataclass(frozen=True)
 class Placement:
-    """Rotations about the vertical and shifts over the floor of B bodies in the world.
+    """Placement of B bodies in the world: rotations about the vertical axis and shifts over the
+    floor.
 
     The rotation (B,) is in radians. The shift (B, 3) is in meters, with y = 0. Both are float64.
     """

@@ -94,8 +94,7 @@ def resolve(
         model: the model that samples the motions.
         refused: mapping that receives the errors of prompts that the model cannot sample, by the
             number of the prompt. Other prompts are resolved. Default: the first error is raised.
-        check_words: whether to refuse a text if the model knows none of its words that say what
-            happens.
+        check_words: whether to refuse a text if the model knows none of its content words.
 
     Raises:
         UserError: If the model cannot do what is requested. The process checks the sampler and its

@@ -60,8 +60,8 @@ def stream(
         block: number of frames per block. The maximum and the default are the frames that the
             model predicts at once. Shorter blocks react sooner to a new text, but cost more per
             second of motion.
-        cleanup: smooth motions, constant bone lengths, feet that do not slide. A block is
-            returned after the next block was computed, because it must fit that block.
+        cleanup: smooth the motions, keep bone lengths constant, and keep feet from sliding. A
+            block is returned after the next block was computed, because it must fit that block.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:
             the model's.
 
@@ -69,8 +69,8 @@ def stream(
         An iterator of blocks; see `Stream`.
 
     Raises:
-        UserError: If the model does not continue frames or knows no word of the text that says
-            what happens. Also if the motion to continue cannot be read or is too short.
+        UserError: If the model does not continue frames or knows no content word of the text.
+            Also if the motion to continue cannot be read or is too short.
 
     Example:
         >>> import flame_mdm

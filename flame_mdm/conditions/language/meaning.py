@@ -104,7 +104,7 @@ def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
 
 @cache
 def _centers() -> np.ndarray:
-    """Returns, for each action, the mean vector of its words (N, D), scaled to length 1."""
+    """Returns, for each action, the mean vector of its words (N, D), scaled to norm 1."""
     names, rows, vectors = _action_vectors()
     centers = np.array([vectors[rows == row].sum(0) for row in range(len(names))])
     return centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-9)

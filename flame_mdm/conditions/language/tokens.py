@@ -1,4 +1,4 @@
-"""Words of a sentence, correction of typos, and detection of other languages than English."""
+"""Words of a sentence, correction of typos, and detection of languages other than English."""
 
 import re
 import unicodedata

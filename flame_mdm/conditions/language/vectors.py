@@ -18,7 +18,7 @@ SMOOTHING = 1e-4  # words with a higher frequency have less weight in a mean
 
 
 class WordTable:
-    """Vectors (N, D) of length 1 for N words, most frequent first."""
+    """Vectors (N, D) of norm 1 for N words, most frequent first."""
 
     def __init__(self, words: Sequence[str], vectors: np.ndarray):
         self.words = list(words)
@@ -39,7 +39,7 @@ class WordTable:
         return None if row is None else self.vectors[row]
 
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
-        """Returns the mean vector (D,) of words, scaled to length 1; None if all are missing.
+        """Returns the mean vector (D,) of words, scaled to norm 1; None if all are missing.
 
         Frequent words have less weight: smooth inverse frequency (Arora et al. 2017), with
         frequencies from Zipf's law.

@@ -257,7 +257,10 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Describes the numbers of motions and replications of most values, and of real motions."""
+    """Describes how many motions and replications most values have.
+
+    The number of real motions is added if it differs.
+    """
     values = [value for value in (result.values or {}).values() if value and value.replications]
     if not values:
         return ""

@@ -94,7 +94,10 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 
 
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
-    """Returns a reading of the largest rise of an angle (F,), with the times of its main part."""
+    """Measures the largest rise of an angle (F,).
+
+    The reading has the times of the main part of the rise.
+    """
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())
     start = int(yaw[: end + 1].argmin())

@@ -27,7 +27,7 @@ class Evaluate(Callback):
     replications, .../ci is the half width of the 95 % interval.
 
     The evaluation runs at the first validation and then at multiples of `every_n_steps`. It uses
-    averaged weights if the recipe averages weights. All processes share the motions.
+    averaged weights if the recipe averages weights. The motions are divided among all ranks.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.

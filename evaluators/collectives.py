@@ -1,5 +1,5 @@
 # pyright: standard
-"""Shares the work of an evaluation among processes.
+"""Divides the work of an evaluation among the ranks of a process group.
 
 Without a process group, everything runs in one process.
 """
@@ -20,7 +20,7 @@ Item = TypeVar("Item")
 
 
 def world_size() -> int:
-    """Returns the number of processes; 1 without a process group."""
+    """Returns the number of ranks; 1 without a process group."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
@@ -32,7 +32,7 @@ def is_first() -> bool:
 
 
 def shared(value: T) -> T:
-    """Returns the value of the first process in every process."""
+    """Returns the value of rank 0 on every rank."""
     box = [value]
     if world_size() > 1:
         dist.broadcast_object_list(box)

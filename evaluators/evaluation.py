@@ -71,7 +71,7 @@ def evaluate(request: EvaluationRequest) -> None:
 class Evaluation:
     """Evaluates a split of a data set under a protocol.
 
-    All processes create and run it together.
+    All ranks create and run it together.
     """
 
     protocol: Protocol  # what is measured
@@ -94,9 +94,9 @@ class Evaluation:
     ) -> Measured:
         """Evaluates real motions of all replications, and then the motions of the source.
 
-        Each process generates a share of the batches and computes their features. The first
-        process computes the metrics; all processes return the result. Raises `UserError` before
-        anything is generated if real motions do not have the expected values, unless `force`.
+        Each rank generates a share of the batches and computes their features. Rank 0 computes
+        the metrics; all ranks return the result. Raises `UserError` before anything is generated
+        if real motions do not have the expected values, unless `force`.
 
         Args:
             source: source of the motions; None = only real motions are measured.
@@ -402,7 +402,7 @@ def _select(rows: Rows, indices: list[int]) -> Rows:
 
 def _refuse(unexpected: Sequence[str]) -> None:
     if not is_first():
-        raise SystemExit(1)  # the first process prints the reason
+        raise SystemExit(1)  # rank 0 prints the reason
     raise UserError(
         f"nothing was generated, because {'; '.join(unexpected)}. Check the data and the extractor, or give "
         "force=true: the result is then marked as not valid"

@@ -183,7 +183,7 @@ class Evaluator:
     def _texts(self, motions: Motions, indices: Sequence[int]) -> Tensor | None:
         """Returns features of captions.
 
-        Every process computes all features, since extractors cache captions.
+        Every rank computes all features, since extractors cache captions.
         """
         if self.extractor is None or motions.captions is None:
             return None

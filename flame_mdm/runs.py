@@ -56,7 +56,7 @@ class Provenance(Schema):
 
 
 class FaultyBatch(Schema):
-    """One process's part of a batch."""
+    """The part of a batch on one rank."""
 
     rank: Int
     batch: Int

@@ -74,7 +74,7 @@ class Task(Model, LightningModule):
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
-        """Encodes all captions of the data once, in one process, if the encoder is frozen."""
+        """Encodes all captions of the data once, on one rank, if the encoder is frozen."""
         self.encoder().precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
@@ -376,7 +376,7 @@ class GeneratorTask(Task):
             self.val_losses[name].update(value)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean of each loss over the clips of all processes, with equal weights."""
+        """Logs the mean of each loss over the clips of all ranks, with equal weights."""
         for name, metric in self.val_losses.items():
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")

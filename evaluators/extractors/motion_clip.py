@@ -110,15 +110,15 @@ def info_nce(
     meaning: Tensor | None = None,
     wrong_text: Tensor | None = None,
 ) -> Tensor:
-    """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
+    """Contrastive loss over the pairs of all ranks: the mean of both cross-entropies.
 
-    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own
-    pairs (B, E) with the motions and texts of all processes. DDP averages gradients over
-    processes. If all processes have the same number of pairs, the averages of losses and
-    gradients equal the loss and gradient of a single process with all pairs.
+    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each rank compares its own
+    pairs (B, E) with the motions and texts of all ranks. DDP averages gradients over ranks. If
+    all ranks have the same number of pairs, the averages of losses and gradients equal the loss
+    and gradient of a single rank with all pairs.
 
     Args:
-        motion: (B, E) features of the motions of this process.
+        motion: (B, E) features of the motions on this rank.
         text: (B, E) features of their texts.
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each

@@ -94,7 +94,7 @@ class ExtractorTask(Task, Generic[Network]):
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
         """Adds a batch to the validation metrics.
 
-        With fewer clips than processes, each process has all clips, and only the first process counts.
+        With fewer clips than ranks, each rank has all clips, and only rank 0 counts.
         """
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return

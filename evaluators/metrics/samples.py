@@ -94,9 +94,9 @@ class SampleMetric(Declared, Metric):
     """Base class of all metrics,
     which compute their value from one row per sample, sorted by key.
 
-    The value therefore does not depend on the batches, their order or the number of processes; a
-    process may also have no samples. `value` is the formula. If a metric draws at random, its
-    argument `seed` determines the draws.
+    The value therefore does not depend on the batches, their order or the number of ranks. A rank
+    may have no samples. `value` is the formula. If a metric draws at random, its argument `seed`
+    determines the draws.
 
     A class also declares facts that readers of its values need; see `Declared`.
 
@@ -245,9 +245,9 @@ class SampleMetric(Declared, Metric):
         return motions
 
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
-        """Gathers the rows of all processes.
+        """Gathers the rows of all ranks.
 
-        The default of torchmetrics fails if a process has no rows.
+        The default of torchmetrics fails if a rank has no rows.
         """
         states = {name: [rows.cpu() for rows in getattr(self, name)] for name in self._reductions}
         group = process_group or self.process_group

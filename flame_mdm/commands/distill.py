@@ -59,8 +59,7 @@ def main(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
-    """Returns the recipe of a student:
-    the recipe of its teacher with the changes of a distillation.
+    """Returns the recipe of a student. It is the recipe of the teacher, changed for distillation.
 
     Raises `UserError` if the model was not trained by this framework.
     """

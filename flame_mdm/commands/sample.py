@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 # Maximum number of motions on the page for a file of prompts; each motion takes about 20 kB
 GALLERY = 200
-CLAIMS = "claims"  # the scorer that judges the claims of the text; see docs/referee.md
+CLAIMS = "claims"  # scorer that checks the claims of the text; see docs/referee.md
 
 
 def scorer_source(key: str, source: str) -> None:

@@ -76,7 +76,7 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns batches with every clip exactly once across all processes, longest first."""
+    """Returns batches with every clip exactly once across all ranks, longest first."""
     mine = np.argsort(-lengths, kind="stable")[rank::world]
     return [
         [(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)
@@ -90,7 +90,7 @@ class MotionDataModule(LightningDataModule):
         representation: encodes the clips; it gets the statistics of the store.
         root: folder of all prepared data sets.
         name: name of the data set. The name of its folder in `root` starts with it.
-        batch_size: clips per process and step.
+        batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
         resident: whether the data set is kept on the training device. The same batches are then
@@ -158,7 +158,7 @@ class MotionDataModule(LightningDataModule):
         self.prepare_data_per_node = False  # all machines share the folder
 
     def prepare_data(self) -> None:
-        """Writes the store if it does not exist. Lightning calls this in one process only."""
+        """Writes the store if it does not exist. Lightning calls this on one rank only."""
         if (self.folder / "store.json").exists():
             say(*self.source.changed(self.folder / "store.json"))
         else:
@@ -297,10 +297,10 @@ class MotionDataModule(LightningDataModule):
         return TrainingBatches(self.train.lengths, self.batch_size, **of_process)
 
     def val_dataloader(self) -> Loader:
-        """Returns a loader of each validation clip, exactly once across all processes.
+        """Returns a loader that yields each validation clip exactly once across all ranks.
 
-        If there are fewer clips than processes, every process gets all clips. A process without a
-        batch would skip the validation, and the others would wait for it.
+        If there are fewer clips than ranks, every rank gets all clips. A rank without a batch
+        would skip the validation, and the others would wait for it.
         """
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size

@@ -175,7 +175,7 @@ def _order(lines: Lines, words: list[str]) -> str:
 
 
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
-    """Returns the values (F, N) of the N degrees of freedom of each bone; angles in degrees.
+    """Returns, for each bone, the values (F, N) of its N degrees of freedom; angles in degrees.
 
     Raises:
         UserError: If there are too many frames for this number of `joints`.

@@ -50,7 +50,7 @@ def bone_poses(
         tree: the file.
         layout: its skeleton.
         joints: (F, 22, 3), SMPL's joints in meters, y up.
-        worlds: (F, J, 3, 3), rotations of the J joints of the file in the world of the file.
+        worlds: (F, J, 3, 3), world rotations of the J joints in the file.
         in_front: (J, 3, 3), rotations relative to the parents in a rest pose in front of the
             motion; None if there is no such pose.
     """

@@ -304,7 +304,7 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
 
 
 def humanoid(file: glb.Glb) -> dict[str, int]:
-    """Returns the node of each joint of SMPL, if the file declares the bones of VRM's humanoid.
+    """Returns the node of each SMPL joint, if the file declares the bones of VRM's humanoid.
 
     Otherwise, returns {}.
     """

@@ -273,7 +273,7 @@ def packed(
     joints: np.ndarray,
     turns: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a body, which `Mesh` reads.
+    """Returns the arrays of a body file, which `Mesh` reads.
 
     Points are stored in units of 1/20 mm, with the pelvis at 0. Normals are stored in units of
     1/127.

@@ -175,7 +175,7 @@ class RestPose:
 
     # The skeleton; `fitted` replaces its neutral rotations for a motion
     rig: Rig
-    # Index of the character's joint by joint of SMPL
+    # For each SMPL joint, the index of the character's joint
     map: Mapping[str, int]
     # Height of the lowest point in the rest pose
     floor: float

@@ -59,8 +59,8 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
-    # The action data sets use camera coordinates, which have no floor: put the lowest joint at
-    # height 0
+    # The action data sets use camera coordinates, which have no floor. The lowest joint is
+    # therefore placed at height 0.
     if below < -0.3:
         joints[..., 1] -= below
     actions = store.info["actions"]

@@ -160,7 +160,7 @@ def resolve_edit(
 
     edit_options, options = method_options(model.process, editing, request.options)
     frames = [_part_length(parts, length, original.fps) for parts in request.parts]
-    # A sentence stays one action, because the edit keeps a single motion.
+    # The sentence is not divided into actions, because an edit changes a single motion.
     fitted = replace(request, frames=frames, options=options, editing=None, split=False)
     features = torch.from_numpy(original.features).to(model.device)
     normalized = representation.normalize(features)[None]

@@ -97,8 +97,8 @@ def resolve(
         check_words: whether to refuse a text if the model knows none of its content words.
 
     Raises:
-        UserError: If the model cannot do what is requested. The process checks the sampler and its
-            options later, when it samples.
+        UserError: If the model cannot do what is requested. The sampler and its options are
+            checked later, by `Process.sample`.
     """
     _check_model(request, model)
     read: dict[int, ReadPrompt] = {}

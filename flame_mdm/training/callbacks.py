@@ -63,9 +63,9 @@ class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step and when interrupted.
 
     `keep_every_n_steps` is the number of steps between checkpoints that are kept. Signals stop
-    training at the end of the current step (`StopRequest`); with several processes, at the end of
-    the next step. Validation is never interrupted, since averaged weights replace the trained
-    weights during validation.
+    training at the end of the current step (`StopRequest`); with several ranks, at the end of the
+    next step. Validation is never interrupted, since averaged weights replace the trained weights
+    during validation.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -88,7 +88,7 @@ class Checkpoints(Checkpoint):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Saves a checkpoint if it is due.
 
-        If any process received a signal, saves one and stops.
+        If any rank received a signal, saves a checkpoint and stops.
         """
         if trainer.global_step == self.step:  # gradients are still being accumulated
             return
@@ -392,9 +392,7 @@ class SampleMotions(Callback):
             )
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Samples a share of the motions in each process;
-        the first process measures, writes and logs them.
-        """
+        """Samples a share of the motions on each rank; rank 0 measures, writes and logs them."""
         assert isinstance(pl_module, GeneratorTask)
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
@@ -428,7 +426,10 @@ class SampleMotions(Callback):
         self.notes = degenerate_notes(motions)
 
     def _sample(self, model: MotionGenerator, rank: int, world: int) -> list[Motion]:
-        """Samples every `world`-th prompt, starting at `rank`; without prompts, all motions on the first process."""
+        """Samples every `world`-th prompt, starting at `rank`.
+
+        Without prompts, rank 0 samples all motions.
+        """
         texts, kind = self.texts[rank::world], model.conditioned_on
         count = len(texts) if self.texts else UNCONDITIONED * (rank == 0)
         if not count:

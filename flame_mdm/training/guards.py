@@ -53,7 +53,7 @@ class BadLoss(Callback):
 
     A loss explodes if it exceeds `factor` times the median of the previous interval.
     `bad_batch.json` in the run directory describes the first bad batch: it contains the step and,
-    for each process, the number of the batch, the ids of the clips and the loss.
+    for each rank, the number of the batch, the ids of the clips and the loss.
 
     Args:
         folder: the run directory.
@@ -92,8 +92,8 @@ class BadLoss(Callback):
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
-        """Raises `UserError` in all processes at the same step,
-        if a loss since the last check is bad.
+        """Raises `UserError` on all ranks at the same step, if a loss since the last check is
+        bad.
         """
         if not self.seen:
             return

@@ -149,7 +149,7 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def mannequin() -> Mesh:
-    """Returns the body of the package."""
+    """Returns the body that the package contains."""
     return Mesh(MANNEQUIN)
 
 

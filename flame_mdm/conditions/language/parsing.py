@@ -67,7 +67,7 @@ def is_explained(word: str) -> bool:
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
     """Returns the actions nearest in meaning to the words of a sentence that are in no table.
 
-    If all words are in tables, all of them count.
+    If all words are in the tables, all of them count.
     """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words

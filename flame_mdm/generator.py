@@ -222,8 +222,8 @@ class MotionGenerator(Model, nn.Module):
                 `context_frames` C needs it. Such a model continues the prefix block by block and
                 takes no edit, no windows and no trajectory.
             unconditioned: sample a conditional model with its null condition.
-            shared_noise: the noise does not depend on the id: it is a function of (seed,
-                replication) alone.
+            shared_noise: the noise is a function of (seed, replication) and does not depend on
+                the id.
             trajectory: list that receives the normalized clean estimate (B, F, D) of each call of
                 the denoiser.
 

@@ -217,8 +217,8 @@ class AuditedGrade(ClosedSchema):
     """One grade of a perturbation.
 
     Each metric has four numbers: its value, the half width of the value's 95 % interval, the
-    difference from real motions, and the half width of the difference's interval. None = not
-    computable.
+    difference from real motions, and the half width of the interval of this difference. None =
+    not computable.
     """
 
     grade: Number

@@ -74,7 +74,8 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     Dataclasses need `strict` = False. The text "1" is then accepted as a number.
 
     Raises:
-        ValueError: If the content has another shape; names key, found value and expected type.
+        ValueError: If the content has another shape. The message contains the key, its value and
+            the expected type.
     """
     if large := _too_large(content):
         raise ValueError(

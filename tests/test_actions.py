@@ -173,7 +173,7 @@ def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
 def test_another_humanact12_file_is_named(tmp_path: Path, subtests):
     columns = {
         r"humanact12poses\.pkl: poses, joints3D, y are not lists of equal length": {"y": [0]},
-        "clip 0: label 12 is not one of 0 to 11": {"y": [12]},
+        "clip 0: label 12 is not in the range 0 to 11": {"y": [12]},
         r"clip 0: poses have shape \(20, 72\) and joints \(9, 18, 3\)": {
             "joints3D": [np.zeros((9, 18, 3))]
         },

@@ -297,7 +297,7 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
         ),
         (
             ["walk.glb", "mp4=true"],
-            "mp4=true: walk.glb is a single motion file. Name a folder, or omit out",
+            "mp4=true: walk.glb is a single motion file. Give a folder, or omit out",
         ),
         (
             ["walk.fbx", "root_motion=true"],

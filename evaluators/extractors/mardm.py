@@ -80,7 +80,10 @@ class MARDMClip(nn.Module):
         return F.normalize(self.motion_encoder(x, mask), dim=-1)
 
     def text(self, tokens: Tensor) -> Tensor:
-        """Returns vectors (B, 512) of captions, given as CLIP's tokens (B, S), 0 after the end."""
+        """Returns vectors (B, 512) of captions.
+
+        The captions are CLIP's tokens (B, S), 0 after the end.
+        """
         hidden = self.text_ln(
             self.textTransEncoder(self.token_embedding(tokens) + self.positional_embedding)
         )

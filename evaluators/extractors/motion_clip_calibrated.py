@@ -1,7 +1,5 @@
 # pyright: standard
-"""Motion-CLIP calibrated with near-miss captions,
-and with copies of motions with noise of known strength.
-"""
+"""Motion-CLIP calibrated with near-miss captions and with noisy copies of motions."""
 
 import json
 from collections.abc import Sequence

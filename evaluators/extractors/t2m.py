@@ -179,7 +179,9 @@ class T2MEvaluator(nn.Module):
         return self.motion_encoder(movements, lengths // UNIT)
 
     def text(self, words: Words) -> Tensor:
-        """Returns embeddings (B, E) of captions, given as output of `WordVectors` or `LearnedWords`."""
+        """Returns embeddings (B, E) of captions from the output of `WordVectors` or
+        `LearnedWords`.
+        """
         weight = self.text_encoder.input_emb.weight
         return self.text_encoder(words.vectors.to(weight), words.parts.to(weight), words.lengths)
 
@@ -248,7 +250,7 @@ class _TextEncoder(_Recurrent):
 def _read_numbers(path: Path) -> np.ndarray:
     array = read_npy(path)
     if array.dtype.kind not in "fiu":
-        raise UserError(f"{path}: an array of {array.dtype}, not of numbers")
+        raise UserError(f"{path}: expected an array of numbers, but found {array.dtype}")
     return array
 
 

@@ -220,8 +220,8 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.words = WordVectors(self.facts["words"], state.cpu())
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """Returns features (B, E) of captions,
-        given as "word/PART" tokens, or as words if vectors are learned.
+        """Returns features (B, E) of captions. The captions are "word/PART" tokens, or words if
+        the vectors are learned.
         """
         assert self.words is not None
         return self.network.text(self.words(tokens))

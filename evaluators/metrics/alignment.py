@@ -197,8 +197,8 @@ class MotionsForText(RPrecision):
 def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Returns the pools of `MotionsForText`.
 
-    The three tensors are the samples (N,) in random order, the pool (N, P) of each sample, and
-    the position (N,) of the sample in its pool.
+    The three tensors are the samples (N,) in random order, the pools (N, P), and the position
+    (N,) of each sample in its pool.
     """
     order = torch.from_numpy(np.random.default_rng(seed).permutation(count))
     start = (torch.arange(count) // pool * pool).clamp(max=count - pool)

@@ -276,7 +276,7 @@ class MotionMean(SampleMetric):
     parts: Sequence[str] = ()
 
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
-        """Adds motions, given as their values.
+        """Adds the values of motions.
 
         Args:
             keys: (B,) int64, unique keys of the motions.

@@ -46,7 +46,7 @@ def read_model_file(path: Path) -> dict[str, Any]:
     text = metadata.get(KEY)
     if ADAPTER in metadata:
         raise UserError(
-            f"{path}: an adapter, which changes a model. Name the model first: MODEL adapter={path}"
+            f"{path}: an adapter, which changes a model. Give the model first: MODEL adapter={path}"
         )
     if text is None:
         raise UserError(

@@ -4,8 +4,8 @@ with only numpy and onnxruntime.
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
 The same caption, length and seed give the same motion as `flame_mdm.generate`, which also
-understands other sentences than captions of the training data. A model that continues frames
-starts from a person who stands.
+understands sentences that differ from the captions of the training data. A model that continues
+frames starts from a person who stands.
 """
 
 from __future__ import annotations

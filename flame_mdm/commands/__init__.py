@@ -43,8 +43,8 @@ def existing(key: str, source: str) -> None:
 
 
 def motion_file(key: str, source: str) -> None:
-    """Checks that a motion file exists and has a known ending;
-    `dataset:id` is checked when it is read.
+    """Checks that a motion file exists and has a supported extension; `dataset:id` is checked
+    when it is read.
     """
     if Path(source).suffix.lower() in ENDINGS:
         existing(key, source)
@@ -198,7 +198,7 @@ class BodySettings:
     )
 
     def read_body(self) -> Mesh | None:
-        """Reads `body`; None = the mannequin, which is drawn where no body is given."""
+        """Reads `body`; None = the mannequin, which is drawn by default."""
         if self.body == "mannequin":
             return None
         from flame_mdm.formats.people import load_body
@@ -275,7 +275,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:
-        """Returns the given keys that determine the content of the motions."""
+        """Returns the keys with values that determine the content of the motions."""
         names = [name for name in ("text", "action") if getattr(self, name) is not None]
         return names + (["unconditioned"] if self.unconditioned else [])
 
@@ -365,7 +365,7 @@ class DataSettings:
         )
 
     def data_node(self, source: str | None = None) -> Config:
-        """Returns the configuration of the data set, with the path given as `source`."""
+        """Returns the configuration of the data set with the path in `source`."""
         node = self.nodes["data"]
         if source is not None:
             if "path" not in node["source"]:

@@ -29,8 +29,8 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
     Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from `make
     sample` or AMASS; .json; and .npy with joint positions.
 
-    Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines, .vrma for VRM
-    avatars, .npz in the layout of AMASS, .json and .npy with joint positions, and .mp4 and .gif
+    Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines; .vrma for VRM
+    avatars; .npz in the layout of AMASS; .json and .npy with joint positions; and .mp4 and .gif
     to watch.
 
     docs/engines.md lists which files a program reads. docs/formats.md explains units, axes and

@@ -123,7 +123,7 @@ class SampleSettings(OutputSettings, WritingSettings):
                         f"cut. Omit {entry.name}"
                     )
             if self.file is not None:
-                raise UserError(f"out={self.out}: a set has several files. Name a folder")
+                raise UserError(f"out={self.out}: a set has several files. Give a folder")
             return
         if self.format is not None:
             raise UserError(
@@ -141,7 +141,7 @@ class SampleSettings(OutputSettings, WritingSettings):
             return
         for key in ("prompts", "mp4", "trajectory"):
             if value := getattr(self, key):
-                advice = "Name a folder, or omit out"
+                advice = "Give a folder, or omit out"
                 raise UserError(
                     f"{key}={str(value).lower()}: {self.out} is a single motion file. {advice}"
                 )

@@ -26,8 +26,8 @@ Settings = TypeVar("Settings")
 
 `OBJECTS` names the keys for leading words without a key. If the last of these keys is a list, it
 takes all remaining words. `SWEEPS` is True if the command takes --multirun and launch=, as in
-`flame_mdm.config.jobs`. A field `composed` receives the words for Hydra: keys with a dot, such as
-`data.source.path`, and the keys and options in `COMPOSED`.
+`flame_mdm.config.jobs`. A field `composed` receives the arguments for Hydra: keys with a dot,
+such as `data.source.path`, and the keys and options in `COMPOSED`.
 """
 
 STOP = (signal.SIGINT, signal.SIGTERM)  # signals after which a command cleans up and ends
@@ -204,7 +204,7 @@ def _help(kind: type[Any]) -> list[str]:
 
 
 def make_variables() -> list[str]:
-    """Returns the variables given to make as words.
+    """Returns the variables of make as command-line arguments.
 
     `EXP` names the recipe; other upper-case names are keys. Make passes the variables in
     MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.

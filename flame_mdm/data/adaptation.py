@@ -42,7 +42,7 @@ class Lesson(MotionSource):
 
     Args:
         path: the user's folder of motions.
-        prior: folder of the store with the known clips.
+        prior: folder of the store with clips that the model was trained on.
         motion: "joints" for representations of joint positions, "smpl" for representations of
             rotations.
     """
@@ -55,7 +55,7 @@ class Lesson(MotionSource):
 
     @cached_property
     def store(self) -> Store:
-        """The store with the known clips."""
+        """The store with clips that the model was trained on."""
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
@@ -170,10 +170,12 @@ class LessonBatches(Sampler[list[Draw]]):
 
 
 class LessonData(MotionDataModule):
-    """Serves a `Lesson`: half of each batch are the user's clips, half are known clips."""
+    """Serves a `Lesson`: half of each batch are the user's clips, and half prior clips."""
 
     def halves(self) -> list[np.ndarray]:
-        """Returns the indices of the user's training clips, and the indices of the known ones."""
+        """Returns the indices of the user's training clips, and the indices of the clips of the
+        prior store.
+        """
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
             raise UserError(

@@ -38,11 +38,12 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 
 
 def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
-    """Yields names and contents of the wanted files in a zip or tar archive.
+    """Yields names and contents of the files in a zip or tar archive for which `is_wanted` is
+    true.
 
     Raises:
         UserError: If the archive is damaged, expands disproportionately or has too many members.
-            Also if a wanted file is a link, sparse or encrypted.
+            Also if such a file is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:

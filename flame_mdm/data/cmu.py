@@ -541,7 +541,10 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
 
 
 def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
-    """Returns a tree with additional joints, given as name -> parent and offset (3,)."""
+    """Returns a tree with additional joints.
+
+    Each keyword is a joint, with its parent and offset (3,).
+    """
     return replace(
         tree,
         joints=(*tree.joints, *joints),

@@ -99,7 +99,9 @@ class HumanAct12(MotionSource):
                         f"poses have shape {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
                     )
                 if not 0 <= label < len(self.actions):
-                    raise UserError(f"label {label} is not one of 0 to {len(self.actions) - 1}")
+                    raise UserError(
+                        f"label {label} is not in the range 0 to {len(self.actions) - 1}"
+                    )
             motions.append((np.concatenate([joint[:, 0], pose], 1), label))
         return motions
 

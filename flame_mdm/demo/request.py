@@ -53,7 +53,7 @@ Path = Annotated[
 
 
 class DemoEdit(BaseModel):
-    """An edit of a previous motion, given by its number.
+    """An edit of a previous motion; `motion` is its number.
 
     See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part; "" =
     unconditioned. A variation of the entire motion keeps text, parts and path of the request.

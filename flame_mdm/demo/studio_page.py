@@ -314,7 +314,7 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 
 def _refusal(error: NotUnderstood) -> str:
-    """Returns the message about a text without a known action.
+    """Returns the message for a text that contains no action that the model knows.
 
     The nearest actions are buttons with pictures.
     """

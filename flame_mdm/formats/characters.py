@@ -264,7 +264,7 @@ def _listed(
 
 @cache
 def known_skeletons() -> list[dict[str, str]]:
-    """Returns, per known skeleton, the joint of SMPL for each spelling of a bone's name."""
+    """Returns, for each supported skeleton, the SMPL joint by spelling of a bone's name."""
     skeletons = []
     for layout in LAYOUTS.values():
         joints = {name: joint for joint, name in layout.bones.items()}

@@ -294,7 +294,10 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
         skin.joints
     )
     if view.buffer or view.byteStride not in (0, 64) or not fits:
-        raise ValueError("inverse bind matrices are not floats, or not one per joint")
+        raise ValueError(
+            "inverse bind matrices are not floats, or their number differs from "
+            "the number of joints"
+        )
     values = np.frombuffer(
         data, "<f4", 16 * len(skin.joints), view.byteOffset + accessor.byteOffset
     )

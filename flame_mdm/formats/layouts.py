@@ -113,7 +113,7 @@ class Layout(BaseModel):
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
-        """Returns the layout with another map, as a known layout."""
+        """Returns the layout with another map and the name of a supported layout."""
         layout = self.model_copy(update={"map": dict(map)})
         layout._name = name
         return layout
@@ -121,7 +121,7 @@ class Layout(BaseModel):
     def ending(self, **ends: str) -> dict[str, Source]:
         """Returns a map in which some joints of SMPL are the end sites of their parents.
 
-        They are given as joint=parent, for example the toes.
+        Each keyword is joint=parent, for example the toes.
         """
         return {
             side + joint: f"{self.map[side + parent]}.end"
@@ -229,7 +229,7 @@ def _spelled() -> dict[str, dict[str, str]]:
 
 @lru_cache(64)
 def _nearest(names: tuple[str, ...]) -> Match:
-    """Returns the known layout that fits the names best."""
+    """Returns the supported layout that fits the names best."""
     return best_match(names, _spelled())
 
 

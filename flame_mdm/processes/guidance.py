@@ -209,7 +209,7 @@ def _with_bones(
     lengths: Tensor,
     free: Tensor,
 ) -> Tensor:
-    """Returns the nearest motion (F, D) with given bone lengths in each frame.
+    """Returns the nearest motion (F, D) whose bones have the requested lengths in each frame.
 
     Bones `edges` (N, 2) have `lengths` (F, N).
     """

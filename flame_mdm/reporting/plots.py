@@ -76,7 +76,7 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
 
 
 def svg_file(drawing: Markup) -> str:
-    """Returns the text of a file that shows a drawing outside of a page: the styles are in it."""
+    """Returns the text of a standalone file with a drawing, which includes the styles."""
     style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
     return str(drawing).replace(">", f"><style>{style}</style>", 1)
 

@@ -56,7 +56,7 @@ class PromptFile:
         }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
-        """Refuses prompts, given by error and position among the accepted prompts."""
+        """Refuses prompts. `errors` has their errors by position among the accepted prompts."""
         numbers = list(self.accepted)
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 

@@ -89,8 +89,8 @@ def adapt(
     the guide.
 
     Args:
-        base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a model in this package, or
-            "user/name[@revision]" on the Hugging Face hub.
+        base: the model to adapt. It is a run directory, a .ckpt or .safetensors file, the name of
+            a model in this package, or "user/name[@revision]" on the Hugging Face hub.
         source: folder of motions with captions.
         name: name of the style, one word of letters and digits.
         out: run directory. Default: runs/adapt/NAME.

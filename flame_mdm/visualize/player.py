@@ -61,8 +61,8 @@ def player_page(
     Args:
         motions: the motions, of any skeletons, lengths and frame rates; `title` is the heading of
             the page.
-        about: HTML of a collapsible section below the heading. Texts in it must already be
-            escaped.
+        about: HTML of a collapsible section below the heading of the page. Texts in it must
+            already be escaped.
         columns: motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
         beside: for each motion, the id of an earlier motion next to which it is shown, such as

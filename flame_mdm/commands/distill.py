@@ -80,7 +80,7 @@ def student_recipe(settings: DistillSettings) -> Config:
         "experiment": name,
         "data_root": root,
         "data": {"root": root},
-        "initial_weights": None,  # the student starts from its teacher
+        "initial_weights": None,  # the student starts from the weights of its teacher
         "run": {"name": "default", "dir": settings.out or f"runs/{name}/default"},
         "optimizer": {"lr": SHARE_OF_RATE * recipe["optimizer"]["lr"]},
         "trainer": {

@@ -86,7 +86,7 @@ class Mixture(MotionSource):
             for clip in part.clips(fps):
                 action = None
                 if clip.action is not None:
-                    # A folder knows its actions only when it has yielded the first clip.
+                    # The actions of a folder are known only after its first clip.
                     action = names.setdefault(part.actions[clip.action], len(names))
                 yield replace(clip, action=action, license=clip.license or part.license)
             self.excluded.update(part.excluded)

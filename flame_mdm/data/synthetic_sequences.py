@@ -30,7 +30,7 @@ ENDLESS = (
 )
 # Maximum duration of an endless motion, in seconds
 LONGEST = 6.0
-# Duration of its end that is left out, in seconds
+# Duration in seconds of the end of an endless motion, which is left out
 STOPPING = 0.9
 # Posture at the beginning of actions that do not begin standing, and at the end of actions that
 # do not end standing

@@ -5,7 +5,7 @@ import numpy as np
 from flame_mdm.formats.layouts import UP, Layout, check_feet, check_size
 from flame_mdm.representations.skeleton import SMPL22
 
-# A body lies if the vertical component of its trunk's direction is smaller on average.
+# A body lies if the mean vertical component of its trunk direction is smaller than this.
 LYING = 0.3
 # With another axis up, a body stands if the component is larger than this
 STANDING = 0.7

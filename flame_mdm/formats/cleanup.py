@@ -17,8 +17,9 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.poses import BoneRotations
 from flame_mdm.representations.skeleton import Skeleton
 
-# Weight of the squared third differences of a joint's path, relative to its squared change. Third
-# differences are changes of acceleration, so steady accelerations of fast motions are kept.
+# Weight of the squared third differences of a joint's path, relative to the squared change of the
+# path. Third differences are changes of acceleration, so steady accelerations of fast motions are
+# kept.
 SMOOTHNESS = 0.034
 # Distance in meters from the smooth path at which a position has half its weight
 OUTLIER = 0.03

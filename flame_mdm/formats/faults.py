@@ -12,8 +12,8 @@ from flame_mdm.formats.motion import Motion
 # Height in meters above the floor, y = 0, below which a toe joint touches it. It is also used for
 # foot skating.
 LOW = 0.05
-# Maximum speed in m/s of the root of a body that is not jumping. A jump is also slower at its
-# top, but only for 0.04 s.
+# A body in the air whose root is slower than this, in m/s, floats and does not jump. A jump is
+# also slower at its top, but only for 0.04 s.
 STANDSTILL = 0.2
 LIMITS = {
     "skating": (

@@ -71,7 +71,7 @@ class _Writer:
         self._animation(bones, duration)
 
         # A file has this order: header, settings, documents, definitions, objects, connections,
-        # takes. Objects are a flat list. Connections by id make it a tree, in which id 0 is the
+        # takes. Objects are a flat list. Connections by id form a tree whose root, id 0, is the
         # scene.
         root = Record("")
         _header(root)

@@ -295,8 +295,7 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
     )
     if view.buffer or view.byteStride not in (0, 64) or not fits:
         raise ValueError(
-            "inverse bind matrices are not floats, or their number differs from "
-            "the number of joints"
+            "inverse bind matrices are not floats, or there are fewer matrices than joints"
         )
     values = np.frombuffer(
         data, "<f4", 16 * len(skin.joints), view.byteOffset + accessor.byteOffset

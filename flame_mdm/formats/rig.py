@@ -23,9 +23,10 @@ SPINE = ("spine1", "spine2", "spine3")
 TILT = 45
 # A facing direction within this angle of an axis, in degrees, is replaced by the axis
 SNAP = 8
-# Minimum sine of the bend of an elbow or knee in the rest pose. The twist of a straighter limb
-# cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees at the
-# knees and by 5 degrees at the elbows. A small bend is therefore far from the axis of the joint.
+# Minimum sine of the bend angle of an elbow or knee in the rest pose. The twist of a straighter
+# limb cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees
+# at the knees and by 5 degrees at the elbows. A small bend is therefore far from the axis of the
+# joint.
 BEND = 0.25
 # Maximum height in meters of the lowest joint of a clip that stands on the floor
 GROUND = 0.1

@@ -125,7 +125,8 @@ def drop_repetition(joints: Joints, count: int) -> Joints:
     """Cuts one of `count` repetitions out of a motion, which becomes shorter.
 
     The cut joins two frames with similar poses: the nearest poses whose distance in time is one
-    period, give or take 20 %. The second part continues from the place of the first part.
+    period, give or take 20 %. The second part continues at the position where the first part
+    ends.
     """
     poses = joints - joints[:, :1] * GROUND
     change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
@@ -143,8 +144,8 @@ def drop_repetition(joints: Joints, count: int) -> Joints:
 
 
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
-    """Replaces the second half with the second half of another motion,
-    starting at the same place.
+    """Replaces the second half with the second half of another motion, starting at the same
+    position.
 
     Poses are blended over `BLEND` seconds.
     """

@@ -71,7 +71,7 @@ def matching_loss(
     Returns a scalar for B pairs. Each text is compared with its own motion, and with a wrong
     motion: the motion of the nearest previous pair that the text does not fit. The wrong motion
     adds no loss if its distance is larger than `margin`. The authors shift the motions by a
-    random number of places instead, which also pushes matching pairs apart.
+    random number of rows instead, which also pushes matching pairs apart.
 
     Args:
         motion: (B, E) features of the motions.

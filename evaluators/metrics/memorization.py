@@ -20,7 +20,7 @@ CLOSE = 0.01
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
-    """Returns poses (F, 3J) of joints (F, J, 3), independent of place and heading.
+    """Returns poses (F, 3J) of joints (F, J, 3), independent of position and heading.
 
     Joints are relative to the pelvis on the ground, and turned to face z in every frame.
     """

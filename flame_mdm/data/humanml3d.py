@@ -275,7 +275,7 @@ class HumanML3DSMPL(MotionSource):
     """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters of whole clips.
 
     There is one clip per caption, named NAME#0, NAME#1 ... As in FLAME's code, there are no
-    mirrored copies, no limits of length and no cuts: a caption of a part is used for the whole
+    mirrored copies, no length limits and no cuts. A caption of a part is used for the whole
     motion. In five subsets, frames were trimmed from the start. Unlike FLAME's code, this class
     takes them into account, so that motion and caption match.
 

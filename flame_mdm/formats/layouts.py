@@ -88,7 +88,7 @@ class Layout(BaseModel):
 
     @property
     def name(self) -> str:
-        """The name of a known layout, or "own map"."""
+        """The name of a supported layout, or "own map"."""
         return self._name
 
     @property
@@ -208,7 +208,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @cache
 def _variants() -> dict[str, Layout]:
-    """Returns the known layouts by name, also with end sites instead of toes, hands, or both."""
+    """Returns the supported layouts by name, also with end sites for toes, hands, or both."""
     variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
     toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
     for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
@@ -282,12 +282,12 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
 
 
 def layout_name(layout: Layout) -> str:
-    """Returns the name of a known layout, or "own map"."""
+    """Returns the name of a supported layout, or "own map"."""
     return layout.name
 
 
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the known layout for joints with these names, overridden by `fields`.
+    """Returns the supported layout for joints with these names, overridden by `fields`.
 
     The map of the layout uses these names. Names are matched as in `flame_mdm.formats.names`.
 

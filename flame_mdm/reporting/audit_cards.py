@@ -110,7 +110,7 @@ class CitedCard:
         """Returns a tuple by which cards are compared:
         the larger, the better the card fits the evaluated data.
 
-        Cards with the same limits of length are best, then cards of the test split, cards of the
+        Cards with the same length limits are best, then cards of the test split, cards of the
         same data, and cards of more motions.
         """
         same_frames = self.data.frames == data.frames

@@ -1,4 +1,4 @@
-"""Joins two motions: the second begins at the place and in the pose of the first's end."""
+"""Joins two motions. The second begins with the position and pose of the end of the first."""
 
 import copy
 
@@ -58,7 +58,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
         getattr(joined, name)[..., 1] = after[name][..., 1] + height
 
     def world(points: np.ndarray) -> np.ndarray:
-        """Returns points of the second motion at their place in the joined motion."""
+        """Returns points of the second motion at their positions in the joined motion."""
         return first.position[-1] * ground + (points - second.position[0] * ground) @ turn.T
 
     ground = np.array([1.0, 0.0, 1.0])

@@ -292,7 +292,7 @@ def skip(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def spin(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Turns once all the way around in small steps, with the arms out."""
+    """Turns once all the way around in small steps, with the arms stretched out to the sides."""
     sign = 1 if requested["direction"] == "left" else -1
     angle = sign * np.radians(rng.uniform(340, 375))
     gait = Gait(rng.uniform(0.26, 0.3), 0.82, 0.07, 0.3, 0.0, 0.1)

@@ -19,10 +19,8 @@ import pytest
 from sphinx.cmd.build import build_main
 from support.fixtures import ROOT
 from support.motions import synthetic
-from support.runs import TINY_DIP, untrained
 
 from flame_mdm.__main__ import COMMANDS
-from flame_mdm.checkpoints.model_files import write_model_file
 from flame_mdm.config import guarded, sweeps
 from flame_mdm.config.command_line import make_variables, read_settings
 from flame_mdm.config.jobs import run_jobs
@@ -176,12 +174,6 @@ def test_the_python_examples_of_a_page_run_and_print_what_they_say(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     Path("runs/quickstart").mkdir(parents=True)
     Path("runs/quickstart/default").symlink_to(trained.parent.parent)
-    if page.name == "streams.md":
-        model = untrained(TINY_DIP, 40, "synthetic/dip")
-        path = tmp_path / "runs/synthetic/dip/default/model.safetensors"
-        write_model_file(
-            path, model.state_dict(), config=model.config, facts=model.facts, origin={}
-        )
     for name in ("walk.npz", "walk.bvh"):
         synthetic(fps=30.0, size=20).save(name)
     names: dict[str, Any] = {"__name__": "example"}

@@ -271,7 +271,9 @@ def fetch_runtime(folder: Path) -> None:
 if __name__ == "__main__":
     try:
         name, streaming = (*sys.argv[1:], "", "")[:2]
-        single = flame_mdm.load(name or "quickstart")
+        if not name:
+            name, streaming = "quickstart", streaming or "package_dip"
+        single = flame_mdm.load(name)
         build(single, Path("build/web"), flame_mdm.load(streaming) if streaming else None)
         say("written: build/web. To see it: python3 -m http.server -d build/web")
     except UserError as error:

@@ -13,13 +13,13 @@ class DemoSettings:
     """usage: flame-mdm demo [CKPT ...] [adapter=FILE] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
     Serves a page where you type a sentence, watch the motion, edit it and download it. Without
-    CKPT, the demo uses the model in the package. It requires the extra demo: pip install
+    CKPT, the demo uses the models in the package. It requires the extra demo: pip install
     "flame-mdm[demo]". docs/demo.md explains the page.
     """
 
     OBJECTS: ClassVar = ("ckpt",)
     ckpt: list[str] = option(
-        lambda: ["quickstart"],
+        lambda: ["quickstart", "package_dip"],
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(

@@ -51,13 +51,14 @@ class Studio:
         self._readers: dict[str, Reader] = {}
         self._made: OrderedDict[tuple[Any, ...], Sequence[Motion]] = OrderedDict()
         self._working, self._memory = Lock(), Lock()
-        model = self.model(sources[0])
-        self.live = LiveStreams(model) if model.denoiser.context_frames else None
+        models = [self.model(name) for name in sources if PLUS not in name]
+        streaming = [model for model in models if model.denoiser.context_frames]
+        self.live = LiveStreams(streaming[0]) if streaming else None
 
     def model(self, name: str) -> MotionGenerator:
         """Returns a model by its name on the page; raises `UserError` for other names.
 
-        A model is loaded at its first use.
+        A model with an adapter is loaded at its first use.
         """
         if name not in self.files:
             near = did_you_mean(name, self.files)

@@ -223,7 +223,7 @@ def measure(settings: Settings) -> Section:
     )
     return section(
         "Host cost of a training step",
-        f"""An almost empty network: one transformer layer of width 16, 4 clips per batch, no text encoder. Its step
+        f"""The network is tiny: one transformer layer of width 16, no text encoder, and batches of 4 clips. Its step
         has almost no arithmetic: it is the time of calling torch, the framework and Lightning. Bare Lightning
         trains the same network with the same loss, optimizer and clipping on batches that are in memory, without
         averaged weights, logger and checkpoints. The framework is complete: batches, callbacks, logger. One thread,

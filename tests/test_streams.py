@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.fixtures import ROOT
+from support.fixtures import ROOT, script
 from support.npm import node
 from support.runs import TINY_DIP, untrained
 from torch import Tensor
@@ -572,3 +572,38 @@ def test_the_web_page_bends_the_way_in_the_same_manner(tmp_path):
     (tmp_path / "cases.json").write_text(json.dumps(cases))
     theirs = node("web_waypoints.mjs", tmp_path)
     np.testing.assert_allclose(theirs, [bends(*case) for case in cases], rtol=0, atol=1e-12)
+
+
+def test_the_page_of_long_streams_is_rendered_from_the_committed_figures():
+    folder = ROOT / "docs" / "benchmarks"
+    drift = script("tools/stream_drift.py")
+    results = json.loads((folder / "streams.json").read_text(encoding="utf-8"))
+    assert (folder / "streams.md").read_text(encoding="utf-8") == drift.page(results)
+    drawing = drift.svg_file(drift.figure(results))
+    assert (folder / "streams-figure.svg").read_text(encoding="utf-8") == drawing
+
+
+def test_steps_at_seams_are_told_from_steps_inside_blocks():
+    """All joints go 1 cm per frame, and jump by 7 cm where the second block begins."""
+    x = np.arange(20) * 0.01
+    x[10:] += 0.06
+    joints = np.zeros((2, 20, 22, 3))
+    joints[..., 0] = x[:, None]
+    figures = script("tools/stream_drift.py").seams_of(joints, np.array([10]))
+    assert figures["step, seam, median"] == pytest.approx(0.07)
+    assert figures["step, inside, percentile 99"] == pytest.approx(0.01)
+    assert figures["change of step, seam, median"] == pytest.approx(0.06)
+    assert figures["change of step, inside, percentile 99"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_action_counts_as_recognized_if_it_is_shown_in_time():
+    drift = script("tools/stream_drift.py")
+    source = Synthetic(clips=1)
+    clips = (source.clip(index, FPS) for index in range(100))
+    clip = next(c for c in clips if c.attributes["action"] == "kick" and len(c.motion) >= 45)
+    kick = np.asarray(clip.motion)
+    still = np.repeat(kick[:1], 100, 0)
+    for frames, right in ((10, 1), (90, 0)):  # half a second, or too late
+        motion = np.concatenate([still[:frames], kick, np.repeat(kick[-1:], 100, 0)])[None]
+        request = [[("kicks", {"action": "kick"})]]
+        assert drift.recognized(motion, request, FPS)["right"] == right

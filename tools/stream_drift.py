@@ -39,9 +39,8 @@ MINUTES = 5
 SECONDS_PER_TEXT = 10
 PERIODS = {"0–10 s": (0, 10), "50–60 s": (50, 60), "290–300 s": (290, 300)}
 WINDOW = 2.0  # seconds of the windows whose features are compared
-# A motion counts as recognized if a window that begins at most this long after the change shows it
-SECONDS_TO_REACT = 2.0
 SHOWN = (2.0, 3.0, 4.0)  # lengths in seconds of the windows in which an action is looked for
+LATEST = 4.0  # seconds from the change of a text to the latest end of these windows
 TOES = [10, 11]
 HEAD = 15
 
@@ -55,7 +54,7 @@ single synthetic actions. No frame is cleaned up.
 
 ## Drift
 
-![FID, skating, height and jitter over time](streams-figure.svg)
+![Skating, height of the head and jitter of each ten seconds](streams-figure.svg)
 
 {periods}
 
@@ -72,8 +71,8 @@ The largest step of a joint from one frame to the next, and the largest change o
 
 ## Texts
 
-{right} of {changes} actions ({share} %) are recognized in a window that begins at most two seconds after the text
-changed. These actions are not always recognized: {actions}.
+{right} of {changes} actions ({share} %) are recognized in at least one window of two, three or four seconds that ends
+at most four seconds after the text changed. These actions are not always recognized: {actions}.
 """
 
 
@@ -103,7 +102,7 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
         for title, (begin, end) in PERIODS.items()
     }
     minute = round(60 * fps)
-    jitter = [jitter_of(part, fps) for part in (joints[:, :minute], joints[:, -minute:])]
+    jitter = [value(Jitter(fps), part) for part in (joints[:, :minute], joints[:, -minute:])]
     return {
         "format": 1,
         "model": name,
@@ -130,9 +129,9 @@ def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
     length = round(SECONDS_PER_TEXT * fps)
     parts = [joints[:, begin : begin + length] for begin in range(0, joints.shape[1], length)]
     return {
-        "skating": [skating(part, fps) for part in parts],
+        "skating": [value(FootSkating(fps), part) for part in parts],
         "height of the head, m": [float(np.median(part[..., HEAD, 1])) for part in parts],
-        "jitter, m/s³": [jitter_of(part, fps) for part in parts],
+        "jitter, m/s³": [value(Jitter(fps), part) for part in parts],
     }
 
 
@@ -216,15 +215,15 @@ def in_period(
     windows = joints.reshape(-1, length, *joints.shape[2:])
     return {
         "fid": float(frechet_distance(encoded(extractor, windows), real)),
-        "skating": float(skating(joints, fps)),
+        "skating": value(FootSkating(fps), joints),
         "head": float(np.median(joints[..., HEAD, 1])),
         "lowest_toe": float(joints[..., TOES, 1].min(-1).mean()),
-        "jitter": jitter_of(joints, fps),
+        "jitter": value(Jitter(fps), joints),
     }
 
 
 def encoded(extractor: MotionCLIPExtractor, windows: np.ndarray) -> torch.Tensor:
-    """Returns features (N, E) of windows (N, F, 22, 3), each turned so that it begins facing +z at the origin."""
+    """Returns features (N, E) of windows (N, F, 22, 3); positions and headings in the world do not matter."""
     representation = HumanML(variant="clean")
     features = torch.stack([representation.encode(torch.from_numpy(w).float()) for w in windows])
     mask = torch.ones(features.shape[:2], dtype=torch.bool)
@@ -247,23 +246,10 @@ def real_windows(count: int, length: int, fps: float, seed: int) -> np.ndarray:
     return np.stack(windows)
 
 
-def skating(joints: np.ndarray, fps: float) -> float:
-    metric = FootSkating(fps)
-    metric.update(
-        torch.from_numpy(joints),
-        torch.ones(joints.shape[:2], dtype=torch.bool),
-        keys=torch.arange(len(joints)),
-    )
-    return metric.compute()
-
-
-def jitter_of(joints: np.ndarray, fps: float) -> float:
-    metric = Jitter(fps)
-    metric.update(
-        torch.from_numpy(joints),
-        torch.ones(joints.shape[:2], dtype=torch.bool),
-        keys=torch.arange(len(joints)),
-    )
+def value(metric: FootSkating | Jitter, joints: np.ndarray) -> float:
+    """Returns the value of a metric for motions (B, F, 22, 3)."""
+    mask = torch.ones(joints.shape[:2], dtype=torch.bool)
+    metric.update(torch.from_numpy(joints), mask, keys=torch.arange(len(joints)))
     return metric.compute()
 
 
@@ -282,7 +268,7 @@ def recognized(
                     fps,
                 )
                 for length in SHOWN
-                for late in np.arange(0, SECONDS_TO_REACT + 0.01, 0.25)
+                for late in np.arange(0, LATEST - length + 0.01, 0.25)
             )
             counts = right.setdefault(str(attributes["action"]), [0, 0])
             counts[0] += shown

@@ -38,7 +38,7 @@ export class Clock {
  *   file of the last minute.
  * @param page `player(motion)` returns the page of the player that shows a motion; `read(text)` returns what the source
  *   reads for a text, or throws an error with the texts `nearest` in meaning; `fps`; a first `text`, in which the person
- *   stands; and a text `walk` for the way to waypoints, null if there are none.
+ *   stands; and a text `walk` for the path to waypoints, null if there are none.
  */
 export class Live {
   constructor(container, source, page) {

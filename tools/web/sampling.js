@@ -204,7 +204,7 @@ export class Stream {
     return { joints: placed, reached: reached(points, placed, one, frames) };
   }
 
-  // A function that bends the way in clean estimates.
+  // A function that bends the path in clean estimates.
   async #guide(points) {
     const { width, size, sampler } = this, { root, fps } = sampler.content, { heading, place } = await this.#start();
     const [turn, side, ahead] = root, units = ([mean, std], value) => mean + std * value;

@@ -130,7 +130,7 @@ def data_of(source, root: Path, **options) -> MotionDataModule:
     return data
 
 
-def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
+def test_humanact12_from_raw_file_to_batch(tmp_path: Path, subtests):
     raw = str(write_humanact12(tmp_path / "raw"))
     ours, published = (
         data_of(HumanAct12(raw, flag), tmp_path / str(flag)) for flag in (False, True)
@@ -139,7 +139,10 @@ def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
     assert ours.store.info["actions"] == list(HumanAct12.actions)
     assert [clip.action for clip in ours.store.clips] == [k % 12 for k in range(360)]
     for split in SPLITS:
-        assert {clip.action for clip in ours.store.clips if clip.split == split} == set(range(12))
+        with subtests.test(split=split):
+            assert {clip.action for clip in ours.store.clips if clip.split == split} == set(
+                range(12)
+            )
     assert len(ours.test) == 120  # of 30 clips an action, one block of ten
     assert [data.store.info["published_split"] for data in (ours, published)] == [False, True]
     assert published.store.info["clips"] == {"train": 360, "val": 0, "test": 0}
@@ -148,25 +151,30 @@ def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
 
 
 @golden_case("smpl147")
-def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
+def test_samples_are_those_of_actor(stem: str, tmp_path: Path, subtests):
     """The whole way: pickle, store, crop, sample."""
     arrays = golden(stem)
     numbers = [key.removeprefix("a2m/inp_") for key in arrays if key.startswith("a2m/inp_")]
     for number in numbers:
-        pose, joints = arrays[f"a2m/pose72_{number}"], arrays[f"a2m/joints3d_{number}"]
-        label = int(arrays[f"a2m/label_{number}"])
-        raw = write_humanact12(tmp_path / number, poses=[pose], joints3D=[joints], y=[label])
-        expected = arrays[f"a2m/inp_{number}"].transpose(2, 0, 1).reshape(-1, 150)
-        crop = Fixed(frames=len(expected))
-        data = data_of(
-            HumanAct12(str(raw), published_split=True), raw.parent, batch_size=1, crop=crop, seed=0
-        )
-        low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
-        starts = [int(data.train.draw([0], batch)[0][0]) for batch in range(400)]
-        assert set(starts) == set(range(max(low, 0), max(high, 0) + 1))
-        _, sample, _, action = data.train[0, starts.index(max(drawn, 0))]
-        assert action == label
-        np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6, err_msg=number)
+        with subtests.test(number=number):
+            pose, joints = arrays[f"a2m/pose72_{number}"], arrays[f"a2m/joints3d_{number}"]
+            label = int(arrays[f"a2m/label_{number}"])
+            raw = write_humanact12(tmp_path / number, poses=[pose], joints3D=[joints], y=[label])
+            expected = arrays[f"a2m/inp_{number}"].transpose(2, 0, 1).reshape(-1, 150)
+            crop = Fixed(frames=len(expected))
+            data = data_of(
+                HumanAct12(str(raw), published_split=True),
+                raw.parent,
+                batch_size=1,
+                crop=crop,
+                seed=0,
+            )
+            low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
+            starts = [int(data.train.draw([0], batch)[0][0]) for batch in range(400)]
+            assert set(starts) == set(range(max(low, 0), max(high, 0) + 1))
+            _, sample, _, action = data.train[0, starts.index(max(drawn, 0))]
+            assert action == label
+            np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6, err_msg=number)
     assert numbers
 
 

@@ -49,7 +49,7 @@ def clips(tmp_path_factory) -> Path:
     ],
 )
 def test_every_kind_of_file_is_taught_to_models_of_every_representation(
-    name: str, kind: Literal["joints", "smpl"], features: int, clips: Path, tmp_path: Path
+    name: str, kind: Literal["joints", "smpl"], features: int, clips: Path, tmp_path: Path, subtests
 ):
     recipe = compose_data("folder", [f"representation={name}"])["representation"]
     representation = instantiate(recipe)
@@ -73,11 +73,12 @@ def test_every_kind_of_file_is_taught_to_models_of_every_representation(
         "a person walks in limp style"
     }
     for clip in of_user:
-        values = torch.from_numpy(np.array(data.store.motion(clip)))
-        joints = representation.decode(values)
-        head = representation.skeleton.joints.index("head")
-        assert values.shape[1] == features
-        assert (joints[:, head] - joints[:, 0])[:, 1].min() > 0.3, f"{clip.id} stands"
+        with subtests.test(clip=clip.id):
+            values = torch.from_numpy(np.array(data.store.motion(clip)))
+            joints = representation.decode(values)
+            head = representation.skeleton.joints.index("head")
+            assert values.shape[1] == features
+            assert (joints[:, head] - joints[:, 0])[:, 1].min() > 0.3, f"{clip.id} stands"
     batch = next(iter(data.train_dataloader()))
     assert batch.x.isfinite().all()
     assert [id.startswith(KEPT) for id in batch.ids] == [False, False, True, True]

@@ -203,7 +203,7 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
     ]
 
 
-def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
+def test_pages_escape_and_show_one_card_or_two(card, tmp_path, subtests):
     page, text = write_card([card], tmp_path)
     assert page.name.startswith("x-abababababab-40-")
     assert page.read_text().count("<polyline") == 2
@@ -230,8 +230,9 @@ def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
     ):
         content = content.replace(own, json.dumps("<img src=x onerror=alert(1)>"))
     for path in write_card([check_shape(json.loads(content), AuditCard)], tmp_path, "escaped"):
-        assert "<img" not in path.read_text()
-        assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
+        with subtests.test(path=path.name):
+            assert "<img" not in path.read_text()
+            assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
 
 
 def test_the_strongest_card_that_fits_is_cited_and_a_weaker_one_overwrites_nothing(
@@ -385,11 +386,12 @@ def test_committed_cards_are_listed_complete_and_small(path, tmp_path, subtests)
         Path("docs/benchmarks/audit") / f"{path.stem}.html", card.motions, card.split, card.data
     )
     for written in write_card([card], tmp_path, path.stem):
-        kept = path.with_suffix(written.suffix)
-        assert kept.read_bytes() == written.read_bytes(), (
-            f"flame-mdm audit cards={path} out={path.parent}"
-        )
-        assert kept.stat().st_size <= 300_000
+        with subtests.test(written=written.name):
+            kept = path.with_suffix(written.suffix)
+            assert kept.read_bytes() == written.read_bytes(), (
+                f"flame-mdm audit cards={path} out={path.parent}"
+            )
+            assert kept.stat().st_size <= 300_000
     assert card.motions >= 368
     by_name = {perturbation.name: perturbation for perturbation in card.perturbations}
     for name in ("wrong captions", "near misses"):

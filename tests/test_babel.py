@@ -63,17 +63,20 @@ def small(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @golden_case("rules")
-def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
+def test_clips_are_those_of_flame(stem: str, tmp_path: Path, subtests):
     source = coded(tmp_path, golden(stem))
     rows = sorted(row_of(window) for window in source.windows)
     assert rows == sorted(golden(stem)["babel_clips"].tolist())
     clips = list(source.clips(FPS))
     assert source.count() == len(clips) == len(rows)
     for clip in clips[:: len(clips) // 5]:
-        motion = frames_of(tmp_path / "amass", clip.attributes["motion"])
-        assert clip.window is not None
-        first, length = clip.window
-        np.testing.assert_array_equal(clip.motion[first : first + length], motion[first:][:length])
+        with subtests.test(clip=clip.id):
+            motion = frames_of(tmp_path / "amass", clip.attributes["motion"])
+            assert clip.window is not None
+            first, length = clip.window
+            np.testing.assert_array_equal(
+                clip.motion[first : first + length], motion[first:][:length]
+            )
 
 
 def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):

@@ -55,23 +55,24 @@ def same(one: list[Clip], other: list[Clip]) -> None:
         assert {**vars(a), "motion": None} == {**vars(b), "motion": None}
 
 
-def test_clips_of_a_folder(tiny):
+def test_clips_of_a_folder(tiny, subtests):
     everything = clips(tiny)
     ids = [clip.id for clip in everything]
     originals = [clip for clip in everything if clip.id[0] != "M"]
     assert Bandai(str(tiny)).count() == len(set(ids)) == len(ids)
     assert [clip.id for clip in originals] == sorted(TAKES)
     for clip in originals:
-        frames = (TAKES[clip.id] - 1) * 20 // 30 + 1
-        assert (clip.motion.shape, clip.motion.dtype, clip.source) == (
-            (frames, 22, 3),
-            np.float32,
-            clip.id,
-        )
-        assert (f"M{clip.id}" in ids) == (clip.split == "train")
-        assert Bandai.actions[clip.action or 0] == clip.attributes["content"]
-        assert clip.attributes["dataset"] == int(clip.id[8])
-        assert len(set(clip.captions)) == 4
+        with subtests.test(clip=clip.id):
+            frames = (TAKES[clip.id] - 1) * 20 // 30 + 1
+            assert (clip.motion.shape, clip.motion.dtype, clip.source) == (
+                (frames, 22, 3),
+                np.float32,
+                clip.id,
+            )
+            assert (f"M{clip.id}" in ids) == (clip.split == "train")
+            assert Bandai.actions[clip.action or 0] == clip.attributes["content"]
+            assert clip.attributes["dataset"] == int(clip.id[8])
+            assert len(set(clip.captions)) == 4
     assert {clip.split for clip in originals} == {"train", "val", "test"}
     assert Bandai(str(tiny), mirror=False).count() == len(TAKES)
     same(clips(tiny, mirror=False), originals)
@@ -92,23 +93,24 @@ def test_bones_keep_their_length_and_joints_their_position(tiny):
         np.testing.assert_allclose(motion[::2][: len(expected)], expected, atol=1e-6)
 
 
-def test_mirrored_copies(tiny):
+def test_mirrored_copies(tiny, subtests):
     by_id = {clip.id: clip for clip in clips(tiny)}
     mirrored = [clip for clip in by_id.values() if clip.id[0] == "M"]
     assert mirrored
     swapped = {"left": "right", "right": "left"}
     for clip in mirrored:
-        original = by_id[clip.id[1:]]
-        assert (clip.split, clip.source) == ("train", original.id)
-        np.testing.assert_array_equal(
-            SMPL22.mirror(torch.from_numpy(clip.motion)).numpy(), original.motion
-        )
-        side = str(original.attributes.get("side", ""))
-        assert clip.attributes.get("side", "") == swapped.get(side, side)
-        ours, theirs = (
-            [c.replace(",", " ,").split() for c in some.captions] for some in (clip, original)
-        )
-        assert ours == [[swapped.get(word, word) for word in words] for words in theirs]
+        with subtests.test(clip=clip.id):
+            original = by_id[clip.id[1:]]
+            assert (clip.split, clip.source) == ("train", original.id)
+            np.testing.assert_array_equal(
+                SMPL22.mirror(torch.from_numpy(clip.motion)).numpy(), original.motion
+            )
+            side = str(original.attributes.get("side", ""))
+            assert clip.attributes.get("side", "") == swapped.get(side, side)
+            ours, theirs = (
+                [c.replace(",", " ,").split() for c in some.captions] for some in (clip, original)
+            )
+            assert ours == [[swapped.get(word, word) for word in words] for words in theirs]
     wrong_side = (
         "dataset-2_walk-turn-right_masculine_006"  # this take turns to the other side than named
     )
@@ -117,10 +119,13 @@ def test_mirrored_copies(tiny):
         ("Mdataset-1_bye_giant_001", "bye", "left"),
         (wrong_side, "walk-turn-left", "left"),
     ):
-        clip = by_id[name]
-        assert (clip.attributes["content"], clip.attributes["side"]) == (content, side)
-        assert Bandai.actions[clip.action or 0] == content
-        assert all(side in caption and swapped[side] not in caption for caption in clip.captions)
+        with subtests.test(name=name):
+            clip = by_id[name]
+            assert (clip.attributes["content"], clip.attributes["side"]) == (content, side)
+            assert Bandai.actions[clip.action or 0] == content
+            assert all(
+                side in caption and swapped[side] not in caption for caption in clip.captions
+            )
     assert by_id[wrong_side].split == "test"  # as the name says
 
 
@@ -142,26 +147,29 @@ def resting_offsets() -> np.ndarray:
     return offsets
 
 
-def test_smpl_rotations_show_the_joints(tiny):
+def test_smpl_rotations_show_the_joints(tiny, subtests):
     """Posed by SMPL's kinematics, the skeleton of the files has its joints where the files have them."""
     by_id = {clip.id: clip for clip in clips(tiny, motion="smpl")}
     for joints in clips(tiny):
-        rotations = by_id[joints.id]
-        assert (rotations.motion.shape, rotations.motion.dtype) == (
-            (len(joints.motion), 75),
-            np.float32,
-        )
-        same([Clip(**{**vars(rotations), "motion": joints.motion})], [joints])
-        np.testing.assert_allclose(
-            decoded(rotations.motion, resting_offsets())[:, :22], joints.motion, atol=1e-5
-        )
-        assert not rotations.motion[:, -6:].any()
-        if joints.id[0] == "M":
-            mirrored = SMPL24.mirror(torch.from_numpy(decoded(by_id[joints.id[1:]].motion))).numpy()
-            np.testing.assert_allclose(decoded(rotations.motion), mirrored, atol=1e-6)
+        with subtests.test(clip=joints.id):
+            rotations = by_id[joints.id]
+            assert (rotations.motion.shape, rotations.motion.dtype) == (
+                (len(joints.motion), 75),
+                np.float32,
+            )
+            same([Clip(**{**vars(rotations), "motion": joints.motion})], [joints])
+            np.testing.assert_allclose(
+                decoded(rotations.motion, resting_offsets())[:, :22], joints.motion, atol=1e-5
+            )
+            assert not rotations.motion[:, -6:].any()
+            if joints.id[0] == "M":
+                mirrored = SMPL24.mirror(
+                    torch.from_numpy(decoded(by_id[joints.id[1:]].motion))
+                ).numpy()
+                np.testing.assert_allclose(decoded(rotations.motion), mirrored, atol=1e-6)
 
 
-def test_the_rest_pose_is_that_of_smpl():
+def test_the_rest_pose_is_that_of_smpl(subtests):
     take = synthetic_take(0, 1)
     turned = [bandai.REST.get(name, np.eye(3)) for name in take.joints]
     local = np.stack(
@@ -175,12 +183,13 @@ def test_the_rest_pose_is_that_of_smpl():
     offsets = np.stack([resting_offsets(), ADULT])
     bones, expected = offsets / np.maximum(np.linalg.norm(offsets, axis=2, keepdims=True), 1e-9)
     for joint, name in enumerate(SMPL24.joints):
-        if name.endswith(("shoulder", "elbow", "wrist", "knee", "ankle")):
-            assert bones[joint] @ expected[joint] > 1 - 1e-6, name
-        if name.endswith("foot"):
-            assert np.arctan2(*bones[joint, [0, 2]]) == pytest.approx(
-                np.arctan2(*expected[joint, [0, 2]]), abs=1e-3
-            )
+        with subtests.test(joint=name):
+            if name.endswith(("shoulder", "elbow", "wrist", "knee", "ankle")):
+                assert bones[joint] @ expected[joint] > 1 - 1e-6, name
+            if name.endswith("foot"):
+                assert np.arctan2(*bones[joint, [0, 2]]) == pytest.approx(
+                    np.arctan2(*expected[joint, [0, 2]]), abs=1e-3
+                )
     at = dict(zip(SMPL24.joints, decoded(motion)[0] - decoded(motion)[0, 0], strict=True))
     assert at["left_wrist"][0] > 0.6 > -0.6 > at["right_wrist"][0]
     assert at["head"][1] > 0.5 > -0.8 > at["left_ankle"][1]
@@ -200,21 +209,23 @@ def published() -> list[tuple[int, str, str, int]]:
     return [(*combination, k + 1) for combination, count in counts.items() for k in range(count)]
 
 
-def test_split_of_the_published_takes():
+def test_split_of_the_published_takes(subtests):
     takes = published()
     assert Counter(take[0] for take in takes) == {1: 174, 2: 2902}
     splits = {take: split_of(*take) for take in takes}
     assert Counter(splits.values()) == {"train": 2379, "val": 325, "test": 372}
     for content, style in {take[1:3] for take in takes if take[0] == 2}:
-        of_combo = {split for take, split in splits.items() if take[:3] == (2, content, style)}
-        overlapping = style == "normal" and content.startswith("walk-turn-")
-        assert of_combo == ({"train"} if overlapping else {"train", "val", "test"})
-    for (dataset, content, style, number), split in splits.items():
-        if dataset == 2:  # neighbors in blocks of five
-            assert split == splits[2, content, style, (number - 1) // 5 * 5 + 1]
+        with subtests.test(content=content, style=style):
+            of_combo = {split for take, split in splits.items() if take[:3] == (2, content, style)}
+            overlapping = style == "normal" and content.startswith("walk-turn-")
+            assert of_combo == ({"train"} if overlapping else {"train", "val", "test"})
+    second = {take: split for take, split in splits.items() if take[0] == 2}
+    # neighbors in blocks of five
+    first = {take: (*take[:3], (take[3] - 1) // 5 * 5 + 1) for take in second}
+    assert second == {take: second[first[take]] for take in second}
 
 
-def test_compositional_split_holds_out_whole_combinations():
+def test_compositional_split_holds_out_whole_combinations(subtests):
     takes = published()
     splits = {take: split_of(*take, "compositional") for take in takes}
     assert Counter(splits.values()) == {"train": 2324, "val": 279, "test": 473}
@@ -233,9 +244,10 @@ def test_compositional_split_holds_out_whole_combinations():
         )
     assert not both[0] & both[1]
     for part in (1, 2):  # content, style: each is seen, in other combinations
-        assert {take[part] for take in held_out} <= {
-            take[part] for take in splits if splits[take] == "train"
-        }
+        with subtests.test(part=part):
+            assert {take[part] for take in held_out} <= {
+                take[part] for take in splits if splits[take] == "train"
+            }
     assert {style for dataset, _, style, _ in held_out if dataset == 2} == set(STYLES_2)
     # Other takes stay where they are, except test takes, which are used for training.
     assert all(
@@ -244,7 +256,7 @@ def test_compositional_split_holds_out_whole_combinations():
     assert splits[1, "walk", "old", 1] == splits[2, "walk", "elderly", 6] == "test"
 
 
-def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeypatch):
+def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeypatch, subtests):
     files = sorted(tiny.rglob("*"), reverse=True)  # another order than the clips have
     with zipfile.ZipFile(tmp_path / "set.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for file in files:
@@ -260,8 +272,9 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeyp
     expected, count = clips(tiny), Bandai(str(tiny)).count()
     packed = sorted(tmp_path.glob("set.*"))
     for path in packed:
-        assert Bandai(str(path)).count() == count
-        same(clips(path), expected)
+        with subtests.test(path=path.name):
+            assert Bandai(str(path)).count() == count
+            same(clips(path), expected)
     with tarfile.open(tmp_path / "set.evil", "w") as archive:
         archive.add(files[0], f"data/../../{HAPPY}.bvh")
     message = r"set\.evil: the file data/\.\./\.\./.* would be unpacked outside the folder"

@@ -66,7 +66,7 @@ def run(package: Path, requests: list[Any], folder: Path) -> list[Any]:
     return json.loads((folder / "results.json").read_text())
 
 
-def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path) -> None:
+def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path, subtests) -> None:
     assert package.stat().st_size <= 40e6
     hero = tmp_path / "hero.glb"
     synthetic("kick").save(hero, rig="mixamo")
@@ -78,25 +78,27 @@ def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path)
     requests = [[WALK, 20, None], [KICK | {"in_place": True}, 30, None], [WAVE, 20, str(hero)]]
     first, second, third = run(package, requests, tmp_path)
     for (names, joints), motion in ((first, walk), (second, kick)):
-        order = [names.index(name) for name in motion.skeleton.joints]
-        if motion is kick:  # 30 frames per second
-            assert len(joints) == round((len(motion.joints) - 1) * 1.5) + 1
-            joints = joints[::3]
-            motion.joints[..., [0, 2]] -= motion.joints[:, :1, [0, 2]]
-            motion.joints = motion.joints[::2]
-        assert np.abs(np.array(joints)[:, order] - motion.joints).max() < 1e-3
+        with subtests.test(text=motion.text):
+            order = [names.index(name) for name in motion.skeleton.joints]
+            if motion is kick:  # 30 frames per second
+                assert len(joints) == round((len(motion.joints) - 1) * 1.5) + 1
+                joints = joints[::3]
+                motion.joints[..., [0, 2]] -= motion.joints[:, :1, [0, 2]]
+                motion.joints = motion.joints[::2]
+            assert np.abs(np.array(joints)[:, order] - motion.joints).max() < 1e-3
     wave.save(tmp_path / "python.glb", character=hero)
     file, character = Glb(tmp_path / "python.glb"), characters.read_skinned(hero)
     names, joints = third
     for number in character.map.values():
-        expected = file.worlds()[:, character.file.nodes[number], :3, 3]
-        actual = np.array(joints)[:, names.index(character.rig.joints[number])]
-        assert np.abs(actual - expected).max() < 1e-3
+        with subtests.test(joint=character.rig.joints[number]):
+            expected = file.worlds()[:, character.file.nodes[number], :3, 3]
+            actual = np.array(joints)[:, names.index(character.rig.joints[number])]
+            assert np.abs(actual - expected).max() < 1e-3
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
 def test_what_cannot_be_generated_and_damage_are_refused_in_one_line(
-    package: Path, tmp_path: Path
+    package: Path, tmp_path: Path, subtests
 ) -> None:
     requests = [WALK | {"sentence": "qwer asdf"}, WALK | {"sentence": " "}, WALK | {"seconds": 9}]
     errors = run(
@@ -119,8 +121,9 @@ def test_what_cannot_be_generated_and_damage_are_refused_in_one_line(
         "skeletons.json is damaged",
     )
     for error, message in zip(errors, messages, strict=True):
-        assert message in error
-        assert "\n" not in error
+        with subtests.test(message=message):
+            assert message in error
+            assert "\n" not in error
 
 
 def test_an_unknown_platform_is_refused(tmp_path: Path) -> None:

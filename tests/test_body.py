@@ -46,7 +46,7 @@ def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
     np.testing.assert_allclose(points, mannequin().points, atol=4e-3)  # a little twist
 
 
-def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor():
+def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor(subtests):
     turns: Any = {"left_hip": (-50, 10, 0), "left_knee": (70, 0, 0), "right_shoulder": (0, 30, 60)}
     motion = posed(scale=0.93, spine2=(15, 0, 9), **turns)
     drawn = fit_body(motion)
@@ -61,8 +61,13 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
     # A rigid bone maps both its ends to joints
     moves = (drawn.turns[0, :22] @ drawn.joints[..., None])[..., 0]
     for parent, joint in SMPL22.edges:
-        end = drawn.starts[0, parent] - moves[parent] + drawn.turns[0, parent] @ drawn.joints[joint]
-        assert np.linalg.norm(end - drawn.starts[0, joint]) < 1e-4, SMPL22.joints[joint]
+        with subtests.test(joint=SMPL22.joints[joint]):
+            end = (
+                drawn.starts[0, parent]
+                - moves[parent]
+                + drawn.turns[0, parent] @ drawn.joints[joint]
+            )
+            assert np.linalg.norm(end - drawn.starts[0, joint]) < 1e-4, SMPL22.joints[joint]
 
 
 def test_a_twisted_wrist_turns_the_forearm_by_degrees_toes_bend_and_the_head_is_level():

@@ -114,7 +114,7 @@ def test_a_page_shows_every_clip_and_its_texts_as_text(store, tmp_path):
     assert '<tr><td>val</td><td class="number">1</td>' in about
 
 
-def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, capsys):
+def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, capsys, subtests):
     out = tmp_path / "page.html"
 
     def run(*words: str) -> int:
@@ -136,16 +136,17 @@ def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, c
         f"motion_{n:03d}_{m['id']}.npz" for n, m in enumerate(motions)
     ]
     for path, shown in zip(files, motions, strict=True):
-        file = read(path)
-        assert (file.fps, len(file.joints)) == (20, min(shown["frames"], 60)), (
-            "cut as for evaluation"
-        )
-        assert file.text
-        assert file.text in shown["caption"].split(" · ")
-        with np.load(path) as arrays:
-            assert str(arrays["clip"]) == shown["id"]
-            decoded = HumanML().decode(torch.from_numpy(arrays["features"])).numpy()
-            np.testing.assert_allclose(decoded, arrays["joints"], atol=1e-6)
+        with subtests.test(clip=shown["id"]):
+            file = read(path)
+            assert (file.fps, len(file.joints)) == (20, min(shown["frames"], 60)), (
+                "cut as for evaluation"
+            )
+            assert file.text
+            assert file.text in shown["caption"].split(" · ")
+            with np.load(path) as arrays:
+                assert str(arrays["clip"]) == shown["id"]
+                decoded = HumanML().decode(torch.from_numpy(arrays["features"])).numpy()
+                np.testing.assert_allclose(decoded, arrays["joints"], atol=1e-6)
 
     assert run("split=test", "clips=1", f"motions={folder}") == 1
     assert "holds other motions, such as motion_001_" in capsys.readouterr().err
@@ -153,7 +154,7 @@ def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, c
 
 @pytest.mark.tools
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_page_narrows_down_in_a_browser(store, tmp_path):
+def test_a_page_narrows_down_in_a_browser(store, tmp_path, subtests):
     page_of(store, tmp_path / "page.html")
     with browser(tmp_path / "profile", 1000, 500) as tab:
         tab.open((tmp_path / "page.html").as_uri())
@@ -165,13 +166,14 @@ def test_a_page_narrows_down_in_a_browser(store, tmp_path):
             ("filter", "walks 3", "input", [3, 4]),  # the copy has no such caption, but comes along
             ("filter", "", "input", [0, 1, 2, 3, 4]),
         ):
-            tab.run(
-                f"element('{field}').value = '{value}'; element('{field}').dispatchEvent(new Event('{event}'))"
-            )
-            assert tab.run("shown().map((m) => motions.indexOf(m))") == shown, value
-            assert tab.run("element('count').textContent") == (
-                "" if len(shown) == 5 else f"{len(shown)} of 5"
-            )
+            with subtests.test(field=field, value=value):
+                tab.run(
+                    f"element('{field}').value = '{value}'; element('{field}').dispatchEvent(new Event('{event}'))"
+                )
+                assert tab.run("shown().map((m) => motions.indexOf(m))") == shown, value
+                assert tab.run("element('count').textContent") == (
+                    "" if len(shown) == 5 else f"{len(shown)} of 5"
+                )
         assert tab.run("element('each').checked")
         columns = tab.run("motions.map((m) => +m.figure.style.gridColumnStart)")
         assert columns[4] == columns[3] + 1  # a copy beside its original

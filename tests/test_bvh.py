@@ -130,16 +130,17 @@ def test_what_is_written_reads_back(tmp_path):
     assert (tmp_path / "again.bvh").read_bytes() == (tmp_path / "tree.bvh").read_bytes()
 
 
-def test_resampling_turns_at_a_constant_rate_and_keeps_bones_and_the_last_frame(parse):
+def test_resampling_turns_at_a_constant_rate_and_keeps_bones_and_the_last_frame(parse, subtests):
     for frames, expected in ((1, 1), (2, 1), (3, 2), (4, 3), (7, 5), (128, 85), (130, 87)):
-        motion = replace(tree(0, frames), fps=30.0)
-        rotations, translations = motion.resample(20)
-        assert len(rotations) == len(translations) == expected
-        shared = slice(0, len(rotations[::2]))  # times 0, 0.1, 0.2, ... are frames of both
-        np.testing.assert_allclose(rotations[::2], motion.rotations()[::3][shared], atol=1e-12)
-        np.testing.assert_allclose(
-            translations[::2], motion.translations()[::3][shared], atol=1e-12
-        )
+        with subtests.test(frames=frames):
+            motion = replace(tree(0, frames), fps=30.0)
+            rotations, translations = motion.resample(20)
+            assert len(rotations) == len(translations) == expected
+            shared = slice(0, len(rotations[::2]))  # times 0, 0.1, 0.2, ... are frames of both
+            np.testing.assert_allclose(rotations[::2], motion.rotations()[::3][shared], atol=1e-12)
+            np.testing.assert_allclose(
+                translations[::2], motion.translations()[::3][shared], atol=1e-12
+            )
 
     frames = "0 0 0 170 0 0 0 0 0 7\n3 6 9 -170 0 0 0 90 0 7\n"
     motion = parse(ARM[: ARM.index("0 0 0 0 0 0")].replace("Frames:\t3", "Frames:\t2") + frames)

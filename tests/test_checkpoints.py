@@ -227,32 +227,37 @@ def test_flame_outputs(case: str, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.golden
-def test_every_weight_of_the_released_sizes_has_its_target_and_text_encoders_are_left() -> None:
+def test_every_weight_of_the_released_sizes_has_its_target_and_text_encoders_are_left(
+    subtests,
+) -> None:
     path = GOLDEN / "state_dict_manifest.json"
     manifest = json.loads(path.read_text()) if path.is_file() else {}
     for name in (name for name in manifest if name.startswith(("mdm_", "mfm_", "flame_hml"))):
-        state = {
-            key: torch.empty(shape, device="meta") for key, shape in manifest[name]["keys"].items()
-        }
-        if name.startswith("flame"):
-            released = import_flame(
-                state | {"lm.embeddings.word_embeddings.weight": torch.empty(3)}
-            )
-        else:
-            args: dict[str, Any] = {
-                "arch": next((a for a in ("trans_dec", "gru") if a in name), "trans_enc")
+        with subtests.test(name=name):
+            state = {
+                key: torch.empty(shape, device="meta")
+                for key, shape in manifest[name]["keys"].items()
             }
-            args |= {
-                "emb_trans_dec": name.endswith("_emb"),
-                "text_encoder_type": "bert" if "bert" in name else "clip",
-            }
-            released = import_mdm(
-                state | {"clip_model.positional_embedding": torch.empty(3)}, Options(**args)
-            )
-        action = 0 if released.action_embedding is None else released.action_embedding.numel()
-        assert (
-            sum(x.numel() for x in released.state.values()) + action == manifest[name]["n_params"]
-        ), name
+            if name.startswith("flame"):
+                released = import_flame(
+                    state | {"lm.embeddings.word_embeddings.weight": torch.empty(3)}
+                )
+            else:
+                args: dict[str, Any] = {
+                    "arch": next((a for a in ("trans_dec", "gru") if a in name), "trans_enc")
+                }
+                args |= {
+                    "emb_trans_dec": name.endswith("_emb"),
+                    "text_encoder_type": "bert" if "bert" in name else "clip",
+                }
+                released = import_mdm(
+                    state | {"clip_model.positional_embedding": torch.empty(3)}, Options(**args)
+                )
+            action = 0 if released.action_embedding is None else released.action_embedding.numel()
+            assert (
+                sum(x.numel() for x in released.state.values()) + action
+                == manifest[name]["n_params"]
+            ), name
 
 
 MDM_ARGUMENTS = {
@@ -763,7 +768,9 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtes
             load(name)
 
 
-def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, capsys, monkeypatch):
+def test_push_writes_a_card_and_uploads_these_files_alone(
+    trained, tmp_path, capsys, monkeypatch, subtests
+):
     folder, api = tmp_path / "mine", MagicMock()
     words = ["push", str(trained), "me/walker", f"out={folder}"]
     assert main([*words, "dry_run=true"]) == 0
@@ -780,8 +787,9 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     }
     model = model_files.read_model_file(folder / "model.safetensors")
     for dataset, terms in (("bandai", "license: cc-by-nc-4.0"), ("humanml3d", "license: other")):
-        model["facts"]["dataset"] = dataset
-        assert terms in hub.card(model, "me/walker", "")
+        with subtests.test(dataset=dataset):
+            model["facts"]["dataset"] = dataset
+            assert terms in hub.card(model, "me/walker", "")
     assert "non-commercial" in hub.card(model, "me/walker", "")
     licenses = [{"license": "CC0", "clips": 3, "minutes": 1.5, "actions": ["run", "walk"]}]
     model["facts"] |= {"dataset": "package", "licenses": licenses}

@@ -127,7 +127,7 @@ PAIRS = [(process, "learned") for process in PROCESSES] + [("x0", "action"), ("x
 
 @pytest.mark.parametrize(("process", "condition"), PAIRS)
 @each_denoiser
-def test_trains_and_samples(denoiser, process, condition, monkeypatch):
+def test_trains_and_samples(denoiser, process, condition, monkeypatch, subtests):
     task, motions = build(denoiser, process, condition), batch()
     # Such a denoiser reads tokens instead of the pooled vector.
     if condition == "none" and DENOISERS[denoiser].get("max_tokens"):
@@ -156,11 +156,12 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     assert {"train/loss", "train/mse"} <= logged.keys()
     assert ("train/vlb" in logged) == (process == "learned_range")
     for sampler in samplers(process):
-        x = generated(task, motions, SamplerOptions(sampler=sampler))
-        assert x.shape == motions.x.shape
-        assert x.isfinite().all()
-        assert (x[~motions.mask] == 0).all()
-        assert x[motions.mask].std() > 0.01
+        with subtests.test(sampler=sampler):
+            x = generated(task, motions, SamplerOptions(sampler=sampler))
+            assert x.shape == motions.x.shape
+            assert x.isfinite().all()
+            assert (x[~motions.mask] == 0).all()
+            assert x[motions.mask].std() > 0.01
     assert task.training
 
 
@@ -178,18 +179,19 @@ def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
 @pytest.mark.parametrize(
     ("process", "sampler"), [(p, s) for p in ("x0", FLOW) for s in samplers(p)]
 )
-def test_one_encoding_a_run_and_one_forward_a_call(process, sampler):
+def test_one_encoding_a_run_and_one_forward_a_call(process, sampler, subtests):
     for guidance_scale, copies in ((2.5, 2), (1.0, 1)):
-        task, encodings, forwards = build("mdm_decoder_text", process), [], []
-        model = task.generator
-        model.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1))
-        model.denoiser.register_forward_hook(
-            lambda _, x, __, calls=forwards: calls.append(len(x[0]))
-        )
-        options = SamplerOptions(
-            sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale
-        )
-        model.generate(batch(), options)
-        assert len(encodings) == 1
-        assert set(forwards) == {copies * len(LENGTHS)}
-        assert sampler == "dopri5" or len(forwards) == 5 * CALLS_A_STEP.get(sampler, 1)
+        with subtests.test(guidance_scale=guidance_scale):
+            task, encodings, forwards = build("mdm_decoder_text", process), [], []
+            model = task.generator
+            model.condition.register_forward_hook(lambda *_, calls=encodings: calls.append(1))
+            model.denoiser.register_forward_hook(
+                lambda _, x, __, calls=forwards: calls.append(len(x[0]))
+            )
+            options = SamplerOptions(
+                sampler=sampler, num_inference_steps=5, guidance_scale=guidance_scale
+            )
+            model.generate(batch(), options)
+            assert len(encodings) == 1
+            assert set(forwards) == {copies * len(LENGTHS)}
+            assert sampler == "dopri5" or len(forwards) == 5 * CALLS_A_STEP.get(sampler, 1)

@@ -215,7 +215,7 @@ def test_folders_of_motions_are_compared_without_a_run(tmp_path):
     assert "No evaluation in common" not in text
 
 
-def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
+def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path, subtests):
     text = page(three, tmp_path / "rate.html", "rate=true")
     assert "Which animation better fits the following description?" in text
     items = data_of(text)["items"]
@@ -224,27 +224,31 @@ def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
     ]
     assert sorted((item["b"], item["prompt"]) for item in items) == sorted(pairs)
     for item in items:
-        scene = data_of(item["player"])
-        assert [motion["id"] for motion in scene] == ["the left one", "the right one"]
-        assert not any(motion["caption"] for motion in scene)
-        assert not any(label in item["player"] for label in ("mine/one", "mine/two", "mine/three"))
-        left, right = (motion["center"][0] for motion in scene)
-        assert (left < right) == (item["left"] == "a"), (
-            "a is the first run, which stands at the smallest x"
-        )
+        with subtests.test(prompt=item["prompt"]):
+            scene = data_of(item["player"])
+            assert [motion["id"] for motion in scene] == ["the left one", "the right one"]
+            assert not any(motion["caption"] for motion in scene)
+            assert not any(
+                label in item["player"] for label in ("mine/one", "mine/two", "mine/three")
+            )
+            left, right = (motion["center"][0] for motion in scene)
+            assert (left < right) == (item["left"] == "a"), (
+                "a is the first run, which stands at the smallest x"
+            )
     assert page(three, tmp_path / "again.html", "rate=true") == text
 
 
-def test_sides_and_order_are_drawn(tmp_path):
+def test_sides_and_order_are_drawn(tmp_path, subtests):
     prompts = tuple(f"prompt {number}" for number in range(24))
     folders = [motions(tmp_path / name, prompts, at) for name, at in (("a", 0), ("b", 1))]
     out = tmp_path / "rate.html"
     first, other = (
         data_of(page(folders, out, "rate=true", f"seed={seed}"))["items"] for seed in (0, 1)
     )
-    for items in (first, other):
-        assert 5 < sum(item["left"] == "a" for item in items) < 19
-        assert [item["prompt"] for item in items] != list(prompts)
+    for seed, items in enumerate((first, other)):
+        with subtests.test(seed=seed):
+            assert 5 < sum(item["left"] == "a" for item in items) < 19
+            assert [item["prompt"] for item in items] != list(prompts)
     assert [item["prompt"] for item in first] != [item["prompt"] for item in other]
     assert {item["prompt"]: item["left"] for item in first} != {
         item["prompt"]: item["left"] for item in other

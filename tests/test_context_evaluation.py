@@ -39,17 +39,19 @@ def protocol(model, clips) -> Protocol:
     return opened
 
 
-def test_the_frames_before_the_measured_ones_are_the_context(protocol, clips, model):
+def test_the_frames_before_the_measured_ones_are_the_context(protocol, clips, model, subtests):
     rows = protocol.rows(clips, 0, 0)
     assert rows
     for row in rows:
-        assert (len(row.context), len(row.frames)) == (CONTEXT, FRAMES - CONTEXT)
-        assert row.context[-1] + 1 == row.frames[0]
+        with subtests.test(clip=row.id):
+            assert (len(row.context), len(row.frames)) == (CONTEXT, FRAMES - CONTEXT)
+            assert row.context[-1] + 1 == row.frames[0]
     for purpose in ("real", "training"):
-        assert all(
-            len(row.frames) == FRAMES - CONTEXT
-            for row in protocol.rows(clips, 0, 0, purpose=purpose)
-        )
+        with subtests.test(purpose=purpose):
+            assert all(
+                len(row.frames) == FRAMES - CONTEXT
+                for row in protocol.rows(clips, 0, 0, purpose=purpose)
+            )
     ordinary = load_protocol("synthetic", model.representation)
     assert all(
         len(row.frames) == FRAMES and not len(row.context) for row in ordinary.rows(clips, 0, 0)

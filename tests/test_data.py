@@ -118,18 +118,19 @@ def test_the_fingerprint_tells_each_field_of_a_clip(tmp_path, changed):
     assert fingerprint("one") != fingerprint("other", **changed)
 
 
-def test_damaged_files_are_named(store, tmp_path):
+def test_damaged_files_are_named(store, tmp_path, subtests):
     for name, part in product(
         ("features.npy", "clips.jsonl", "statistics.npz", "store.json"), (None, 0, 0.5)
     ):
-        path = shutil.copytree(store.folder, tmp_path / f"{name}-{part}") / name
-        content = path.read_bytes()
-        path.unlink()
-        if part is not None:
-            path.write_bytes(content[: int(part * len(content))])
-        with pytest.raises((ValueError, FileNotFoundError), match=str(path.parent)) as error:
-            Store(path.parent)
-        assert "\n" not in str(error.value)
+        with subtests.test(name=name, part=part):
+            path = shutil.copytree(store.folder, tmp_path / f"{name}-{part}") / name
+            content = path.read_bytes()
+            path.unlink()
+            if part is not None:
+                path.write_bytes(content[: int(part * len(content))])
+            with pytest.raises((ValueError, FileNotFoundError), match=str(path.parent)) as error:
+                Store(path.parent)
+            assert "\n" not in str(error.value)
     path = shutil.copytree(store.folder, tmp_path / "flipped") / "features.npy"
     data = bytearray(path.read_bytes())
     data[-5] ^= 1
@@ -187,7 +188,7 @@ def test_integers_are_uniform_and_independent(subtests):
     assert [set(many[k::3].tolist()) for k in range(3)] == [{0}, {0, 1}, {0, 1, 2}]
 
 
-def test_batches_are_a_function_of_their_number_and_processes_share_them():
+def test_batches_are_a_function_of_their_number_and_processes_share_them(subtests):
     lengths = np.random.default_rng(0).integers(24, 60, 103)
 
     def batches(count, first=0, rank=0, world=1):
@@ -203,10 +204,13 @@ def test_batches_are_a_function_of_their_number_and_processes_share_them():
     assert [batches(20, rank=rank, world=2) for rank in (0, 1)] == [stream[0::2], stream[1::2]]
     lengths = np.random.default_rng(0).integers(24, 60, 31)
     for world in (1, 2, 3):
-        parts = [evaluation_batches(lengths, 4, rank=rank, world=world) for rank in range(world)]
-        assert sorted(index for part in parts for batch in part for index, _ in batch) == list(
-            range(31)
-        )
+        with subtests.test(world=world):
+            parts = [
+                evaluation_batches(lengths, 4, rank=rank, world=world) for rank in range(world)
+            ]
+            assert sorted(index for part in parts for batch in part for index, _ in batch) == list(
+                range(31)
+            )
 
 
 def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(
@@ -326,18 +330,19 @@ def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path, subtests
                 assert {batch.text is None for batch in first} == {True, False}
 
 
-def test_batches_are_padded_to_few_lengths(root):
+def test_batches_are_padded_to_few_lengths(root, subtests):
     options = ({"resident": True, "pad_multiple": 7}, {"resident": False, "pad_multiple": 7}, {})
     first, second, plain = (
         list(islice(loader(module(root, CROPS[0], **o), "train"), 40)) for o in options
     )
     assert_equal(first, second)
     assert {batch.x.shape[1] for batch in first} <= {*range(0, 60, 7), 60}
-    for padded, batch in zip(first, plain, strict=True):
-        frames = batch.x.shape[1]
-        assert torch.equal(padded.x[:, :frames], batch.x)
-        assert not padded.x[:, frames:].any()
-        assert not padded.mask[:, frames:].any()
+    for number, (padded, batch) in enumerate(zip(first, plain, strict=True)):
+        with subtests.test(batch=number):
+            frames = batch.x.shape[1]
+            assert torch.equal(padded.x[:, :frames], batch.x)
+            assert not padded.x[:, frames:].any()
+            assert not padded.mask[:, frames:].any()
 
 
 @pytest.mark.parametrize(

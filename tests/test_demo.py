@@ -127,12 +127,13 @@ def test_the_python_lines_and_the_files_give_the_same_motions(
         PATH.model_copy(update={"edits": (DemoEdit(strength=0.5, samples=2),)}),
         EDITED,
     ):
-        ours, names = studio.motions(request), dict[str, Any]()
-        exec(request.python("text", "cpu"), names)
-        for motion, program in zip(ours, names["motions"], strict=True):
-            assert motion.cleanup == (not request.path)
-            np.testing.assert_array_equal(motion.joints, program.joints)
-        assert studio.file(request, 0, ".bvh") == Path("motion.bvh").read_bytes()
+        with subtests.test(path=request.path):
+            ours, names = studio.motions(request), dict[str, Any]()
+            exec(request.python("text", "cpu"), names)
+            for motion, program in zip(ours, names["motions"], strict=True):
+                assert motion.cleanup == (not request.path)
+                np.testing.assert_array_equal(motion.joints, program.joints)
+            assert studio.file(request, 0, ".bvh") == Path("motion.bvh").read_bytes()
     with np.load(io.BytesIO(studio.file(EDITED, 1, ".npz"))) as file:
         np.testing.assert_array_equal(file["joints"], ours[1].joints)
     assert all(studio.file(EDITED, 1, ".bvh", rig).startswith(b"HIERARCHY") for rig in presets())

@@ -103,7 +103,7 @@ def test_dropped_condition_is_the_null_and_time_is_continuous(path: Path) -> Non
     assert 100 * later < much_later > 1e-6
 
 
-def test_paper_sizes() -> None:
+def test_paper_sizes(subtests) -> None:
     sizes = {"mdm_encoder": 17_880_327, "mdm_decoder": 26_293_511, "mdm_decoder_token": 26_293_511}
     sizes |= {"dip": 26_424_583, "dip_target": 26_704_135}
     # The paper states 23.47M for the U-Net.
@@ -113,15 +113,16 @@ def test_paper_sizes() -> None:
         "flame": 64_905_766,
     }
     for name, parameters in sizes.items():
-        with torch.device("meta"):
-            config = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
-            widths = {
-                "flame": (147, 294, 768),
-                "dip": (263, 263, 768),
-                "dip_target": (263, 263, 768),
-            }
-            denoiser = instantiate(config, *widths.get(name, (263, 263, 512)))
-        assert sum(p.numel() for p in denoiser.parameters()) == parameters, name
+        with subtests.test(name=name):
+            with torch.device("meta"):
+                config = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
+                widths = {
+                    "flame": (147, 294, 768),
+                    "dip": (263, 263, 768),
+                    "dip_target": (263, 263, 768),
+                }
+                denoiser = instantiate(config, *widths.get(name, (263, 263, 512)))
+            assert sum(p.numel() for p in denoiser.parameters()) == parameters, name
 
 
 @each_denoiser

@@ -213,7 +213,7 @@ def prepared(data_root: Path, *words: str) -> tuple[GeneratorTask, MotionDataMod
 
 
 @pytest.mark.parametrize("steps", [60, pytest.param(1000, marks=pytest.mark.robustness)])
-def test_training_equals_the_loop_in_plain_pytorch(data_root, tmp_path, steps):
+def test_training_equals_the_loop_in_plain_pytorch(data_root, tmp_path, steps, subtests):
     task, data = prepared(data_root, "data.resident=false")
     loop = ReferenceLoop(task, data)
     average = MovingAverage(DECAY, from_initial_weights=True)
@@ -241,8 +241,9 @@ def test_training_equals_the_loop_in_plain_pytorch(data_root, tmp_path, steps):
     for (name, parameter), averaged in zip(
         loop.network.named_parameters(), loop.average, strict=True
     ):
-        torch.testing.assert_close(ours[our_name(name)].detach(), averaged, rtol=0, atol=1e-7)
-        assert (parameter - averaged).abs().max() > 1e-6
+        with subtests.test(parameter=name):
+            torch.testing.assert_close(ours[our_name(name)].detach(), averaged, rtol=0, atol=1e-7)
+            assert (parameter - averaged).abs().max() > 1e-6
 
 
 def test_windows_are_uniform_over_all_places_of_a_clip(subtests):
@@ -280,7 +281,7 @@ RUN = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["synthetic/dip", "targets"])
-def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, data_root, recipe):
+def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, data_root, recipe, subtests):
     extra = ["denoiser=dip_target", "task=generation_targets", *WORDS, "denoiser.context_frames=10"]
     words = [*(extra if recipe == "targets" else WORDS), *RUN, f"data_root={data_root}"]
     weights = []
@@ -291,8 +292,9 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, data_root, recipe):
         weights.append(read_checkpoint(tmp_path / name / "checkpoints" / "last.ckpt"))
     whole, resumed = weights
     for part in ("state_dict", "current_model_state"):
-        assert whole[part].keys() == resumed[part].keys()
-        assert all(torch.equal(whole[part][key], resumed[part][key]) for key in whole[part])
+        with subtests.test(part=part):
+            assert whole[part].keys() == resumed[part].keys()
+            assert all(torch.equal(whole[part][key], resumed[part][key]) for key in whole[part])
 
 
 class Step(nn.Module):

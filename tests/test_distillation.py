@@ -134,7 +134,9 @@ def student(trained, data_root, tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encoder(trained, student):
+def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encoder(
+    trained, student, subtests
+):
     content, teacher = (
         read_checkpoint(student / "checkpoints" / "last.ckpt"),
         read_checkpoint(trained),
@@ -143,9 +145,10 @@ def test_a_student_starts_as_its_teacher_and_keeps_its_hash_data_and_text_encode
     assert content["facts"]["teacher"] == weights_sha256(trained)
     assert content["facts"]["fingerprint"] == teacher["facts"]["fingerprint"]
     for name, value in teacher["state_dict"].items():
-        after = content["state_dict"][name]
-        assert torch.equal(value, after) == (not name.startswith("denoiser")), name
-        torch.testing.assert_close(after, value, atol=0.05, rtol=0)
+        with subtests.test(name=name):
+            after = content["state_dict"][name]
+            assert torch.equal(value, after) == (not name.startswith("denoiser")), name
+            torch.testing.assert_close(after, value, atol=0.05, rtol=0)
 
 
 def test_the_target_of_a_student_has_its_averaged_weights(
@@ -551,7 +554,7 @@ def test_an_adaptation_keeps_the_captions_of_the_users_clips_and_the_text_encode
 
 @pytest.mark.slow
 def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(
-    trained, clips, tmp_path, data_root, monkeypatch
+    trained, clips, tmp_path, data_root, monkeypatch, subtests
 ):
     monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
     words = [
@@ -569,8 +572,9 @@ def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(
     root = {"root": str(tmp_path / "run" / "data")}
     data = instantiate(model.config["data"] | root, representation=model.representation)
     data.setup("fit")
-    for batch in itertools.islice(data.train_dataloader(), 3):
-        assert [name.startswith("prior/") for name in batch.ids] == [False, False, True, True]
+    for number, batch in enumerate(itertools.islice(data.train_dataloader(), 3)):
+        with subtests.test(batch=number):
+            assert [name.startswith("prior/") for name in batch.ids] == [False, False, True, True]
 
 
 def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):

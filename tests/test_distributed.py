@@ -67,7 +67,7 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
 
 
 @pytest.mark.robustness
-def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
+def test_torchrun_starts_a_killed_group_again(tiny, tmp_path, subtests):
     """The first process dies at step 3 and leaves its lock; then SIGTERM ends torchrun at step 6."""
     words = [*tiny, *RUN, "callbacks.samples=null"]
     counter = "TORCHELASTIC_RESTART_COUNT"
@@ -104,7 +104,8 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
         )
     )
     for line in ("steps: 0 to 100000", "died; taking over its run directory", "steps: 2 to 100000"):
-        assert out.count(line) == 1, err
+        with subtests.test(line=line):
+            assert out.count(line) == 1, err
     step = int(re.findall(r"stopped at step (\d+)", out)[0])
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert checkpoint["global_step"] == step >= 6
@@ -115,24 +116,26 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
 
 
 @pytest.mark.slow
-def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny):
+def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny, subtests):
     config = compose("quickstart", [*tiny, "data.batch_size=1"])
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=0)
     for part in (data, GeneratorTask.build(config, representation)):
-        # With this value, Lightning asks only the first process of the first machine.
-        assert part.prepare_data_per_node is False
+        with subtests.test(part=type(part).__name__):
+            # With this value, Lightning asks only the first process of the first machine.
+            assert part.prepare_data_per_node is False
     data.prepare_data()
     data.setup("fit")
     for world, batches in ((1, 5), (2, 3), (7, 5)):
-        data.trainer = SimpleNamespace(global_rank=0, world_size=world)  # type: ignore[assignment]
-        assert len(data.val_dataloader()) == batches
-        data.trainer.global_rank = world - 1  # type: ignore[union-attr]
-        assert len(data.val_dataloader()) >= 1
+        with subtests.test(world=world):
+            data.trainer = SimpleNamespace(global_rank=0, world_size=world)  # type: ignore[assignment]
+            assert len(data.val_dataloader()) == batches
+            data.trainer.global_rank = world - 1  # type: ignore[union-attr]
+            assert len(data.val_dataloader()) >= 1
 
 
 @pytest.mark.slow
-def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeypatch):
+def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeypatch, subtests):
     seen: list[tuple[list[str], Config]] = []
     note = partial(run_recipe, lambda config: seen.append((sys.argv[1:], config)), train.USAGE)
     monkeypatch.setattr(train, "main", note)
@@ -143,9 +146,13 @@ def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeyp
         str(tmp_path / "sweep" / f"seed={n}") for n in (1, 2)
     ]
     for (command, *words), config in seen:
-        assert command == "train"
-        assert config["callbacks"]["checkpoints"]["folder"] == f"{config['run']['dir']}/checkpoints"
-        assert compose(words[0], words[1:]) == config
+        with subtests.test(seed=config["seed"]):
+            assert command == "train"
+            assert (
+                config["callbacks"]["checkpoints"]["folder"]
+                == f"{config['run']['dir']}/checkpoints"
+            )
+            assert compose(words[0], words[1:]) == config
 
 
 @pytest.mark.robustness

@@ -168,7 +168,7 @@ EXAMPLES = {page: blocks for page in PAGES if (blocks := python_examples(page.re
 
 @pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_python_examples_of_a_page_run_and_print_what_they_say(
-    page, trained, tmp_path, monkeypatch
+    page, trained, tmp_path, monkeypatch, subtests
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -182,11 +182,13 @@ def test_the_python_examples_of_a_page_run_and_print_what_they_say(
         for expression, shape in re.findall(
             r"^([\w.\[\]]+) +# (\(\d+(?:, \d+)+\))", block, re.MULTILINE
         ):
-            assert str(eval(expression, names).shape) == shape, expression
+            with subtests.test(expression=expression):
+                assert str(eval(expression, names).shape) == shape, expression
         for expression, text in re.findall(
             r"^([\w.\[\]]+) +# ([A-Z]\w+\(.*\))$", block, re.MULTILINE
         ):
-            assert repr(eval(expression, names)) == text, expression
+            with subtests.test(expression=expression):
+                assert repr(eval(expression, names)) == text, expression
 
 
 def test_few_examples_do_not_run():
@@ -224,10 +226,11 @@ def make(*words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_make_forwards_every_command_and_refuses_a_text_without_quotes():
+def test_make_forwards_every_command_and_refuses_a_text_without_quotes(subtests):
     for name in COMMANDS:
-        done = make("-n", "-s", "-o", ".venv/.ready", name)
-        assert done.stdout == f".venv/bin/python -m flame_mdm {name} --from-make\n"
+        with subtests.test(name=name):
+            done = make("-n", "-s", "-o", ".venv/.ready", name)
+            assert done.stdout == f".venv/bin/python -m flame_mdm {name} --from-make\n"
     done = make("sample", "CKPT=x", "TEXT=a", "person", "walks")
     assert (
         'sample person walks: one command at a time; quote a value with spaces, as in TEXT="a'

@@ -123,35 +123,37 @@ def test_parts_of_the_body(skeleton):
 
 
 @pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
-def test_features_of_joints_move_these_joints(representation):
+def test_features_of_joints_move_these_joints(representation, subtests):
     """A joint's rotation turns what hangs on it, and nothing else; the root's features move all."""
     torch.manual_seed(0)
     features = torch.randn(2, representation.features)
     for joint in range(24):
-        below = {joint}
-        for child, parent in enumerate(representation.skeleton.parents):
-            below |= {child} if parent in below else set()
-        mask = representation.joint_features([joint])
-        moved = representation.decode(torch.where(mask, torch.randn_like(features), features))
-        distance = (moved - representation.decode(features)).norm(dim=-1).amax(0)
-        expected = set(range(24)) if joint == 0 else below - {joint}
-        assert {i for i, way in enumerate(distance.tolist()) if way > 1e-3} == expected
+        with subtests.test(joint=joint):
+            below = {joint}
+            for child, parent in enumerate(representation.skeleton.parents):
+                below |= {child} if parent in below else set()
+            mask = representation.joint_features([joint])
+            moved = representation.decode(torch.where(mask, torch.randn_like(features), features))
+            distance = (moved - representation.decode(features)).norm(dim=-1).amax(0)
+            expected = set(range(24)) if joint == 0 else below - {joint}
+            assert {i for i, way in enumerate(distance.tolist()) if way > 1e-3} == expected
     owners = torch.stack([representation.joint_features([joint]) for joint in range(24)])
     assert (owners.sum(0) == 1).all()
 
 
 @pytest.mark.parametrize("method", ["mdm", "flame"])
 @pytest.mark.parametrize("options", [{"region": "in_between"}, {"joints": "upper_body"}], ids=str)
-def test_exact_methods_keep_exactly(diffusion, motion, method, options):
+def test_exact_methods_keep_exactly(diffusion, motion, method, options, subtests):
     results = edit(diffusion, motion, "a person jumps", method=method, samples=2, **options)
-    for result in results:
-        assert result.feature_error == 0
-        assert np.abs(result.features - motion.features)[result.keep].max() < 1e-5
-        assert np.abs(result.features - motion.features)[~result.keep].mean() > 0.05
-        if "joints" in options:
-            lower = part_names(SMPL22)["lower_body"]
-            assert result.joint_error < 1e-5
-            assert np.abs(result.joints[:, lower] - motion.joints[:, lower]).max() < 1e-5
+    for number, result in enumerate(results):
+        with subtests.test(sample=number):
+            assert result.feature_error == 0
+            assert np.abs(result.features - motion.features)[result.keep].max() < 1e-5
+            assert np.abs(result.features - motion.features)[~result.keep].mean() > 0.05
+            if "joints" in options:
+                lower = part_names(SMPL22)["lower_body"]
+                assert result.joint_error < 1e-5
+                assert np.abs(result.joints[:, lower] - motion.joints[:, lower]).max() < 1e-5
     assert not np.array_equal(results[0].features, results[1].features)
 
 

@@ -184,7 +184,7 @@ def motions(out: Path) -> Path:
     return next((out.parent / "model" / "evaluation").glob("*/*"))
 
 
-def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
+def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full, subtests):
     result, out = full
     assert json.loads(out.read_text()) == result.model_dump(), "nothing is written that is not read"
     protocol: Any = load_protocol("synthetic", load(runs.model).representation)
@@ -195,11 +195,12 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     }
     assert {name.split("/")[0] for name in result.ground_truth} == set(protocol.metrics)
     for name, value in result.values.items():
-        assert (value.replications, value.n) == (
-            2,
-            len(data.test) if name != "multimodality" else 20 * 20,
-        )
-        assert value.mean is None or value.mean == pytest.approx(sum(value.per_replication) / 2)
+        with subtests.test(name=name):
+            assert (value.replications, value.n) == (
+                2,
+                len(data.test) if name != "multimodality" else 20 * 20,
+            )
+            assert value.mean is None or value.mean == pytest.approx(sum(value.per_replication) / 2)
     assert result.values["attributes/action"].ci is not None
     assert result.values["diversity"].mean is None, "not 0"
     assert "300" in result.not_computed["diversity"]
@@ -278,7 +279,7 @@ def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path,
             assert words in out
 
 
-def test_clips_that_may_have_been_seen_in_training_are_marked():
+def test_clips_that_may_have_been_seen_in_training_are_marked(subtests):
     differ = "and evaluated data here differ: splits may overlap"
     cases: list[tuple[str, str, Any, list[str]]] = [
         ("other", "here", "test", [f"training data other {differ}"]),
@@ -287,10 +288,13 @@ def test_clips_that_may_have_been_seen_in_training_are_marked():
         ("here", "here", "test", []),
     ]
     for model, extractor, split, reasons in cases:
-        plan: Any = SimpleNamespace(data=SimpleNamespace(store=SimpleNamespace(fingerprint="here")))
-        plan.model = SimpleNamespace(facts={"fingerprint": model})
-        plan.extractor = SimpleNamespace(fingerprint=extractor)
-        assert _overlaps(EvaluationRequest(ckpt="a", split=split), plan) == reasons
+        with subtests.test(model=model, extractor=extractor, split=split):
+            plan: Any = SimpleNamespace(
+                data=SimpleNamespace(store=SimpleNamespace(fingerprint="here"))
+            )
+            plan.model = SimpleNamespace(facts={"fingerprint": model})
+            plan.extractor = SimpleNamespace(fingerprint=extractor)
+            assert _overlaps(EvaluationRequest(ckpt="a", split=split), plan) == reasons
 
 
 def killed(words: list[str]) -> None:
@@ -339,7 +343,7 @@ def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypa
     assert results[0] == results[1]
 
 
-def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
+def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch, subtests):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled again"))
     model = full[1].parent / "model" / "checkpoints" / "last.ckpt"
     result = runs.evaluate(
@@ -348,9 +352,10 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     assert "extractor" in result.not_computed
     of_joints = ("attributes", "foot_skating", "penetration", "floating", "jitter", "static_share")
     for name, value in result.values.items():
-        assert value.mean == (full[0].values[name].mean if name.startswith(of_joints) else None), (
-            name
-        )
+        with subtests.test(name=name):
+            assert value.mean == (
+                full[0].values[name].mean if name.startswith(of_joints) else None
+            ), name
 
 
 def again(rows: Rows, indices: np.ndarray) -> Rows:
@@ -362,7 +367,7 @@ def again(rows: Rows, indices: np.ndarray) -> Rows:
     return taken | {"keys": torch.arange(len(indices))}
 
 
-def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
+def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs, subtests):
     evaluation = runs.evaluation(features=True)
     # Ill-conditioned metrics are left out of the exact comparison.
     metrics = {
@@ -375,13 +380,16 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     generator = np.random.default_rng(key("bootstrap", 3))
     count = len(first["keys"])
     for number in range(2):
-        own, others = (generator.integers(count, size=count) for _ in range(2))
-        values, _ = evaluator.score(again(first, own), again(first, own), again(second, others), 3)
-        assert values.keys() == drawn.keys()
-        for name, value in values.items():
-            assert drawn[name][number] == (
-                None if value is None else pytest.approx(value, rel=1e-5)
-            ), name
+        with subtests.test(draw=number):
+            own, others = (generator.integers(count, size=count) for _ in range(2))
+            values, _ = evaluator.score(
+                again(first, own), again(first, own), again(second, others), 3
+            )
+            assert values.keys() == drawn.keys()
+            for name, value in values.items():
+                assert drawn[name][number] == (
+                    None if value is None else pytest.approx(value, rel=1e-5)
+                ), name
     assert drawn["fid"][0] != drawn["fid"][1]
 
 
@@ -467,7 +475,7 @@ def stopped(runs: Runs) -> str:
     return error.type.__name__
 
 
-def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
+def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool, subtests):
     """Shares of unequal sizes, and shares of nothing: batches are dealt as wholes, so nothing depends on the number."""
     both, single = (pool.run(shares, *((runs, *size),) * 2) for size in ((33, tmp_path), (1, None)))
     baselines, ends = (pool.run(function, *((runs,),) * 2) for function in (of_baseline, stopped))
@@ -478,8 +486,11 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
     assert {path.name for path in tmp_path.iterdir()} == {"rep_0.npz", "multimodality_0.npz"}
     assert means(shares(runs, 33, tmp_path / "alone")) == means(both[0])
     for file in (tmp_path / "alone").iterdir():
-        one, two = read_samples(file), read_samples(tmp_path / file.name)
-        assert all(np.array_equal(one[name], two[name]) for name in ("ids", "features", "captions"))
+        with subtests.test(file=file.name):
+            one, two = read_samples(file), read_samples(tmp_path / file.name)
+            assert all(
+                np.array_equal(one[name], two[name]) for name in ("ids", "features", "captions")
+            )
     assert single[0] == single[1]
     assert (single[0].values["jitter"].n, single[0].cost.nfe) == (1, 5)
     assert means(shares(runs, 1, None)) == means(single[0])
@@ -491,7 +502,7 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
     assert ends == ["UserError", "SystemExit"], "one says why"
 
 
-def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
+def test_motions_of_others_are_measured_alike(runs, full, tmp_path, subtests):
     folder, out = tmp_path / "samples", tmp_path / "result.json"
     folder.mkdir()
     for path in motions(full[1]).glob("rep_*.npz"):
@@ -510,9 +521,10 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
     assert result.checkpoint is None
     assert len(result.samples_sha256) == 64
     for name, value in result.values.items():
-        assert value == full[0].values[name] if name != "multimodality" else value.mean is None, (
-            name
-        )
+        with subtests.test(name=name):
+            assert (
+                value == full[0].values[name] if name != "multimodality" else value.mean is None
+            ), name
 
     path, data = folder / "rep_0.npz", runs.data()
     (folder / "rep_1.npz").unlink()
@@ -532,13 +544,16 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
 def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_data(subtests):
     nothing = {"keys": torch.zeros(0, dtype=torch.long)}
     for name in protocol_names():
-        protocol = load_protocol(name, HumanML())
-        assert (protocol.name, protocol.version >= 1) == (name, True)
-        values, reasons = Evaluator(None, protocol.metrics, HumanML()).score(
-            nothing, nothing, nothing, 0
-        )
-        assert (set(values.values()), reasons) == ({None} if protocol.metrics else set(), {}), name
-        assert all(set(table) <= set(values) for table in protocol.expected.values()), name
+        with subtests.test(name=name):
+            protocol = load_protocol(name, HumanML())
+            assert (protocol.name, protocol.version >= 1) == (name, True)
+            values, reasons = Evaluator(None, protocol.metrics, HumanML()).score(
+                nothing, nothing, nothing, 0
+            )
+            assert (set(values.values()), reasons) == ({None} if protocol.metrics else set(), {}), (
+                name
+            )
+            assert all(set(table) <= set(values) for table in protocol.expected.values()), name
     for model, name in {
         **{"none humanact12": "unconditioned", "action humanact12": "action_to_motion"},
         **{"action uestc": "action_to_motion_uestc", "action bandai": "action_to_motion_own"},
@@ -593,18 +608,20 @@ def test_other_sampling_options_have_other_folders_of_motions(runs):
     assert len(set(folders)) == len(folders)
 
 
-def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs):
+def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs, subtests):
     data = runs.data()
     protocol = load_protocol("synthetic", data.representation)
     rows = {row.id: row for row in protocol.rows(data.test, 0, 1)}
     for row in protocol.model_copy(update={"samples": 10}).rows(data.test, 0, 1):
-        assert (row.caption, row.frames.tolist()) == (
-            rows[row.id].caption,
-            rows[row.id].frames.tolist(),
-        )
+        with subtests.test(clip=row.id):
+            assert (row.caption, row.frames.tolist()) == (
+                rows[row.id].caption,
+                rows[row.id].frames.tolist(),
+            )
     for replication, seed, purpose in ((1, 1, {}), (0, 2, {}), (0, 1, {"purpose": "real"})):
-        others = protocol.rows(data.test, replication, seed, **purpose)
-        assert any(row.caption != rows[row.id].caption for row in others)
+        with subtests.test(replication=replication, seed=seed, purpose=purpose):
+            others = protocol.rows(data.test, replication, seed, **purpose)
+            assert any(row.caption != rows[row.id].caption for row in others)
     many = protocol.model_copy(update={"samples": len(data.test) + 5, "real_samples": 12})
     assert len({row.id for row in many.rows(data.test, 0, 1)}) == len(data.test) + 5
     assert len(many.rows(data.test, 0, 0, purpose="real")) == 12
@@ -775,7 +792,7 @@ def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_pat
 
 
 @pytest.mark.parametrize("name", ["prediction", "interpolation", "upper_body"])
-def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name):
+def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name, subtests):
     evaluation = runs.evaluation(f"editing_{name}", samples=9)
     source = runs.generator(evaluation, tmp_path)
     assert source.edit == {"mode": "x0", "resample": 1, "strength": None}
@@ -798,33 +815,36 @@ def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name):
     for row, motion, real in zip(
         rows, generated, real_motions(evaluation.clips, rows), strict=True
     ):
-        assert len(row.frames) == len(motion)
-        kept = np.zeros_like(real, bool) | lower
-        if name != "upper_body":
-            kept[:] = False
-            kept[: len(real) // 4] = name == "prediction"
-            kept[::5] |= name == "interpolation"
-        np.testing.assert_allclose(motion[kept], real[kept], atol=1e-4)
-        assert np.abs(motion - real)[~kept].max() > 0.1
+        with subtests.test(clip=row.id):
+            assert len(row.frames) == len(motion)
+            kept = np.zeros_like(real, bool) | lower
+            if name != "upper_body":
+                kept[:] = False
+                kept[: len(real) // 4] = name == "prediction"
+                kept[::5] |= name == "interpolation"
+            np.testing.assert_allclose(motion[kept], real[kept], atol=1e-4)
+            assert np.abs(motion - real)[~kept].max() > 0.1
 
 
-def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
+def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs, subtests):
     clips = runs.data().test
     rows = load_protocol("synthetic", clips.representation).rows(clips, 0, 0)
     real = [motion.tobytes() for motion in real_motions(clips, rows)]
     for condition in ("text", "action"):
-        requests = [row.text if condition == "text" else row.clip.action for row in rows]
-        requested = dict(zip(real, requests, strict=True))
-        shuffled = [
-            x.tobytes()
-            for x in Baseline("shuffled", clips, condition, 0)("rep_0", rows, 0).features
-        ]
-        assert sorted(shuffled) == sorted(real)
-        assert all(
-            requested[motion] != request for request, motion in zip(requests, shuffled, strict=True)
-        )
-        with pytest.raises(UserError, match="2 of 3 motions have the same caption or label"):
-            Baseline("shuffled", clips, condition, 0)("rep_0", [rows[0], rows[0], rows[1]], 0)
+        with subtests.test(condition=condition):
+            requests = [row.text if condition == "text" else row.clip.action for row in rows]
+            requested = dict(zip(real, requests, strict=True))
+            shuffled = [
+                x.tobytes()
+                for x in Baseline("shuffled", clips, condition, 0)("rep_0", rows, 0).features
+            ]
+            assert sorted(shuffled) == sorted(real)
+            assert all(
+                requested[motion] != request
+                for request, motion in zip(requests, shuffled, strict=True)
+            )
+            with pytest.raises(UserError, match="2 of 3 motions have the same caption or label"):
+                Baseline("shuffled", clips, condition, 0)("rep_0", [rows[0], rows[0], rows[1]], 0)
     with pytest.raises(UserError, match="real, shuffled, noisy, static"):
         Baseline("shufled", clips, "text", 0)
     with pytest.raises(UserError, match="without text or labels cannot be shuffled"):

@@ -65,12 +65,13 @@ def clips() -> list[Tensor]:
     return [torch.from_numpy(synthetic(action).joints).double() for action in actions]
 
 
-def test_recorded_motion_comes_out_exactly_and_neither_limbs_flip_nor_angles_jump(clips):
-    for joints in clips:
-        poses = solve(joints, FPS)
-        torch.testing.assert_close(poses.joints(), joints, rtol=0, atol=1e-6)
-        # A punch stretches the elbow by 50 degrees per frame
-        assert largest_step(poses.rotations) < 70
+def test_recorded_motion_comes_out_exactly_and_neither_limbs_flip_nor_angles_jump(clips, subtests):
+    for number, joints in enumerate(clips):
+        with subtests.test(clip=number):
+            poses = solve(joints, FPS)
+            torch.testing.assert_close(poses.joints(), joints, rtol=0, atol=1e-6)
+            # A punch stretches the elbow by 50 degrees per frame
+            assert largest_step(poses.rotations) < 70
     poses = solve(clips[1], FPS)
     angles = continuous_euler(poses.rotations)
     for joint, order in ((0, "YZX"), (16, "YXZ")):
@@ -95,10 +96,11 @@ def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist(su
             ("hip", {f"{side}_hip": (0, 34, 0), f"{side}_knee": (69, 0, 0)}),
             ("shoulder", {f"{side}_shoulder": (46, 0, 0), f"{side}_elbow": (0, -69 * sign, 0)}),
         ):
-            made = posed(20, **turns).posed()
-            joint = SMPL22.joints.index(f"{side}_{limb}")
-            solved = solve(made.joints(), FPS).rotations[:, joint]
-            assert degrees(solved @ made.rotations[:, joint].mT).max() < 6, (side, limb)
+            with subtests.test(side=side, limb=limb):
+                made = posed(20, **turns).posed()
+                joint = SMPL22.joints.index(f"{side}_{limb}")
+                solved = solve(made.joints(), FPS).rotations[:, joint]
+                assert degrees(solved @ made.rotations[:, joint].mT).max() < 6, (side, limb)
 
 
 def test_bones_that_change_length_are_met_on_average_and_joints_without_rotations_are_refused(
@@ -122,13 +124,14 @@ def test_bones_that_change_length_are_met_on_average_and_joints_without_rotation
 def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle, subtests):
     features = np.arange(6, dtype=np.float32).reshape(3, 2)
     for ending in (".bvh", ".json", ".npy", ".npz"):
-        replace(circle, features=features, representation="mine").save(
-            tmp_path / f"circle{ending}", seed=3
-        )
-        again = read(tmp_path / f"circle{ending}", fps=FPS if ending == ".npy" else None)
-        np.testing.assert_allclose(again.joints, circle.joints, rtol=0, atol=2e-5)
-        assert (again.fps, again.id) == (FPS, "circle")
-        assert again.text == ("" if ending in (".bvh", ".npy") else circle.text)
+        with subtests.test(ending=ending):
+            replace(circle, features=features, representation="mine").save(
+                tmp_path / f"circle{ending}", seed=3
+            )
+            again = read(tmp_path / f"circle{ending}", fps=FPS if ending == ".npy" else None)
+            np.testing.assert_allclose(again.joints, circle.joints, rtol=0, atol=2e-5)
+            assert (again.fps, again.id) == (FPS, "circle")
+            assert again.text == ("" if ending in (".bvh", ".npy") else circle.text)
     np.testing.assert_array_equal(again.features, features)
     assert (again.representation, again.poses, np.load(tmp_path / "circle.npz")["seed"]) == (
         "mine",
@@ -161,7 +164,7 @@ def test_files_bring_joints_back_and_angles_of_bvh_do_not_jump(tmp_path, circle,
             read(tmp_path / "circle.bvh", unit=unit)
 
 
-def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path):
+def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path, subtests):
     made = two_circles()
     Motion(made.joints().float().numpy(), FPS, poses=made).save(tmp_path / "a.npz")
     recording = amass.read(tmp_path / "a.npz", "a.npz")
@@ -181,28 +184,31 @@ def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path):
         (156, "mocap_framerate"),
         (165, "mocap_frame_rate"),
     ):
-        poses = 0.2 * np.random.default_rng(0).normal(size=(9, width))
-        arrays: dict[str, Any] = {"poses": poses, "trans": np.zeros((9, 3)), rate: 60.0}
-        np.savez(tmp_path / "a.npz", **arrays)
-        recording = read(tmp_path / "a.npz")
-        assert recording.fps == 60
-        for ending in (".bvh", ".glb", ".npz"):
-            recording.save(tmp_path / f"b{ending}")
-        expected = rotation.axis_angle_to_matrix(
-            torch.from_numpy(poses[:, 3 * head : 3 * head + 3])
-        )
-        vectors = torch.from_numpy(np.load(tmp_path / "b.npz")["poses"])[:, 3 * head : 3 * head + 3]
-        file = bvh.read(tmp_path / "b.bvh")
-        of_bvh = torch.from_numpy(file.rotations())[:, file.joints.index("head")]
-        of_glb = torch.from_numpy(
-            Glb(tmp_path / "b.glb").curves()[head, "rotation"][:, [3, 0, 1, 2]]
-        )
-        for turns in (
-            rotation.axis_angle_to_matrix(vectors),
-            of_bvh,
-            rotation.quaternion_to_matrix(of_glb),
-        ):
-            torch.testing.assert_close(turns.double(), expected, rtol=0, atol=1e-5)
+        with subtests.test(width=width):
+            poses = 0.2 * np.random.default_rng(0).normal(size=(9, width))
+            arrays: dict[str, Any] = {"poses": poses, "trans": np.zeros((9, 3)), rate: 60.0}
+            np.savez(tmp_path / "a.npz", **arrays)
+            recording = read(tmp_path / "a.npz")
+            assert recording.fps == 60
+            for ending in (".bvh", ".glb", ".npz"):
+                recording.save(tmp_path / f"b{ending}")
+            expected = rotation.axis_angle_to_matrix(
+                torch.from_numpy(poses[:, 3 * head : 3 * head + 3])
+            )
+            vectors = torch.from_numpy(np.load(tmp_path / "b.npz")["poses"])[
+                :, 3 * head : 3 * head + 3
+            ]
+            file = bvh.read(tmp_path / "b.bvh")
+            of_bvh = torch.from_numpy(file.rotations())[:, file.joints.index("head")]
+            of_glb = torch.from_numpy(
+                Glb(tmp_path / "b.glb").curves()[head, "rotation"][:, [3, 0, 1, 2]]
+            )
+            for turns in (
+                rotation.axis_angle_to_matrix(vectors),
+                of_bvh,
+                rotation.quaternion_to_matrix(of_glb),
+            ):
+                torch.testing.assert_close(turns.double(), expected, rtol=0, atol=1e-5)
 
 
 def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_are_not(
@@ -237,7 +243,7 @@ def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_a
     assert (tmp_path / "a.bvh").read_text() == (tmp_path / "b.bvh").read_text()
 
 
-def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle):
+def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle, subtests):
     circle.save(tmp_path / "a.glb")
     file = Glb(tmp_path / "a.glb")
     document, curves = file.document, file.curves()
@@ -250,9 +256,12 @@ def test_glb_holds_the_motion_and_a_body_on_its_joints(tmp_path, circle):
     times = file.array(animation["samplers"][0]["input"])[:, 0]
     np.testing.assert_allclose(times, np.arange(len(times)) / FPS, atol=1e-6)
     assert (animation["name"], document["asset"]["extras"]["fps"]) == (circle.text, FPS)
-    for turns in (curve for (_, kind), curve in curves.items() if kind == "rotation"):
-        np.testing.assert_allclose(np.linalg.norm(turns, axis=1), 1, atol=1e-6)
-        assert ((turns[1:] * turns[:-1]).sum(1) > 0).all()
+    for joint, turns in (
+        (joint, curve) for (joint, kind), curve in curves.items() if kind == "rotation"
+    ):
+        with subtests.test(joint=joint):
+            np.testing.assert_allclose(np.linalg.norm(turns, axis=1), 1, atol=1e-6)
+            assert ((turns[1:] * turns[:-1]).sum(1) > 0).all()
 
     # a body hangs on the joints
     skin, primitive = file.document["skins"][0], file.document["meshes"][0]["primitives"][0]

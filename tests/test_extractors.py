@@ -124,7 +124,7 @@ def test_t2m_and_mardms_variant_give_the_authors_embeddings(stem):
 @pytest.mark.parametrize(
     "features", [pytest.param(f, id=f"state_dict_manifest-t2m_{f}") for f in (263, 251)]
 )
-def test_recipes_of_t2m_have_the_sizes_of_the_released_networks(features):
+def test_recipes_of_t2m_have_the_sizes_of_the_released_networks(features, subtests):
     manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())
     config = compose({263: "t2m/humanml3d", 251: "t2m/kit"}[features])
     representation = instantiate(config["representation"])
@@ -132,11 +132,12 @@ def test_recipes_of_t2m_have_the_sizes_of_the_released_networks(features):
         network = T2MTask.build(config, representation).network
     keys = (f"t2m_movement_encoder_{features}", "t2m_text_encoder", "t2m_motion_encoder")
     for ours, theirs in zip(T2M_PARTS, keys, strict=True):
-        shapes = {
-            name: list(value.shape)
-            for name, value in network.get_submodule(ours).state_dict().items()
-        }
-        assert shapes == manifest[theirs]["keys"]
+        with subtests.test(part=ours):
+            shapes = {
+                name: list(value.shape)
+                for name, value in network.get_submodule(ours).state_dict().items()
+            }
+            assert shapes == manifest[theirs]["keys"]
 
 
 def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end(subtests):

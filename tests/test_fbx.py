@@ -103,10 +103,11 @@ def test_the_scene_has_what_single_programs_need(tmp_path: Path, subtests):
     assert objects is not None
     # Autodesk's SDK drops meshes without this property
     for model in objects.all("Model"):
-        properties = model.first("Properties70")
-        assert properties is not None
-        names = [entry.properties[0] for entry in properties.all("P")]
-        assert "DefaultAttributeIndex" in names
+        with subtests.test(name=model.properties[1]):
+            properties = model.first("Properties70")
+            assert properties is not None
+            names = [entry.properties[0] for entry in properties.all("P")]
+            assert "DefaultAttributeIndex" in names
     # assimp finds no animation without a block in its stack and layer: 13 zero bytes before the end of the record
     content = (tmp_path / "kick.fbx").read_bytes()
     for name in (b"AnimationStack", b"AnimationLayer"):
@@ -281,7 +282,7 @@ def test_pivots_offsets_and_orders_of_rotation_follow_the_documented_formula(tmp
     np.testing.assert_allclose(motion.positions[0, 1], [0, 1, 0], atol=1e-9)
 
 
-def test_records_come_back_with_their_types(tmp_path: Path):
+def test_records_come_back_with_their_types(tmp_path: Path, subtests):
     root = Record("")
     values = [True, Short(-3), Int(7), 2**40, 0.5, "text", b"\x00raw"]
     record = root.add("Values", *values)
@@ -292,8 +293,9 @@ def test_records_come_back_with_their_types(tmp_path: Path):
     (again,) = fbx.read(tmp_path / "values.fbx").children
     assert again.properties == values
     for array, child in zip(arrays, again.children, strict=True):
-        np.testing.assert_array_equal(child.properties[0], array)
-        assert child.properties[0].dtype == array.dtype
+        with subtests.test(dtype=array.dtype):
+            np.testing.assert_array_equal(child.properties[0], array)
+            assert child.properties[0].dtype == array.dtype
 
 
 def header(version: int = fbx.VERSION) -> bytes:

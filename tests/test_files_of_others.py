@@ -214,7 +214,8 @@ def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys
     for motion, words in ((mirrored, "the toes point backwards"), (small, "people's are")):
         write_bvh(path, motion)
         for name, enter in entrances.items():
-            assert words in said(enter), name
+            with subtests.test(words=words, entrance=name):
+                assert words in said(enter), name
     write_bvh(path, walk(), turn="z")
     for name, enter in entrances.items():
         with subtests.test(name=name, enter=enter):

@@ -137,7 +137,7 @@ def test_smpl_rotations_are_kept(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_skeletons_are_recognized(name: str, tmp_path: Path):
+def test_skeletons_are_recognized(name: str, tmp_path: Path, subtests):
     """Joints that a skeleton has itself come out where they are; the blended ones lie between them."""
     layout = LAYOUTS[name]
     sources = {joint: [of] if isinstance(of, str) else list(of) for joint, of in layout.map.items()}
@@ -153,13 +153,14 @@ def test_skeletons_are_recognized(name: str, tmp_path: Path):
     frames = np.concatenate([local, np.zeros_like(local)], 2).reshape(len(local), -1)
     parents = (-1, *[0] * (size - 1))
     for prefix in ("", "mixamorig:", "mixamorig1_", "Character1_", "An Actor "):
-        names = tuple(prefix + n for n in [*own, *extra])
-        take = bvh.Bvh(names, parents, np.zeros((size, 3)), (CHANNELS,) * size, frames, 30.0)
-        bvh.write(take, tmp_path / "take.bvh")
-        motion = only(tmp_path)
-        for joint, names in sources.items():
-            furthest = np.abs(motion[:, number[joint]] - WALK[:, number[joint]]).max()
-            assert furthest < (1e-4 if len(names) == 1 else 0.35), (prefix, joint)
+        with subtests.test(prefix=prefix):
+            names = tuple(prefix + n for n in [*own, *extra])
+            take = bvh.Bvh(names, parents, np.zeros((size, 3)), (CHANNELS,) * size, frames, 30.0)
+            bvh.write(take, tmp_path / "take.bvh")
+            motion = only(tmp_path)
+            for joint, names in sources.items():
+                furthest = np.abs(motion[:, number[joint]] - WALK[:, number[joint]]).max()
+                assert furthest < (1e-4 if len(names) == 1 else 0.35), (prefix, joint)
 
 
 def test_a_skeleton_file_maps_any_joints(tmp_path: Path):
@@ -565,9 +566,10 @@ def test_every_representation_is_prepared_from_every_kind_of_file(
         clip.id: representation.decode(torch.from_numpy(np.array(store.motion(clip))))
         for clip in store.clips
     }
-    for joints in clips.values():
-        head, pelvis = joints[:, representation.skeleton.joints.index("head")], joints[:, 0]
-        assert (head - pelvis)[:, 1].mean() > 0.3, "it stands"
+    for clip, joints in clips.items():
+        with subtests.test(clip=clip):
+            head, pelvis = joints[:, representation.skeleton.joints.index("head")], joints[:, 0]
+            assert (head - pelvis)[:, 1].mean() > 0.3, "it stands"
 
     other = "joints" if motion == "smpl" else "smpl"
     for check in ("check=true", "check=false"):

@@ -68,68 +68,77 @@ class Scripted:
 
 
 @golden_case("rules")
-def test_items_and_their_crops_and_words_are_the_published_ones(stem):
+def test_items_and_their_crops_and_words_are_the_published_ones(stem, subtests):
     rules = golden(stem)
     for group in groups(rules, "entries"):
-        items = published_items(group)
-        entries = [
-            (n, cut.start, cut.length, len(cut.descriptions), int(cut.id != str(n)))
-            for n, cut in items
-        ]
-        np.testing.assert_array_equal(entries, rules[f"{group}/entries"])
-        assert len({cut.id for _, cut in items}) == len(items) == rules[f"{group}/n_items"]
-        crop = Units(SHORTEST[group], 196, 4)
-        for (
-            item,
-            file,
-            caption,
-            double,
-            bound,
-            drawn,
-            length,
-            first,
-            padded,
-            spoken,
-            kept,
-            slots,
-        ) in rules[f"{group}/items"]:
-            number, cut = items[item]
-            assert number == file
-            generator = Scripted(0 if double else 1, drawn)
-            frames = crop(cut.length, generator)  # type: ignore[arg-type]
-            assert generator.bounds == [3, bound + 1]
-            assert (len(frames), cut.start + frames[0], crop.longest()) == (length, first, padded)
-            [description] = [d for d in cut.descriptions if float(d.caption.split()[1]) == caption]
-            tokens, count = t2m.frame_tokens(description.tokens)
-            assert (count, sum(t.startswith("word") for t in tokens), len(tokens)) == (
+        with subtests.test(group=group):
+            items = published_items(group)
+            entries = [
+                (n, cut.start, cut.length, len(cut.descriptions), int(cut.id != str(n)))
+                for n, cut in items
+            ]
+            np.testing.assert_array_equal(entries, rules[f"{group}/entries"])
+            assert len({cut.id for _, cut in items}) == len(items) == rules[f"{group}/n_items"]
+            crop = Units(SHORTEST[group], 196, 4)
+            for (
+                item,
+                file,
+                caption,
+                double,
+                bound,
+                drawn,
+                length,
+                first,
+                padded,
                 spoken,
                 kept,
                 slots,
-            )
-            assert (tokens[0], tokens[count - 1]) == ("sos/OTHER", "eos/OTHER")
-            assert set(tokens[count:]) <= {"unk/OTHER"}
+            ) in rules[f"{group}/items"]:
+                number, cut = items[item]
+                assert number == file
+                generator = Scripted(0 if double else 1, drawn)
+                frames = crop(cut.length, generator)  # type: ignore[arg-type]
+                assert generator.bounds == [3, bound + 1]
+                assert (len(frames), cut.start + frames[0], crop.longest()) == (
+                    length,
+                    first,
+                    padded,
+                )
+                [description] = [
+                    d for d in cut.descriptions if float(d.caption.split()[1]) == caption
+                ]
+                tokens, count = t2m.frame_tokens(description.tokens)
+                assert (count, sum(t.startswith("word") for t in tokens), len(tokens)) == (
+                    spoken,
+                    kept,
+                    slots,
+                )
+                assert (tokens[0], tokens[count - 1]) == ("sos/OTHER", "eos/OTHER")
+                assert set(tokens[count:]) <= {"unk/OTHER"}
 
 
 @golden_case("rules")
-def test_clips_lose_the_published_frames_and_mirrored_joints_are_the_published_ones(stem):
+def test_clips_lose_the_published_frames_and_mirrored_joints_are_the_published_ones(stem, subtests):
     for subset, count, start, end, first, kept, sign in golden(stem)["crop_table"]:
-        name = FIXTURE_SUBSETS[subset]
-        row = IndexedClip(
-            "000000", "P01" if name == "humanact12" else f"{name}/a_poses", start, end
-        )
-        frames = range(int(count))[row.frames(int(count))]
-        assert (frames[0], len(frames), frames.step) == (first, kept, 1)
-        assert row.humanact12 == (sign == 1)
+        with subtests.test(subset=subset, start=start, end=end):
+            name = FIXTURE_SUBSETS[subset]
+            row = IndexedClip(
+                "000000", "P01" if name == "humanact12" else f"{name}/a_poses", start, end
+            )
+            frames = range(int(count))[row.frames(int(count))]
+            assert (frames[0], len(frames), frames.step) == (first, kept, 1)
+            assert row.humanact12 == (sign == 1)
     cases = [
         key.removesuffix("in")
         for key in golden(stem)
         if key.startswith("crop_mirror") and key.endswith("in")
     ]
     for key in cases:
-        joints, mirrored = (
-            torch.from_numpy(golden(stem)[key + end][:, :22]) for end in ("in", "out")
-        )
-        assert torch.equal(SMPL22.mirror(joints), mirrored)
+        with subtests.test(key=key):
+            joints, mirrored = (
+                torch.from_numpy(golden(stem)[key + end][:, :22]) for end in ("in", "out")
+            )
+            assert torch.equal(SMPL22.mirror(joints), mirrored)
     assert cases
 
 

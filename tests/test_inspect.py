@@ -61,7 +61,7 @@ def place(
     return change
 
 
-def test_faults_are_found_where_they_are():
+def test_faults_are_found_where_they_are(subtests):
     feet = ("left_foot", "right_foot")
     cases: list[tuple[Change, set[tuple[str, str, int, int]]]] = [
         (lambda joints: slide(joints, 9), {("skating", foot, 20, 28) for foot in feet}),
@@ -90,12 +90,13 @@ def test_faults_are_found_where_they_are():
     joints[:, AT["left_knee"], 2] += 0.3  # knees may bend backward
     assert not {fault for fault in kinds(joints) if fault[0] == "limit"}
     for change, expected in cases:
-        joints = body()
-        change(joints)
-        faults = kinds(joints)
-        names = {kind for kind, *_ in expected}
-        assert names <= LIMITS.keys()
-        assert {fault for fault in faults if fault[0] in names or not expected} == expected
+        with subtests.test(expected=expected):
+            joints = body()
+            change(joints)
+            faults = kinds(joints)
+            names = {kind for kind, *_ in expected}
+            assert names <= LIMITS.keys()
+            assert {fault for fault in faults if fault[0] in names or not expected} == expected
 
 
 def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys, monkeypatch):
@@ -156,7 +157,7 @@ def test_jitter_has_the_given_deviation_and_wobble_is_a_slow_sine(walk):
     assert np.linalg.norm(offset[:20], axis=-1).max(0).min() > 0.0195
 
 
-def test_skating_resizing_wrists_drawn_in_and_pops(walk):
+def test_skating_resizing_wrists_drawn_in_and_pops(walk, subtests):
     changed = p.skate(walk, 1.5)
     np.testing.assert_allclose(changed - changed[:, :1], walk - walk[:, :1], atol=1e-12)
     steps = np.diff(changed[:, 0], axis=0)
@@ -183,11 +184,12 @@ def test_skating_resizing_wrists_drawn_in_and_pops(walk):
     ]
     assert ["inside" in kind for kind in kinds] == [False, True]
     for last in (False, True):
-        offset = p.pop(walk, 5, np.random.default_rng(0), last=last) - walk
-        (frame,) = np.unique(np.nonzero(offset)[0])
-        assert frame == len(walk) - 1 if last else 0 < frame < len(walk) - 1
-        np.testing.assert_allclose(np.linalg.norm(offset[frame], axis=-1), 0.05)
-        assert np.ptp(offset[frame], axis=0).max() < 1e-12
+        with subtests.test(last=last):
+            offset = p.pop(walk, 5, np.random.default_rng(0), last=last) - walk
+            (frame,) = np.unique(np.nonzero(offset)[0])
+            assert frame == len(walk) - 1 if last else 0 < frame < len(walk) - 1
+            np.testing.assert_allclose(np.linalg.norm(offset[frame], axis=-1), 0.05)
+            assert np.ptp(offset[frame], axis=0).max() < 1e-12
 
 
 def test_freezing_cropping_speeds_frame_rates_and_another_half(walk, subtests):

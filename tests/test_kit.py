@@ -107,7 +107,9 @@ def evaluated(mmm, out, protocol, *words):
     )
 
 
-def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, tmp_path, capsys):
+def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(
+    mmm, tmp_path, capsys, subtests
+):
     out = tmp_path / "result.json"
     assert evaluated(mmm, out, "reconstruction_kit") == 0
     result = json.loads(out.read_text())
@@ -124,9 +126,10 @@ def test_the_protocol_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, 
     assert 1e-4 < apart["root"] < 0.01
     for name, value in apart.items():
         for kind in ("values", "ground_truth"):
-            error = result[kind][f"temos/ape_{name}"]
-            assert error["n"] == 1, "all 587 clips, of which 520 are compared"
-            assert error["mean"] == pytest.approx(value, rel=0.02, abs=1e-6)
+            with subtests.test(name=name, kind=kind):
+                error = result[kind][f"temos/ape_{name}"]
+                assert error["n"] == 1, "all 587 clips, of which 520 are compared"
+                assert error["mean"] == pytest.approx(value, rel=0.02, abs=1e-6)
     assert evaluated(mmm, out, "reconstruction_kit", "split=val") == 1
     assert (
         "the split has no clip with at least 1 frames and ghosh_test=True"

@@ -78,13 +78,14 @@ def test_requests_as_people_type_them_are_understood(half):
     assert min(shares.values()) >= 0.85, shares
 
 
-def test_the_prompts_of_the_synthetic_set_are_understood():
+def test_the_prompts_of_the_synthetic_set_are_understood(subtests):
     for text, attributes in prompts():
-        (step,) = understand(text).steps
-        names = actions()[step[0].action].names
-        assert attributes["action"] in names, text
-        stated = {"count": 1, "speed": "normal", "amount": "quarter"} | dict(step[0].attributes)
-        assert attributes.items() <= (stated | {"action": attributes["action"]}).items(), text
+        with subtests.test(text=text):
+            (step,) = understand(text).steps
+            names = actions()[step[0].action].names
+            assert attributes["action"] in names, text
+            stated = {"count": 1, "speed": "normal", "amount": "quarter"} | dict(step[0].attributes)
+            assert attributes.items() <= (stated | {"action": attributes["action"]}).items(), text
 
 
 def test_captions_of_all_synthetic_actions_are_understood():
@@ -98,7 +99,7 @@ def test_captions_of_all_synthetic_actions_are_understood():
     assert sum(right) / len(right) >= 0.85
 
 
-def test_captions_say_what_they_are_understood_to_say():
+def test_captions_say_what_they_are_understood_to_say(subtests):
     for name, entry in actions().items():
         mentions = [Mention(name)]
         if "direction" in entry.takes:
@@ -108,11 +109,12 @@ def test_captions_say_what_they_are_understood_to_say():
         if "side" in entry.takes:
             mentions.append(Mention(name, {"side": "right"}))
         for mention in mentions:
-            if entry.takes & {"steps"} and "count" in mention.attributes:
-                continue
-            (step,) = understand(caption((mention,))).steps
-            assert step[0].action == name, predicate(mention)
-            assert mention.attributes.items() <= step[0].attributes.items(), predicate(mention)
+            with subtests.test(mention=predicate(mention)):
+                if entry.takes & {"steps"} and "count" in mention.attributes:
+                    continue
+                (step,) = understand(caption((mention,))).steps
+                assert step[0].action == name, predicate(mention)
+                assert mention.attributes.items() <= step[0].attributes.items(), predicate(mention)
 
 
 FACTS = {
@@ -204,12 +206,13 @@ def test_other_languages_are_refused_with_one_line(text):
 @pytest.mark.parametrize(
     "text", ["photosynthesis", "a blue grenade on a shelf", "backflip", "climb a ladder"]
 )
-def test_a_sentence_without_a_known_action_is_refused_with_three_actions(text):
+def test_a_sentence_without_a_known_action_is_refused_with_three_actions(text, subtests):
     with pytest.raises(NotUnderstood) as refusal:
         Reader(FACTS).read(text)
     assert len(set(refusal.value.nearest)) == 3
     for suggested in refusal.value.nearest:
-        assert Reader(FACTS).read(suggested).captions
+        with subtests.test(suggested=suggested):
+            assert Reader(FACTS).read(suggested).captions
 
 
 def test_a_word_in_no_table_acts_as_the_nearest_action_or_is_known_as_a_thing():

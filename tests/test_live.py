@@ -49,7 +49,9 @@ def root(block: dict[str, Any], frame: int) -> tuple[float, float]:
     return x, z
 
 
-def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were_not_shown(model):
+def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were_not_shown(
+    model, subtests
+):
     live = LiveStreams(model)
     first = live.block("", WALK, 0)
     name = first["stream"]
@@ -58,9 +60,12 @@ def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were
     running = stream(model, WALK)
     running.change(SIT, at=2.1)
     expected = [next(running).joints for _ in range(3)]
-    for block, joints in ((first, expected[0]), (changed, expected[2])):
-        assert block["frames"] == len(joints) == 30
-        assert np.abs(joints_of(block["motion"]) - joints).max() < 0.001 + block["motion"]["step"]
+    for number, block, joints in ((0, first, expected[0]), (2, changed, expected[2])):
+        with subtests.test(block=number):
+            assert block["frames"] == len(joints) == 30
+            assert (
+                np.abs(joints_of(block["motion"]) - joints).max() < 0.001 + block["motion"]["step"]
+            )
     turns = base64.b64decode(changed["motion"]["body"]["turns"])
     assert len(turns) == 30 * 28 * 4
     assert json.dumps(changed)
@@ -133,7 +138,7 @@ def test_the_last_minute_is_kept(model, monkeypatch):
     assert b"Frames: 40" in live.file(name, ".bvh")
 
 
-def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
+def test_the_server_sends_blocks_within_the_rules_of_the_guard(model, subtests):
     pytest.importorskip("gradio", reason="gradio is not installed")
     from fastapi import FastAPI
     from starlette.testclient import TestClient
@@ -170,7 +175,8 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model):
             {"path": [["0", 1.0]]},
             {"path": [[1e5, 1.0]]},
         ):
-            assert client.post("/live", json=call | wrong).status_code == 400
+            with subtests.test(wrong=wrong):
+                assert client.post("/live", json=call | wrong).status_code == 400
         nan = json.dumps(call | {"path": [[float("nan"), 0.0]]})
         headers = {"Content-Type": "application/json"}
         refused = client.post("/live", content=nan, headers=headers)

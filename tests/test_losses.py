@@ -90,7 +90,7 @@ def test_masked_mse_is_the_mean_over_real_frames():
     )
 
 
-def test_equal_motions_lose_nothing_but_sliding_feet():
+def test_equal_motions_lose_nothing_but_sliding_feet(subtests):
     """One foot stands and slides in the estimate, the other moves in the data and is free to."""
     x, mask, time = torch.zeros(1, 4, 9), torch.ones(1, 4, dtype=torch.bool), torch.arange(4.0)
     x[..., 6] = time
@@ -106,10 +106,11 @@ def test_equal_motions_lose_nothing_but_sliding_feet():
     assert losses(2 * x, x, mask)["foot_contact"] == 0
     # 1 cm per frame in the data is standing, 1.5 cm is not.
     for step, stands in ((0.0099, True), (0.015, False)):
-        loss = MotionLosses(joints_as_features, [2], foot_contact=1.0)(step * x, step * x, mask)[
-            "foot_contact"
-        ]
-        assert (loss > 0) == stands
+        with subtests.test(step=step):
+            loss = MotionLosses(joints_as_features, [2], foot_contact=1.0)(
+                step * x, step * x, mask
+            )["foot_contact"]
+            assert (loss > 0) == stands
 
 
 def test_bones_lose_their_change_of_length_and_not_their_turns():
@@ -128,17 +129,18 @@ def test_bones_lose_their_change_of_length_and_not_their_turns():
     )
 
 
-def test_padding_has_no_loss_and_no_gradient_and_single_frames_have_no_velocity():
+def test_padding_has_no_loss_and_no_gradient_and_single_frames_have_no_velocity(subtests):
     torch.manual_seed(0)
     losses = MotionLosses(joints_as_features, [0], BONES, **ALL)
     a, b = torch.randn(2, 3, 6, 9).unbind()
     mask = length_mask(torch.tensor([6, 3, 1]))
     spoiled = torch.where(mask[..., None], a, 1e6), torch.where(mask[..., None], b, -1e6)
     for name, loss in losses(a, b, mask).items():
-        torch.testing.assert_close(losses(*spoiled, mask)[name], loss)
-        assert loss.isfinite().all()
-        alone = losses(a[1:2, :3], b[1:2, :3], mask[1:2, :3])[name]
-        torch.testing.assert_close(loss[1:2], alone)
+        with subtests.test(name=name):
+            torch.testing.assert_close(losses(*spoiled, mask)[name], loss)
+            assert loss.isfinite().all()
+            alone = losses(a[1:2, :3], b[1:2, :3], mask[1:2, :3])[name]
+            torch.testing.assert_close(loss[1:2], alone)
     assert losses(a, b, mask)["velocity"][2] == 0
     a.requires_grad_()
     still = 0.001 * b  # so that all feet are in contact

@@ -52,7 +52,7 @@ def test_poses_face_forward_on_the_spot():
     )
 
 
-def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero():
+def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero(subtests):
     motions = [walk(seed, frames) for seed, frames in enumerate((30, 50, 20))]
     features = torch.randn(3, 5, generator=torch.Generator().manual_seed(0))
     copies = [moved(motions[1][7:43], 0.8, (3, 4)), motions[2], motions[0][:24]]
@@ -64,18 +64,20 @@ def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero():
     queries = [walk(9, 20), walk(8, 28), across]
     distances = training(motions).nearest(queries, None)
     assert distances.shape == (3, 1)
-    for query, distance in zip(queries, distances[:, 0], strict=True):
-        compared = poses(query, FACING)[::STEP].numpy()
-        windows = [
-            poses(motion, FACING)[first : first + len(query) : STEP].numpy()
-            for motion in motions
-            for first in range(len(motion) - len(query) + 1)
-        ]
-        best = min(
-            np.sqrt(((compared - window) ** 2).reshape(-1, 3).sum(1).mean()) for window in windows
-        )
-        assert distance.item() == pytest.approx(best, rel=1e-9)
-        assert best > 0.05
+    for number, (query, distance) in enumerate(zip(queries, distances[:, 0], strict=True)):
+        with subtests.test(query=number):
+            compared = poses(query, FACING)[::STEP].numpy()
+            windows = [
+                poses(motion, FACING)[first : first + len(query) : STEP].numpy()
+                for motion in motions
+                for first in range(len(motion) - len(query) + 1)
+            ]
+            best = min(
+                np.sqrt(((compared - window) ** 2).reshape(-1, 3).sum(1).mean())
+                for window in windows
+            )
+            assert distance.item() == pytest.approx(best, rel=1e-9)
+            assert best > 0.05
 
 
 def test_copies_are_counted():

@@ -145,6 +145,7 @@ def test_action_metrics_equal_the_authors(case: str):
 @one
 def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retrieval_equal_the_authors(
     stem: str,
+    subtests,
 ):
     interval: Any = mean_ci(array("ci/values").tolist())
     np.testing.assert_allclose(interval, array("ci/mean_ci"), rtol=1e-12)
@@ -173,9 +174,10 @@ def test_intervals_accuracy_unconstrained_diversity_precision_recall_and_retriev
     assert values == pytest.approx({name: float(array(f"pr/{name}")) for name in values}, rel=1e-12)
     values = whole_set_retrieval(tensor("tmr/sims"))
     for way in ("t2m", "m2t"):
-        recall = {f"{way}_top{k}": float(array(f"tmr/{way}_R{k:02}")) / 100 for k in TMR_TOP}
-        assert {name: values[name] for name in recall} == pytest.approx(recall, rel=1e-12)
-        assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
+        with subtests.test(way=way):
+            recall = {f"{way}_top{k}": float(array(f"tmr/{way}_R{k:02}")) / 100 for k in TMR_TOP}
+            assert {name: values[name] for name in recall} == pytest.approx(recall, rel=1e-12)
+            assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
 
 
 @pytest.mark.golden
@@ -524,7 +526,7 @@ def test_joint_variance_of_known_spread():
     assert metric.compute() == pytest.approx(2 / 3)
 
 
-def test_displacement_and_drift_of_shifted_frames_and_joints():
+def test_displacement_and_drift_of_shifted_frames_and_joints(subtests):
     """Shifted by (3, 0, 4) in every frame after the fourth, and by twice that in the last: 5 and 10 metres."""
     real = wander(22, 10, 0)[None]
     fake = real.clone()
@@ -540,8 +542,9 @@ def test_displacement_and_drift_of_shifted_frames_and_joints():
         ({"real_mask": mask}, 25 / 8, 10.0),
         ({"real_mask": short}, 10 / 6, 5.0),
     ):
-        values = computed(reconstruction.DisplacementErrors(), **motions, **change)
-        assert values == pytest.approx({"ade": ade, "fde": fde}, rel=1e-6)
+        with subtests.test(ade=ade, fde=fde):
+            values = computed(reconstruction.DisplacementErrors(), **motions, **change)
+            assert values == pytest.approx({"ade": ade, "fde": fde}, rel=1e-6)
 
     # Joint 3 is new and 2 m off; of the kept ones joint 5 is 1 m off in one of 10 frames.
     fake = real.clone()
@@ -587,7 +590,7 @@ def test_best_and_worst_of_several_are_chosen_by_the_root(subtests):
         computed(FlamePositionErrors(KIT21.parents, samples=2), **motions)
 
 
-def test_physics_of_simple_motions():
+def test_physics_of_simple_motions(subtests):
     frames, fps = 30, 20.0
     still = torch.rand(1, 1, 22, 3, generator=torch.Generator().manual_seed(0)).repeat(
         1, frames, 1, 1
@@ -616,9 +619,10 @@ def test_physics_of_simple_motions():
         (still - 0.004 * lift, 0, 0),
         (half, 0, 0.05),
     ):
-        values = measured(joints)
-        assert values["above"] == pytest.approx(above, rel=1e-6)
-        assert values["below"] == pytest.approx(below, rel=1e-6)
+        with subtests.test(above=above, below=below):
+            values = measured(joints)
+            assert values["above"] == pytest.approx(above, rel=1e-6)
+            assert values["below"] == pytest.approx(below, rel=1e-6)
 
 
 def test_a_bootstrap_of_a_mean_is_the_interval_in_closed_form():

@@ -151,9 +151,10 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
         (Motion(joints * 100, 30, id="take"), None, "^take: the legs are"),
     ]
     for motion, fps, message in cases:
-        with pytest.raises(UserError, match=message) as caught:
-            edit(model, motion, fps=fps, region="prediction")
-        assert "\n" not in str(caught.value)
+        with subtests.test(message=message):
+            with pytest.raises(UserError, match=message) as caught:
+                edit(model, motion, fps=fps, region="prediction")
+            assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["a.bvh", "folder/../a.bvh", "link.bvh", "second.bvh"])

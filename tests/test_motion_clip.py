@@ -327,7 +327,7 @@ RUN += [
 
 @pytest.mark.slow
 def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_extractor(
-    tmp_path, data_root
+    tmp_path, data_root, subtests
 ):
     options = [f"data_root={data_root}/clip", f"run.dir={tmp_path / 'run'}", "trainer.max_steps=90"]
     options += ["trainer.val_check_interval=30", "optimizer.lr=0.003"]
@@ -336,9 +336,10 @@ def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_e
     last = max(curves["val/loss"])
     assert curves["val/loss"][last] < 0.8 * math.log(32)
     for way in ("texts_for_motion", "motions_for_text"):
-        tops = [curves[f"val/{way}_top{k}"][last] for k in (1, 2, 3)]
-        assert tops == sorted(tops)
-        assert tops[0] > 3 / 32, way  # by chance: 1 / 32
+        with subtests.test(way=way):
+            tops = [curves[f"val/{way}_top{k}"][last] for k in (1, 2, 3)]
+            assert tops == sorted(tops)
+            assert tops[0] > 3 / 32, way  # by chance: 1 / 32
     temperature = curves["train/temperature"]
     assert temperature[min(temperature)] == pytest.approx(0.07, rel=0.1)
 
@@ -401,13 +402,14 @@ def test_a_calibrated_run_resumes_exactly(tmp_path, data_root, capsys):
     assert len(features.unique(dim=0)) == 2
 
 
-def test_near_misses_change_with_step_and_attribute():
+def test_near_misses_change_with_step_and_attribute(subtests):
     task = CalibratedMotionCLIPTask.__new__(CalibratedMotionCLIPTask)
     torch.nn.Module.__init__(task)
     task.seed, task.near_misses = 0, {"a": [["left", "l"], ["twice"]], "b": []}
     for step in range(20):
-        texts = [task.near_miss("a", number, step) for number in range(2)]
-        assert texts == [task.near_miss("a", number, step) for number in range(2)]
-        assert sorted(text == "twice" for text in texts) == [False, True]
+        with subtests.test(step=step):
+            texts = [task.near_miss("a", number, step) for number in range(2)]
+            assert texts == [task.near_miss("a", number, step) for number in range(2)]
+            assert sorted(text == "twice" for text in texts) == [False, True]
     assert {task.near_miss("a", 0, step) for step in range(20)} == {"left", "l", "twice"}
     assert task.near_miss("b", 0, 0) == ""

@@ -85,7 +85,7 @@ def test_a_motion_on_a_root_is_the_same_motion(walk: GroundedMotion):
 
 
 def test_a_walk_becomes_a_start_a_loop_and_a_stop_that_fit_together(
-    walk: GroundedMotion, parts: list[GroundedMotion]
+    walk: GroundedMotion, parts: list[GroundedMotion], subtests
 ):
     start, loop, stop = parts
     np.testing.assert_array_equal(loop.local[-1], loop.local[0])
@@ -94,10 +94,11 @@ def test_a_walk_becomes_a_start_a_loop_and_a_stop_that_fit_together(
     np.testing.assert_allclose(start.local[0], walk.local[0], atol=1e-5)
     np.testing.assert_allclose(stop.local[-1], walk.local[0], atol=1e-5)
     # a straight path, at a constant speed in the loop
-    for part in parts:
-        assert np.abs(part.path[:, 0]).max() < 1e-9
-        assert np.abs(part.heading).max() == 0
-        assert slide(part) < CENTIMETER
+    for name, part in (("start", start), ("loop", loop), ("stop", stop)):
+        with subtests.test(part=name):
+            assert np.abs(part.path[:, 0]).max() < 1e-9
+            assert np.abs(part.heading).max() == 0
+            assert slide(part) < CENTIMETER
     steps = np.diff(loop.path[:, 1])
     np.testing.assert_allclose(steps, steps[0])
     assert 1.5 < steps[0] * 20 < 2
@@ -273,20 +274,21 @@ def test_contacts_are_in_the_description_and_markers_in_the_files(small: Path, t
     }
 
 
-def test_contacts_are_attributes_of_the_animation_in_usd_files(tmp_path: Path):
+def test_contacts_are_attributes_of_the_animation_in_usd_files(tmp_path: Path, subtests):
     motion = grounded(synthetic("a person walks").joints, 20)
     (clip,) = rig_clips([Clip("walk", "start", motion, "a walk")], "unreal")
     motion_sets.WRITERS["usdc"](tmp_path / "walk.usdc", clip)
     stage = opened(tmp_path / "walk.usdc")
     animation = stage.GetPrimAtPath("/person/skeleton/animation")
     for foot, name in enumerate(("LeftFootContact", "RightFootContact")):
-        contact = animation.GetAttribute(name)
-        # booleans are held between samples
-        values = [contact.Get(frame) for frame in range(len(motion))]
-        assert values == motion.contacts[:, foot].tolist()
-        changes = np.flatnonzero(np.diff(motion.contacts[:, foot])) + 1
-        assert contact.GetTimeSamples() == [0, *changes.tolist()]
-        assert len(changes) > 2
+        with subtests.test(name=name):
+            contact = animation.GetAttribute(name)
+            # booleans are held between samples
+            values = [contact.Get(frame) for frame in range(len(motion))]
+            assert values == motion.contacts[:, foot].tolist()
+            changes = np.flatnonzero(np.diff(motion.contacts[:, foot])) + 1
+            assert contact.GetTimeSamples() == [0, *changes.tolist()]
+            assert len(changes) > 2
 
 
 def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):
@@ -385,7 +387,7 @@ def some(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("name", "count"), [("some", 8), pytest.param("locomotion", 20, marks=pytest.mark.robustness)]
 )
 def test_the_locomotion_set_of_the_package_closes_its_loops_and_plants_its_feet(
-    name: str, count: int, request: pytest.FixtureRequest
+    name: str, count: int, request: pytest.FixtureRequest, subtests
 ):
     locomotion: Path = request.getfixturevalue(name)
     clips = described(locomotion)
@@ -393,26 +395,32 @@ def test_the_locomotion_set_of_the_package_closes_its_loops_and_plants_its_feet(
     assert len(clips) == count
     stand = fbx_scene.read(locomotion / clips["Idle"]["files"]["in_place"])
     for name, entry in clips.items():
-        moving, still = (
-            fbx_scene.read(locomotion / entry["files"][key]) for key in ("root_motion", "in_place")
-        )
-        bones = [number for number, bone in enumerate(still.names) if bone != "person"]
-        if entry["kind"] == "loop":
-            closes = np.abs(still.positions[-1] - still.positions[0])[bones].max()
-            assert closes < CENTIMETER, name
-            assert entry["closure"]["degrees"] < 2, name
-        if entry["kind"] in ("start", "turn"):
-            assert np.abs(still.positions[0] - stand.positions[0])[bones].max() < CENTIMETER, name
-        if entry["kind"] in ("stop", "turn"):
-            assert np.abs(still.positions[-1] - stand.positions[0])[bones].max() < CENTIMETER, name
-        if entry["kind"] == "turn":
-            requested = int(name.split("_")[1]) * (1 if name.endswith("Left") else -1)
-            assert entry["turn"] == requested, name
-        for foot, bone in (("left", "ball_l"), ("right", "ball_r")):
-            toe = moving.positions[:, moving.names.index(bone)][:, [0, 2]]
-            for first, last in contacts(entry, foot):
-                moved = np.linalg.norm(toe[first : last + 1] - toe[first], axis=1).max()
-                assert moved < CENTIMETER, (name, foot, first)
+        with subtests.test(name=name):
+            moving, still = (
+                fbx_scene.read(locomotion / entry["files"][key])
+                for key in ("root_motion", "in_place")
+            )
+            bones = [number for number, bone in enumerate(still.names) if bone != "person"]
+            if entry["kind"] == "loop":
+                closes = np.abs(still.positions[-1] - still.positions[0])[bones].max()
+                assert closes < CENTIMETER, name
+                assert entry["closure"]["degrees"] < 2, name
+            if entry["kind"] in ("start", "turn"):
+                assert np.abs(still.positions[0] - stand.positions[0])[bones].max() < CENTIMETER, (
+                    name
+                )
+            if entry["kind"] in ("stop", "turn"):
+                assert np.abs(still.positions[-1] - stand.positions[0])[bones].max() < CENTIMETER, (
+                    name
+                )
+            if entry["kind"] == "turn":
+                requested = int(name.split("_")[1]) * (1 if name.endswith("Left") else -1)
+                assert entry["turn"] == requested, name
+            for foot, bone in (("left", "ball_l"), ("right", "ball_r")):
+                toe = moving.positions[:, moving.names.index(bone)][:, [0, 2]]
+                for first, last in contacts(entry, foot):
+                    moved = np.linalg.norm(toe[first : last + 1] - toe[first], axis=1).max()
+                    assert moved < CENTIMETER, (name, foot, first)
 
 
 def contacts(entry: dict[str, Any], foot: str) -> list[tuple[int, int]]:

@@ -7,9 +7,10 @@ from flame_mdm.seeds import key, normal, seeded_noise, uniform
 
 
 def test_numbers_are_uniform_in_0_to_1_and_noise_is_standard_normal_and_uncorrelated(subtests):
-    for draws in uniform(torch.arange(500), (100,)):
-        assert 0 < draws.min() < draws.max() <= 1
-        assert stats.kstest(draws.flatten().numpy(), "uniform").pvalue > 1e-3
+    for number, draws in enumerate(uniform(torch.arange(500), (100,))):
+        with subtests.test(number=number):
+            assert 0 < draws.min() < draws.max() <= 1
+            assert stats.kstest(draws.flatten().numpy(), "uniform").pvalue > 1e-3
     assert torch.isfinite(normal(torch.arange(500), 10, 5)).all()
     noise = seeded_noise(["a", "b", "c", "d"], 196, 263, seed=1, replication=0, like=torch.zeros(1))
     first, second = noise(0), noise(1)

@@ -307,14 +307,15 @@ def test_a_model_that_continues_frames_is_traced_with_them_as_an_input(
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_runner_continues_frames_as_the_package_does(
-    continuing: MotionGenerator, tmp_path: Path
+    continuing: MotionGenerator, tmp_path: Path, subtests
 ) -> None:
     onnx.write_folder(continuing, tmp_path / "model")
     sampler = runner.Sampler(tmp_path / "model")
     for seconds, seed in ((0.5, 0), (4.2, 3)):
-        motion = flame_mdm.generate(continuing, TEXT, seconds=seconds, seed=seed)[0]
-        joints = sampler.decode(sampler.generate(TEXT, seconds, seed))
-        assert np.abs(joints - motion.joints).max() < 1e-3
+        with subtests.test(seconds=seconds, seed=seed):
+            motion = flame_mdm.generate(continuing, TEXT, seconds=seconds, seed=seed)[0]
+            joints = sampler.decode(sampler.generate(TEXT, seconds, seed))
+            assert np.abs(joints - motion.joints).max() < 1e-3
     with pytest.raises(ValueError, match=r"give 0\.1 to 600 seconds"):
         sampler.generate(TEXT, 601)
 
@@ -390,7 +391,7 @@ def made(tab: Tab) -> dict[str, Any]:
 
 @of_page
 def test_the_page_samples_the_motions_of_the_package(
-    served: tuple[Path, str], tmp_path: Path
+    served: tuple[Path, str], tmp_path: Path, subtests
 ) -> None:
     folder, url = served
     assert sum(p.stat().st_size for p in folder.iterdir() if p.is_file()) <= 8e6
@@ -400,17 +401,18 @@ def test_the_page_samples_the_motions_of_the_package(
         tab.open(f"{url}#text={TEXT}&seconds=2.2&seed=2")
         assert made(tab)["seed"] == "2"
         for seed in (0, 1, 2):
-            tab.run("delete document.body.dataset.made")
-            tab.type("#seed", str(seed))
-            tab.click("#generate")
-            assert made(tab) | {"milliseconds": 0} == {
-                "text": TEXT,
-                "seed": str(seed),
-                "milliseconds": 0,
-            }
-            expected = flame_mdm.generate(model, TEXT, seconds=2.2, seed=seed)[0]
-            joints = np.array(tab.run("joints()")).reshape(expected.joints.shape)
-            assert np.abs(joints - expected.joints).max() < 1e-3
+            with subtests.test(seed=seed):
+                tab.run("delete document.body.dataset.made")
+                tab.type("#seed", str(seed))
+                tab.click("#generate")
+                assert made(tab) | {"milliseconds": 0} == {
+                    "text": TEXT,
+                    "seed": str(seed),
+                    "milliseconds": 0,
+                }
+                expected = flame_mdm.generate(model, TEXT, seconds=2.2, seed=seed)[0]
+                joints = np.array(tab.run("joints()")).reshape(expected.joints.shape)
+                assert np.abs(joints - expected.joints).max() < 1e-3
         file = tmp_path / "a-person-kicks-twice-with-the-left-leg.glb"
         for ending in ("bvh", "glb", "fbx"):
             expected.save(tmp_path / f"python.{ending}")

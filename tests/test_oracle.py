@@ -78,16 +78,17 @@ def longest_step(root: Tensor) -> float:
 
 
 @pytest.mark.parametrize("name", UNCLAMPED)
-def test_an_oracle_travels_as_far_as_the_motion_and_in_betweening_does_not_teleport(name):
+def test_an_oracle_travels_as_far_as_the_motion_and_in_betweening_does_not_teleport(name, subtests):
     real, ours = root_path(name)
     # Some features have a frame less, or scale the body
     assert (real[-1] - real[0]).norm() > METERS - 0.2
     torch.testing.assert_close(ours, real, rtol=0, atol=0.02)
     modes = instantiate(recipe(name)["process"]).edit_modes
     for method in [method for method, how in METHODS.items() if how["mode"] in modes]:
-        _, between = root_path(name, method)
-        torch.testing.assert_close(between[-1], real[-1], rtol=0, atol=0.02)
-        assert longest_step(between) < 2 * longest_step(real)
+        with subtests.test(method=method):
+            _, between = root_path(name, method)
+            torch.testing.assert_close(between[-1], real[-1], rtol=0, atol=0.02)
+            assert longest_step(between) < 2 * longest_step(real)
 
 
 @pytest.mark.parametrize("name", sorted(CLAMPED))

@@ -38,18 +38,19 @@ def test_the_citation_has_the_papers_of_all_methods():
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_workflows_call_what_exists(path):
+def test_workflows_call_what_exists(path, subtests):
     workflow = yaml.safe_load(path.read_text())
     steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
     commands = [step["run"] for step in steps if "run" in step]
     assert commands
     targets = set(re.findall("^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for command in commands:
-        words = command.split()
-        if words[0] == "make":
-            assert words[1] in targets
-        elif words[0].startswith("."):
-            assert (ROOT / words[0]).is_file()
+        with subtests.test(command=command):
+            words = command.split()
+            if words[0] == "make":
+                assert words[1] in targets
+            elif words[0].startswith("."):
+                assert (ROOT / words[0]).is_file()
     assert all(job["runs-on"] for job in workflow["jobs"].values())
 
 

@@ -68,17 +68,18 @@ def humanml(root: Path, width: int = 263) -> Path:
     return write_folder(root, motions, {"train": ["a"], "val": ["b"], "test": ["c"]}, width)
 
 
-def test_verify_reports_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_verify_reports_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str], subtests):
     report = verified(tmp_path, *SYNTHETIC)
     assert f"fingerprint: {report['fingerprint']}" in capsys.readouterr().out
     store = prepared(tmp_path, *SYNTHETIC)
     assert (report["fingerprint"], report["files"]) == (store.fingerprint, store.info["sha256"])
     for split, number in store.info["clips"].items():
-        assert report["figures"][split] == {
-            "found": number,
-            "published": None,
-            "state": "not published",
-        }
+        with subtests.test(split=split):
+            assert report["figures"][split] == {
+                "found": number,
+                "published": None,
+                "state": "not published",
+            }
     texts = {caption for clip in store.clips for caption in clip.captions}
     assert report["captions"]["different captions"] == len(texts)
     assert 20 < report["captions"]["different words"] < len(" ".join(texts).split())
@@ -181,7 +182,7 @@ WHERE = {
 
 @pytest.mark.slow
 def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
-    takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], subtests
 ):
     sets = {path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")}
     assert sets == {
@@ -199,12 +200,19 @@ def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
         for data in sorted(others)
     ]
     for data, words, expected in cases:
-        assert main(["prepare", f"data={data}", f"data_root={tmp_path / 'data'}", *words]) == 1, (
-            data,
-            words,
-        )
-        message = capsys.readouterr().err
-        assert re.fullmatch(rf"error: .*{re.escape(expected)}.*\n", message), (data, words, message)
+        with subtests.test(data=data, expected=expected):
+            assert (
+                main(["prepare", f"data={data}", f"data_root={tmp_path / 'data'}", *words]) == 1
+            ), (
+                data,
+                words,
+            )
+            message = capsys.readouterr().err
+            assert re.fullmatch(rf"error: .*{re.escape(expected)}.*\n", message), (
+                data,
+                words,
+                message,
+            )
     assert not any((tmp_path / "data").glob("*"))
 
 

@@ -60,7 +60,7 @@ POINTWISE: dict[str, dict[str, Any]] = {
 
 
 @golden_case("gaussian")
-def test_schedules_sampling_steps_and_their_betas(stem):
+def test_schedules_sampling_steps_and_their_betas(stem, subtests):
     for key in (key for key in GAUSSIAN if key.startswith("sched/")):
         _, case, table = key.split("/")
         name, total = case.split("_T")
@@ -70,12 +70,13 @@ def test_schedules_sampling_steps_and_their_betas(stem):
         value = tables[TABLES.get(table, table)]
         np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9, err_msg=key)
     for key in (key for key in GAUSSIAN if key.startswith("respace/")):
-        total, spec = key.removeprefix("respace/T").split("/")
-        steps = spaced(int(total), spec)
-        assert steps == GAUSSIAN[key].tolist(), key
-        betas = build_schedule("cosine", int(total)).respace(steps).tables["betas"]
-        expected = GAUSSIAN[key.replace("respace/", "respace_betas/")]
-        np.testing.assert_allclose(betas.numpy(), expected, rtol=1e-9, err_msg=key)
+        with subtests.test(key=key):
+            total, spec = key.removeprefix("respace/T").split("/")
+            steps = spaced(int(total), spec)
+            assert steps == GAUSSIAN[key].tolist(), key
+            betas = build_schedule("cosine", int(total)).respace(steps).tables["betas"]
+            expected = GAUSSIAN[key.replace("respace/", "respace_betas/")]
+            np.testing.assert_allclose(betas.numpy(), expected, rtol=1e-9, err_msg=key)
 
 
 def test_the_linear_schedule_has_the_ends_of_ho_et_al(subtests):

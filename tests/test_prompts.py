@@ -121,7 +121,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
 
 @pytest.mark.slow
 def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written(
-    here, trained, capsys
+    here, trained, capsys, subtests
 ):
     lines = [
         "a person walks",
@@ -150,8 +150,9 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
         ),
         strict=True,
     ):
-        assert line.startswith(f"p.txt, line {number}: ")
-        assert message in line
+        with subtests.test(number=number, message=message):
+            assert line.startswith(f"p.txt, line {number}: ")
+            assert message in line
     motions = [read(path) for path in sorted(here.rglob("motion_*.npz"))]
     assert {motion.text: len(motion.joints) for motion in motions} == {
         "a person walks": 20,

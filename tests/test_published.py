@@ -107,26 +107,27 @@ def test_published_rows_are_whole():
     assert not wrong
 
 
-def test_published_settings_are_those_of_the_recipes():
+def test_published_settings_are_those_of_the_recipes(subtests):
     for name in REPORTED.keys() & SETTINGS.keys():
         part, reported = SETTINGS[name], REPORTED[name]["rows"]
-        assert [row["label"] for row in reported] == list(part["keys"])
+        with subtests.test(name=name):
+            assert [row["label"] for row in reported] == list(part["keys"])
         for row in reported:
             for column, printed in row["values"].items():
-                ours = settings(part["recipes"][column])[part["keys"][row["label"]]]
-                ours = ours if isinstance(ours, list | tuple) else [ours]
-                for value, text in zip(ours, printed.split(", "), strict=True):
-                    if isinstance(value, str):
-                        assert value == text
-                    elif column != "U-net":  # of which no code is public
-                        printed_value = float(text.removesuffix(" words").replace(",", ""))
-                        assert round(value, len(text.partition(".")[2])) == printed_value, (
-                            row,
-                            column,
-                        )
+                with subtests.test(name=name, row=row["label"], column=column):
+                    ours = settings(part["recipes"][column])[part["keys"][row["label"]]]
+                    ours = ours if isinstance(ours, list | tuple) else [ours]
+                    for value, text in zip(ours, printed.split(", "), strict=True):
+                        if isinstance(value, str):
+                            assert value == text
+                        # no code of the U-net is public
+                        elif column != "U-net":
+                            printed_value = float(text.removesuffix(" words").replace(",", ""))
+                            assert round(value, len(text.partition(".")[2])) == printed_value
     for name, part in SETTINGS.items():
         for key in part["keys"].values():
-            assert all(key in settings(column) for column in part["recipes"].values()), (name, key)
+            with subtests.test(name=name, key=key):
+                assert all(key in settings(column) for column in part["recipes"].values())
 
 
 def test_columns_are_what_protocols_measure_and_rows_what_processes_sample():
@@ -188,21 +189,24 @@ def test_rows_are_checkpoints_of_recipes_that_fit(subtests):
                     assert column.get("protocol", part["protocol"]) == "latency", name
 
 
-def test_papers_checkpoints_are_chosen_by_fid():
+def test_papers_checkpoints_are_chosen_by_fid(subtests):
     for name in (n for n in recipes() if n.startswith(("humanml3d/", "kit/", "babel/"))):
-        callbacks = recipe(name)["callbacks"]
-        if name == UNREAD:
-            assert "evaluate" not in callbacks
-            continue
-        evaluate = callbacks["evaluate"]
-        protocol, _ = measures(evaluate["protocol"], name)
-        assert callbacks["best"]["monitor"] == f"val/{evaluate['protocol']}/fid", name
-        assert protocol.metrics["fid"]["_target_"].endswith("FrechetMotionDistance"), name
-        assert extracted(evaluate["extractor"]) == needed_extractor(protocol, recipe(name)), name
-        assert 512 <= evaluate["samples"] <= 1000, name
-        assert recipe(name)["trainer"]["max_steps"] % evaluate["every_n_steps"] == 0, (
-            f"{name}: not the last step"
-        )
+        with subtests.test(name=name):
+            callbacks = recipe(name)["callbacks"]
+            if name == UNREAD:
+                assert "evaluate" not in callbacks
+                continue
+            evaluate = callbacks["evaluate"]
+            protocol, _ = measures(evaluate["protocol"], name)
+            assert callbacks["best"]["monitor"] == f"val/{evaluate['protocol']}/fid", name
+            assert protocol.metrics["fid"]["_target_"].endswith("FrechetMotionDistance"), name
+            assert extracted(evaluate["extractor"]) == needed_extractor(protocol, recipe(name)), (
+                name
+            )
+            assert 512 <= evaluate["samples"] <= 1000, name
+            assert recipe(name)["trainer"]["max_steps"] % evaluate["every_n_steps"] == 0, (
+                f"{name}: not the last step"
+            )
 
 
 def test_real_motions_have_what_protocols_expect(subtests):

@@ -123,7 +123,7 @@ def test_means_of_mbench_and_physical_foot_contact_leave_out_motions_without_a_v
 
 
 @one
-def test_kimodos_skating_equals_the_authors(stem: str):
+def test_kimodos_skating_equals_the_authors(stem: str, subtests):
     joints, contacts, lengths = (
         torch.from_numpy(KIMODO[f"in/quality/{n}"]) for n in ("joints", "foot_contacts", "lengths")
     )
@@ -139,9 +139,10 @@ def test_kimodos_skating_equals_the_authors(stem: str):
     for row, length in enumerate(lengths.tolist()):
         ours = metric.measure(joints[row, :length].double(), contacts[row, :length])
         for name, key_ in theirs.items():
-            assert float(ours[name]) == pytest.approx(
-                float(KIMODO[f"f64/quality/{key_}"][row]), abs=2e-7
-            ), (name, row)
+            with subtests.test(row=row, name=name):
+                assert float(ours[name]) == pytest.approx(
+                    float(KIMODO[f"f64/quality/{key_}"][row]), abs=2e-7
+                ), (name, row)
     frames = torch.arange(joints.shape[1]) < lengths[:, None]
     metric.update(joints, frames, torch.arange(len(joints)), contacts)
     values = metric.compute()
@@ -151,11 +152,12 @@ def test_kimodos_skating_equals_the_authors(stem: str):
 
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases(KIMODO, "c", "kimodo_metrics"))
-def test_kimodos_constraints_equal_the_authors(case: str):
+def test_kimodos_constraints_equal_the_authors(case: str, subtests):
     errors = kimodo_errors(case)
     for name in KimodoConstraints.parts:
-        expected = float(KIMODO.get(f"f64/{case}/constraint_{name}", math.nan))
-        assert float(errors[name]) == pytest.approx(expected, abs=1e-7, nan_ok=True)
+        with subtests.test(name=name):
+            expected = float(KIMODO.get(f"f64/{case}/constraint_{name}", math.nan))
+            assert float(errors[name]) == pytest.approx(expected, abs=1e-7, nan_ok=True)
 
 
 def kimodo_errors(case: str) -> dict[str, Tensor]:

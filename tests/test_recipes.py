@@ -20,17 +20,18 @@ generate = script("docs/generate.py")
 pytestmark = pytest.mark.usefixtures("composed_once")
 
 
-def test_recipes_have_the_values_of_their_papers():
+def test_recipes_have_the_values_of_their_papers(subtests):
     for columns in generate.TABLES.values():
         for name, column in columns.items():
-            papers = {key: cell for key, cell in column.items() if cell is not None}
-            ours = generate.hyperparameters(name) if papers else {}
-            differing = {
-                key for key, cell in papers.items() if not generate.same(ours.get(key), cell)
-            }
-            assert differing == {
-                key for row, key in generate.DEVIATIONS if row == name and key in papers
-            }, name
+            with subtests.test(name=name):
+                papers = {key: cell for key, cell in column.items() if cell is not None}
+                ours = generate.hyperparameters(name) if papers else {}
+                differing = {
+                    key for key, cell in papers.items() if not generate.same(ours.get(key), cell)
+                }
+                assert differing == {
+                    key for row, key in generate.DEVIATIONS if row == name and key in papers
+                }, name
 
 
 def test_values_come_from_the_class_where_the_recipe_is_silent_and_agree_to_the_papers_digits():
@@ -51,16 +52,17 @@ def test_the_pages_are_those_of_the_recipes():
     assert stale == [], "python docs/generate.py writes them"
 
 
-def test_recipes_of_the_papers_sets_name_paper_and_deviations():
+def test_recipes_of_the_papers_sets_name_paper_and_deviations(subtests):
     for name in recipes():
-        what, deviations = generate.head(name)
-        if name.split("/")[0] in ("humanml3d", "kit", "babel", "humanact12", "uestc"):
-            whole = (
-                "arXiv:" in what
-                and ("table" in what or "not a row of the" in what.lower())
-                and deviations
-            )
-            assert whole, name
+        with subtests.test(name=name):
+            what, deviations = generate.head(name)
+            if name.split("/")[0] in ("humanml3d", "kit", "babel", "humanact12", "uestc"):
+                whole = (
+                    "arXiv:" in what
+                    and ("table" in what or "not a row of the" in what.lower())
+                    and deviations
+                )
+                assert whole, name
 
 
 def test_samplers_steps_and_prompts_suit_process_and_condition(subtests):

@@ -117,7 +117,8 @@ def test_every_pattern_has_a_kind_and_every_threshold_is_a_band(subtests):
         with subtests.test(name=name, kind=kind):
             assert kind.no < kind.yes, name
     for name, values in thresholds().items():
-        assert values["no"] < values["yes"], name
+        with subtests.test(name=name):
+            assert values["no"] < values["yes"], name
     assert band(Claim("order", parts=(Claim("sit"), Claim("jump")))) == (-0.3, 0.3)
     assert group_of(Claim("travel", direction="left")) == "direction"
 
@@ -221,27 +222,29 @@ def clips() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_answers_do_not_depend_on(clips, change):
+def test_answers_do_not_depend_on(clips, change, subtests):
     claims = [claim for text in SENTENCES for claim in read_claims(text)]
-    for joints in clips:
-        before = verdicts(joints, FPS, claims)
-        after = verdicts(*CHANGES[change](joints), claims)
-        decided = {v.answer for v in before} - {"cannot tell"}
-        assert decided
-        for one, other in zip(before, after, strict=True):
-            # a score at the edge of the band may leave it, but never cross it
-            assert {one.answer, other.answer} != {"yes", "no"}, (one, other)
-        same = sum(a.answer == b.answer for a, b in zip(before, after, strict=True))
-        assert same >= 0.95 * len(claims)
+    for number, joints in enumerate(clips):
+        with subtests.test(clip=number):
+            before = verdicts(joints, FPS, claims)
+            after = verdicts(*CHANGES[change](joints), claims)
+            decided = {v.answer for v in before} - {"cannot tell"}
+            assert decided
+            for one, other in zip(before, after, strict=True):
+                # a score at the edge of the band may leave it, but never cross it
+                assert {one.answer, other.answer} != {"yes", "no"}, (one, other)
+            same = sum(a.answer == b.answer for a, b in zip(before, after, strict=True))
+            assert same >= 0.95 * len(claims)
 
 
-def test_the_mirror_image_and_the_mirrored_sentence_get_the_same_answers(clips):
+def test_the_mirror_image_and_the_mirrored_sentence_get_the_same_answers(clips, subtests):
     claims = [claim for text in SENTENCES for claim in read_claims(text)]
-    for joints in clips:
-        mirrored = SMPL22.mirror(torch.from_numpy(joints)).numpy()
-        before = [v.answer for v in verdicts(joints, FPS, claims)]
-        after = [v.answer for v in verdicts(mirrored, FPS, [c.mirrored for c in claims])]
-        assert before == after
+    for number, joints in enumerate(clips):
+        with subtests.test(clip=number):
+            mirrored = SMPL22.mirror(torch.from_numpy(joints)).numpy()
+            before = [v.answer for v in verdicts(joints, FPS, claims)]
+            after = [v.answer for v in verdicts(mirrored, FPS, [c.mirrored for c in claims])]
+            assert before == after
 
 
 def test_mirroring_reversal_freezing_and_a_dropped_repetition_are_noticed():
@@ -264,15 +267,18 @@ def test_mirroring_reversal_freezing_and_a_dropped_repetition_are_noticed():
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_perturbation_of_an_audit_drops_one_repetition(count):
+def test_the_perturbation_of_an_audit_drops_one_repetition(count, subtests):
     pause = np.repeat(raising("left").joints[:1], 10, 0)
     parts = [raising("left", 40).joints] * count
     joints = np.concatenate([pause, *parts, pause])
     fewer = drop_repetition(joints, count)
     assert 0.7 * 40 < len(joints) - len(fewer) < 1.3 * 40
     for repeated, number in ((joints, count), (fewer, count - 1)):
-        (verdict,) = verdicts(repeated, FPS, [Claim("count raises", side="left", amount=number)])
-        assert verdict.answer == "yes"
+        with subtests.test(number=number):
+            (verdict,) = verdicts(
+                repeated, FPS, [Claim("count raises", side="left", amount=number)]
+            )
+            assert verdict.answer == "yes"
     largest_step = np.abs(np.diff(joints, axis=0)).max()
     assert np.abs(np.diff(fewer, axis=0)).max() < 2 * largest_step
 
@@ -291,28 +297,30 @@ def test_an_order_is_right_in_one_direction_only():
 
 
 @pytest.mark.parametrize("seconds", [2, 4])
-def test_a_duration_is_true_for_its_own_seconds_alone(seconds):
+def test_a_duration_is_true_for_its_own_seconds_alone(seconds, subtests):
     motion = holding(seconds)
     for claimed, answer in ((seconds, "yes"), (2 * seconds, "no"), (seconds // 2, "no")):
-        text = f"raises the left arm for {claimed} seconds"
-        assert answers(motion, text)[f"raise hand: left, for {claimed} s"] == answer
+        with subtests.test(claimed=claimed):
+            text = f"raises the left arm for {claimed} seconds"
+            assert answers(motion, text)[f"raise hand: left, for {claimed} s"] == answer
     assert "2 s" in str(Claim("sit", seconds=2))
 
 
-def test_the_start_is_told_from_the_end():
+def test_the_start_is_told_from_the_end(subtests):
     motion = holding(1, until_end=True)
     backward = Motion(motion.joints[::-1], FPS)
     image = Motion(SMPL22.mirror(torch.from_numpy(motion.joints)).numpy(), FPS)
     for when, other in (("start", "end"), ("end", "start")):
-        text = f"a person {when}s with the left arm raised"
-        claim = f"raise hand: left, at the {when}"
-        right, wrong = (motion, backward) if when == "end" else (backward, motion)
-        assert answers(right, text)[claim] == "yes"
-        assert answers(wrong, text)[claim] == "no"
-        assert answers(image, text)[claim] == "no"
-        ((first, last),) = flame_mdm.judge(right, text).verdicts[0].reading.spans
-        assert (first == 0) == (when == "start"), other
-        assert last - first == pytest.approx(0.6)
+        with subtests.test(when=when):
+            text = f"a person {when}s with the left arm raised"
+            claim = f"raise hand: left, at the {when}"
+            right, wrong = (motion, backward) if when == "end" else (backward, motion)
+            assert answers(right, text)[claim] == "yes"
+            assert answers(wrong, text)[claim] == "no"
+            assert answers(image, text)[claim] == "no"
+            ((first, last),) = flame_mdm.judge(right, text).verdicts[0].reading.spans
+            assert (first == 0) == (when == "start"), other
+            assert last - first == pytest.approx(0.6)
     always = Motion(np.repeat(motion.joints[-1:], 60, 0), FPS)
     assert answers(always, text)[claim] == "cannot tell"
 

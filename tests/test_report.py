@@ -80,7 +80,8 @@ def test_the_history_holds_what_a_step_does_and_costs(evaluated, subtests):
     clips = 108  # of 120
     assert curves["train/epochs"][7] == pytest.approx(8 * 8 / clips, rel=0.1)
     for step, pace in curves["train/samples_per_second"].items():
-        assert pace * curves["train/seconds_per_step"][step] == pytest.approx(8, rel=1e-4)
+        with subtests.test(step=step):
+            assert pace * curves["train/seconds_per_step"][step] == pytest.approx(8, rel=1e-4)
     assert "train/gpu_memory_gib" not in curves
     name = "val/synthetic/foot_skating"
     assert curves[name].keys() == curves[f"{name}/ci"].keys() == {3, 7}

@@ -116,7 +116,7 @@ def wander(skeleton: str = "smpl22", frames: int = 60, seed: int = 0, turns: flo
 
 @pytest.mark.golden
 @pytest.mark.parametrize("stem", ["hml263", "kit251"])
-def test_skeleton_constants_and_mirrored_joints(stem: str):
+def test_skeleton_constants_and_mirrored_joints(stem: str, subtests):
     skeleton = legacy(stem)[0].skeleton
     assert skeleton.parents == tuple(arrays(stem)["parents"])
     assert np.array_equal(skeleton.raw_offsets, arrays(stem)["raw_offsets"])
@@ -125,9 +125,10 @@ def test_skeleton_constants_and_mirrored_joints(stem: str):
             tuple(c[c >= 0].tolist()) for c in arrays(stem)["kinematic_chain_padded"]
         )
     for clip in groups(arrays(stem), "joints_in"):
-        if clip.endswith("_mirror"):
-            joints = torch.from_numpy(arrays(stem)[f"{clip.removesuffix('_mirror')}/joints_in"])
-            assert np.array_equal(SMPL22.mirror(joints), arrays(stem)[f"{clip}/joints_in"])
+        with subtests.test(clip=clip):
+            if clip.endswith("_mirror"):
+                joints = torch.from_numpy(arrays(stem)[f"{clip.removesuffix('_mirror')}/joints_in"])
+                assert np.array_equal(SMPL22.mirror(joints), arrays(stem)[f"{clip}/joints_in"])
 
 
 def test_skeletons_are_trees(subtests):
@@ -152,15 +153,16 @@ def test_skeletons_are_trees(subtests):
 
 @pytest.mark.golden
 @pytest.mark.parametrize("stem", STEMS)
-def test_published_features_and_the_steps_to_and_from_them(stem: str):
+def test_published_features_and_the_steps_to_and_from_them(stem: str, subtests):
     (representation, lengths), atol = legacy(stem), 5e-3 if stem.startswith("kit") else 2e-5
     tolerances = {"rotations": 1e-4, "contacts": 0.0, "turn": min(atol, 1e-4)}
-    for joints, expected in cases(stem, "joints_in", "feats"):
-        features = representation.encode(joints)
-        assert features.dtype == torch.float32
-        assert features.shape == expected.shape == (len(expected), representation.features)
-        for name, columns in representation.slices.items():
-            close(features[:, columns], expected[:, columns], tolerances.get(name, atol))
+    for number, (joints, expected) in enumerate(cases(stem, "joints_in", "feats")):
+        with subtests.test(case=number):
+            features = representation.encode(joints)
+            assert features.dtype == torch.float32
+            assert features.shape == expected.shape == (len(expected), representation.features)
+            for name, columns in representation.slices.items():
+                close(features[:, columns], expected[:, columns], tolerances.get(name, atol))
 
     for expected, joints in cases(stem, "global_positions", "joints_in"):
         close(canonicalize(representation, joints), expected, atol)
@@ -205,7 +207,7 @@ def test_published_statistics_and_normalization(stem: str):
         close(representation.to_joints(representation.normalize(features)), joints, 2e-5)
 
 
-def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_their_rest():
+def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_their_rest(subtests):
     for skeleton, turns in itertools.product(SKELETONS, (-2.0, 0.0, 0.5, 2.0)):
         representation = HumanML(skeleton)
         joints = wander(skeleton, frames=120, turns=turns)
@@ -216,33 +218,40 @@ def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_t
         close(representation._root(features.double())[1], canonical[:-1, 0], 1e-5)
 
     for skeleton in SKELETONS:
-        representation = HumanML(skeleton)
-        joints = rotation.rotate_y(wander(skeleton), torch.tensor(2.0)) + torch.tensor(
-            [3.0, -1.0, 5.0]
-        )
-        canonical = canonicalize(representation, joints)
-        assert canonical[..., 1].min() == 0
-        close(canonical[0, 0, ::2], torch.zeros(2), 1e-12)
-        right_hip, left_hip, right_shoulder, left_shoulder = canonical[
-            0, list(representation.skeleton.facing)
-        ]
-        across = right_hip - left_hip + right_shoulder - left_shoulder
-        assert across[2].item() == pytest.approx(0, abs=1e-9)
-        assert across[0] < 0, "facing +z, the right side is at -x"
-        close(representation.encode(wander(skeleton)), representation.encode(joints), 1e-5)
+        with subtests.test(skeleton=skeleton):
+            representation = HumanML(skeleton)
+            joints = rotation.rotate_y(wander(skeleton), torch.tensor(2.0)) + torch.tensor(
+                [3.0, -1.0, 5.0]
+            )
+            canonical = canonicalize(representation, joints)
+            assert canonical[..., 1].min() == 0
+            close(canonical[0, 0, ::2], torch.zeros(2), 1e-12)
+            right_hip, left_hip, right_shoulder, left_shoulder = canonical[
+                0, list(representation.skeleton.facing)
+            ]
+            across = right_hip - left_hip + right_shoulder - left_shoulder
+            assert across[2].item() == pytest.approx(0, abs=1e-9)
+            assert across[0] < 0, "facing +z, the right side is at -x"
+            close(representation.encode(wander(skeleton)), representation.encode(joints), 1e-5)
 
     representation = HumanML()
     for tilt in (0.0, 1e-9, 1e-4):
-        joints = wander(turns=0)  # a thigh straight up is opposite to its rest direction
-        joints = rotation.rotate_y(
-            joints, -torch.atan2(*representation._facing(joints).unbind(-1))[:, None]
-        )
-        lengths = representation.skeleton.bones(joints[0]).norm(dim=-1)
-        offset = joints[:, 4] - joints[:, 1]
-        joints[:, [4, 7, 10]] += torch.tensor([tilt, lengths[4].item(), 0]) - offset[:, None]
-        features, canonical = representation.encode(joints), canonicalize(representation, joints)
-        close(decode_rotations(representation, features.double(), lengths), canonical[:-1], 1e-5)
-        assert HumanML(variant="legacy").encode(joints).isfinite().all()
+        with subtests.test(tilt=tilt):
+            joints = wander(turns=0)  # a thigh straight up is opposite to its rest direction
+            joints = rotation.rotate_y(
+                joints, -torch.atan2(*representation._facing(joints).unbind(-1))[:, None]
+            )
+            lengths = representation.skeleton.bones(joints[0]).norm(dim=-1)
+            offset = joints[:, 4] - joints[:, 1]
+            joints[:, [4, 7, 10]] += torch.tensor([tilt, lengths[4].item(), 0]) - offset[:, None]
+            features, canonical = (
+                representation.encode(joints),
+                canonicalize(representation, joints),
+            )
+            close(
+                decode_rotations(representation, features.double(), lengths), canonical[:-1], 1e-5
+            )
+            assert HumanML(variant="legacy").encode(joints).isfinite().all()
 
 
 def test_many_motions_at_once_are_encoded_as_one_by_one(subtests):
@@ -363,7 +372,7 @@ def test_features_of_a_joint_of_motion272_are_its_position_velocity_and_rotation
 
 
 @golden_case("temos64")
-def test_features_floor_heading_and_joints_are_temos(stem: str):
+def test_features_floor_heading_and_joints_are_temos(stem: str, subtests):
     rifke, file, atol = Rifke(), tensors(golden(stem)), 2e-3  # in KIT's unit, about 1.6 mm
     clips = {
         name: file[f"{name}/joints_in"].double() / 640 for name in groups(golden(stem), "joints_in")
@@ -382,14 +391,15 @@ def test_features_floor_heading_and_joints_are_temos(stem: str):
     # padding enters the floor of a batch in TEMOS
     features = file["batch/feats_padded"]
     for row, length in enumerate(file["batch/lengths"].tolist()):
-        same = [clip for clip in clips.values() if len(clip) == length]
-        padded = [
-            functional.pad(clip, (0, 0, 0, 0, 0, features.shape[1] - length)) for clip in same
-        ]
-        assert (
-            min((rifke.encode(p)[:length] - features[row, :length]).abs().max() for p in padded)
-            < atol
-        )
+        with subtests.test(row=row):
+            same = [clip for clip in clips.values() if len(clip) == length]
+            padded = [
+                functional.pad(clip, (0, 0, 0, 0, 0, features.shape[1] - length)) for clip in same
+            ]
+            assert (
+                min((rifke.encode(p)[:length] - features[row, :length]).abs().max() for p in padded)
+                < atol
+            )
     close(rifke.decode(features.double()) * 640, file["batch/joints_back_padded"], atol)
     x = file["norm/feats_clip0"]
     rifke.mean.copy_(file["norm/mean"])

@@ -227,7 +227,7 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys, sub
             assert message in error_of(capsys, "sample", "quickstart", *words, *options)
 
 
-def test_edit_takes_a_part_of_any_motion(model, tmp_path):
+def test_edit_takes_a_part_of_any_motion(model, tmp_path, subtests):
     """A motion, its joints and its file are cut in the same way; without cut, the error says so."""
     motion = flame_mdm.generate(model, f"{TEXT} @4", num_inference_steps=2)[0]
     motion.save(tmp_path / "walk.npz")
@@ -238,17 +238,18 @@ def test_edit_takes_a_part_of_any_motion(model, tmp_path):
         (tmp_path / "walk.npz", {}),
     ]
     for source, file_options in sources:
-        with pytest.raises(
-            UserError, match=r"at most 60 \(3 seconds\): select a part with cut=\[begin, end\]"
-        ):
-            flame_mdm.edit(model, source, TEXT, **options, **file_options)
-        edited = flame_mdm.edit(model, source, TEXT, cut=[1, 2.5], **options, **file_options)[0]
-        assert len(edited.joints) == 30
-        np.testing.assert_allclose(edited.original.joints[0, 0, [0, 2]], 0, atol=1e-5)
-        pose = motion.joints[20] - motion.joints[20, 0]
-        np.testing.assert_allclose(
-            edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02
-        )
+        with subtests.test(source=type(source).__name__):
+            with pytest.raises(
+                UserError, match=r"at most 60 \(3 seconds\): select a part with cut=\[begin, end\]"
+            ):
+                flame_mdm.edit(model, source, TEXT, **options, **file_options)
+            edited = flame_mdm.edit(model, source, TEXT, cut=[1, 2.5], **options, **file_options)[0]
+            assert len(edited.joints) == 30
+            np.testing.assert_allclose(edited.original.joints[0, 0, [0, 2]], 0, atol=1e-5)
+            pose = motion.joints[20] - motion.joints[20, 0]
+            np.testing.assert_allclose(
+                edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02
+            )
     with one_line_error(r"cut=\[3, 9\] is not a range of .*, which lasts 4 seconds"):
         flame_mdm.edit(model, motion, TEXT, cut=[3, 9], **options)
 

@@ -80,19 +80,24 @@ def best(run) -> tuple[dict[str, Any], dict[str, Any]]:
     )
 
 
-def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
+def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path, subtests):
     content, state = best
     folder, infinite = tmp_path / "run" / "checkpoints", torch.tensor(float("inf"))
     (tmp_path / "victim.txt").write_text("mine")
     for name in ("../../victim.txt", "../checkpoints/../../victim.txt", "link/victim.txt"):
-        if name.startswith("link"):  # a link out of the run is refused before anything is read
-            (folder / "link").symlink_to(tmp_path)
-        path = f"{folder}/{name}"
-        state |= {f"{kind}_model_path": path for kind in ("best", "kth_best", "last")}
-        state |= {"dirpath": str(folder), "best_k_models": {path: infinite}, "kth_value": infinite}
-        assert resume(content) == int(name.startswith("link"))
-        assert (tmp_path / "victim.txt").read_text() == "mine"
-        assert (folder / "best.ckpt").is_file()
+        with subtests.test(name=name):
+            if name.startswith("link"):  # a link out of the run is refused before anything is read
+                (folder / "link").symlink_to(tmp_path)
+            path = f"{folder}/{name}"
+            state |= {f"{kind}_model_path": path for kind in ("best", "kth_best", "last")}
+            state |= {
+                "dirpath": str(folder),
+                "best_k_models": {path: infinite},
+                "kth_value": infinite,
+            }
+            assert resume(content) == int(name.startswith("link"))
+            assert (tmp_path / "victim.txt").read_text() == "mine"
+            assert (folder / "best.ckpt").is_file()
 
 
 def test_only_files_in_the_folder_of_the_checkpoints_are_removed(tmp_path):

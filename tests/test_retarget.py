@@ -62,7 +62,7 @@ def test_each_skeleton_has_the_euler_order_of_its_program(tmp_path, subtests):
 
 
 def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_not_change_the_body(
-    kick, tmp_path
+    kick, tmp_path, subtests
 ):
     kick.save(tmp_path / "b.glb")
     plain = Glb(tmp_path / "b.glb")
@@ -70,37 +70,48 @@ def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_no
     # The thickness of the soles; of a rig with a root, the hips are lifted, not the node
     lift = np.array(plain.document["nodes"][-1]["translation"])
     for name in presets():
-        kick.save(tmp_path / "a.bvh", rig=name)
-        back = read(tmp_path / "a.bvh").joints
-        exact = [number for joint, number in JOINT.items() if joint not in BLENDED.get(name, ())]
-        np.testing.assert_allclose(
-            back[:, exact], kick.joints[:, exact], rtol=0, atol=1e-5, err_msg=name
-        )
-        assert np.abs(back - kick.joints).max() < 0.07, name
-
-        kick.save(tmp_path / "a.glb", rig=name)
-        file = Glb(tmp_path / "a.glb")
-        worlds, rig = file.worlds(), preset(name, kick.posed())
-        assert [node["name"] for node in file.document["nodes"][:-2]] == list(rig.joints)
-        nodes = [node for node, source in enumerate(rig.sources) if source >= 0]
-        expected = kick.joints[:, [source for source in rig.sources if source >= 0]]
-        np.testing.assert_allclose(
-            worlds[:, nodes][..., :3, 3] - lift, expected, rtol=0, atol=1e-5, err_msg=name
-        )
-        for frame, moved in zip((0, 30), points, strict=True):
+        with subtests.test(name=name):
+            kick.save(tmp_path / "a.bvh", rig=name)
+            back = read(tmp_path / "a.bvh").joints
+            exact = [
+                number for joint, number in JOINT.items() if joint not in BLENDED.get(name, ())
+            ]
             np.testing.assert_allclose(
-                file.skinned(worlds[frame]), moved, rtol=0, atol=1e-5, err_msg=name
+                back[:, exact], kick.joints[:, exact], rtol=0, atol=1e-5, err_msg=name
             )
-        if name in ("lafan1", "unreal", "mixamo"):  # as a character, up to the height of the soles
-            kick.save(tmp_path / "out.glb", character=tmp_path / "a.glb")
-            at = joints_of(Glb(tmp_path / "out.glb"), characters.read_skinned(tmp_path / "a.glb"))
-            for joint in (
-                f"{side}_{part}"
-                for side in SIDES
-                for part in ("hip", "knee", "ankle", "foot", "wrist")
-            ):
-                off = np.linalg.norm((at[joint] - kick.joints[:, JOINT[joint]])[:, [0, 2]], axis=1)
-                assert np.median(off) < 0.012, (name, joint)
+            assert np.abs(back - kick.joints).max() < 0.07, name
+
+            kick.save(tmp_path / "a.glb", rig=name)
+            file = Glb(tmp_path / "a.glb")
+            worlds, rig = file.worlds(), preset(name, kick.posed())
+            assert [node["name"] for node in file.document["nodes"][:-2]] == list(rig.joints)
+            nodes = [node for node, source in enumerate(rig.sources) if source >= 0]
+            expected = kick.joints[:, [source for source in rig.sources if source >= 0]]
+            np.testing.assert_allclose(
+                worlds[:, nodes][..., :3, 3] - lift, expected, rtol=0, atol=1e-5, err_msg=name
+            )
+            for frame, moved in zip((0, 30), points, strict=True):
+                np.testing.assert_allclose(
+                    file.skinned(worlds[frame]), moved, rtol=0, atol=1e-5, err_msg=name
+                )
+            if name in (
+                "lafan1",
+                "unreal",
+                "mixamo",
+            ):  # as a character, up to the height of the soles
+                kick.save(tmp_path / "out.glb", character=tmp_path / "a.glb")
+                at = joints_of(
+                    Glb(tmp_path / "out.glb"), characters.read_skinned(tmp_path / "a.glb")
+                )
+                for joint in (
+                    f"{side}_{part}"
+                    for side in SIDES
+                    for part in ("hip", "knee", "ankle", "foot", "wrist")
+                ):
+                    off = np.linalg.norm(
+                        (at[joint] - kick.joints[:, JOINT[joint]])[:, [0, 2]], axis=1
+                    )
+                    assert np.median(off) < 0.012, (name, joint)
 
 
 def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(kick: Motion):
@@ -407,7 +418,7 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("name", "ending"), itertools.product(("mixamo", "unreal", "lafan1", "soma"), (".glb", ".bvh"))
 )
-def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: Path):
+def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: Path, subtests):
     path, rig = tmp_path / f"a{ending}", preset(name, kick.posed())
     kick.save(path, rig=name)
     lift = np.array(Glb(path).document["nodes"][-1]["translation"]) if ending == ".glb" else 0
@@ -420,17 +431,18 @@ def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: 
     )
     assert [frame for frame, _ in shown] == [0, (len(kick.joints) - 1) // 2, len(kick.joints) - 1]
     for frame, positions in shown:
-        joints = {
-            rig.joints.index(joint): position
-            for joint, position in positions.items()
-            if joint in rig.joints
-        }
-        followed = {
-            joint: position for joint, position in joints.items() if rig.sources[joint] >= 0
-        }
-        assert len(followed) >= len(SMPL22)
-        for joint, position in followed.items():
-            expected = kick.joints[frame, rig.sources[joint]] + lift
-            np.testing.assert_allclose(
-                position, expected, atol=1e-4, err_msg=f"{rig.joints[joint]}, frame {frame}"
-            )
+        with subtests.test(frame=frame):
+            joints = {
+                rig.joints.index(joint): position
+                for joint, position in positions.items()
+                if joint in rig.joints
+            }
+            followed = {
+                joint: position for joint, position in joints.items() if rig.sources[joint] >= 0
+            }
+            assert len(followed) >= len(SMPL22)
+            for joint, position in followed.items():
+                expected = kick.joints[frame, rig.sources[joint]] + lift
+                np.testing.assert_allclose(
+                    position, expected, atol=1e-4, err_msg=f"{rig.joints[joint]}, frame {frame}"
+                )

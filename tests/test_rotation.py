@@ -26,29 +26,32 @@ def same_rotation(actual: Tensor, expected: Tensor, atol: float) -> None:
 
 
 @golden_case("smpl147")
-def test_conversions_are_the_authors(stem: str):
+def test_conversions_are_the_authors(stem: str, subtests):
     file = tensors(golden(stem))
     for dtype in (torch.float32, torch.float64):
-        axis_angle = file["conv/axis_angle"].to(dtype)
-        quaternion = rotation.axis_angle_to_quaternion(axis_angle)
-        matrix = rotation.axis_angle_to_matrix(axis_angle)
-        assert matrix.dtype == dtype
-        same(quaternion.float(), file["conv/quat_p3d"], 2e-6)
-        same(matrix.float(), file["conv/matrix"], 2e-6)
-        same(rotation.matrix_to_rot6d(matrix, "rows").float(), file["conv/rot6d_rows"], 2e-6)
-        same(rotation.matrix_to_rot6d(matrix, "columns").float(), file["conv/rot6d_cols"], 2e-6)
-        actual = rotation.quaternion_to_matrix(rotation.matrix_to_quaternion(matrix))
-        # The variant with copysign loses digits near a half turn.
-        for key, atol in (
-            ("p3d072", 2e-6),
-            ("p3dhead", 2e-6),
-            ("copysign", 2e-3),
-        ):
-            expected = rotation.quaternion_to_matrix(file[f"conv/quat_from_matrix_{key}"]).to(dtype)
-            same(actual, expected, atol)
-        back = rotation.matrix_to_axis_angle(matrix)
-        assert back.norm(dim=-1).max() <= torch.pi + 1e-6
-        same(rotation.axis_angle_to_matrix(back), matrix, 2e-6)
+        with subtests.test(dtype=dtype):
+            axis_angle = file["conv/axis_angle"].to(dtype)
+            quaternion = rotation.axis_angle_to_quaternion(axis_angle)
+            matrix = rotation.axis_angle_to_matrix(axis_angle)
+            assert matrix.dtype == dtype
+            same(quaternion.float(), file["conv/quat_p3d"], 2e-6)
+            same(matrix.float(), file["conv/matrix"], 2e-6)
+            same(rotation.matrix_to_rot6d(matrix, "rows").float(), file["conv/rot6d_rows"], 2e-6)
+            same(rotation.matrix_to_rot6d(matrix, "columns").float(), file["conv/rot6d_cols"], 2e-6)
+            actual = rotation.quaternion_to_matrix(rotation.matrix_to_quaternion(matrix))
+            # The variant with copysign loses digits near a half turn.
+            for key, atol in (
+                ("p3d072", 2e-6),
+                ("p3dhead", 2e-6),
+                ("copysign", 2e-3),
+            ):
+                expected = rotation.quaternion_to_matrix(file[f"conv/quat_from_matrix_{key}"]).to(
+                    dtype
+                )
+                same(actual, expected, atol)
+            back = rotation.matrix_to_axis_angle(matrix)
+            assert back.norm(dim=-1).max() <= torch.pi + 1e-6
+            same(rotation.axis_angle_to_matrix(back), matrix, 2e-6)
     # 6D vectors that are not orthonormal
     noisy = file["conv/noisy6"]
     same(rotation.rot6d_to_matrix(noisy, "rows"), file["conv/noisy6_to_matrix_rows"], 1e-5)

@@ -439,23 +439,26 @@ EVERY = [*product([GaussianDiffusion], DIFFUSION), *product([FlowMatching], CALL
 
 
 @pytest.mark.parametrize(("build", "sampler"), EVERY)
-def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler):
+def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler, subtests):
     how, known = {"sampler": sampler, "num_inference_steps": 10}, torch.full((2, 6, 3), -2.0)
     sampled = partial(sample, denoise=pulled, noise=drawn((2, 6, 3)), **how)
     keep, free = half_kept(known), sampled(build())
     for mode in [mode for mode in build.edit_modes if mode != "trajectory"]:
-        edited = sampled(build(), edit=Edit(known, keep, mode))
-        assert torch.equal(edited[keep], known[keep])
-        assert edited.isfinite().all()
-        # The denoiser sees the kept part, so the rest follows it downwards.
-        assert edited[~keep].mean() < free[~keep].mean() - 0.05
-        nothing = sampled(build(), edit=Edit(known, torch.zeros_like(keep), mode, blend="before"))
-        # Blending uses up the draws of these samplers.
-        if mode == "x0" or sampler not in (
-            "ancestral",
-            "consistency",
-        ):
-            torch.testing.assert_close(nothing, free)
+        with subtests.test(mode=mode):
+            edited = sampled(build(), edit=Edit(known, keep, mode))
+            assert torch.equal(edited[keep], known[keep])
+            assert edited.isfinite().all()
+            # The denoiser sees the kept part, so the rest follows it downwards.
+            assert edited[~keep].mean() < free[~keep].mean() - 0.05
+            nothing = sampled(
+                build(), edit=Edit(known, torch.zeros_like(keep), mode, blend="before")
+            )
+            # Blending uses up the draws of these samplers.
+            if mode == "x0" or sampler not in (
+                "ancestral",
+                "consistency",
+            ):
+                torch.testing.assert_close(nothing, free)
     if build is GaussianDiffusion:  # clipping does not move kept parts
         clipped = sampled(GaussianDiffusion(clip_x0=True), edit=Edit(known, keep))
         assert torch.equal(clipped[keep], known[keep])
@@ -467,7 +470,7 @@ def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler):
     ("blend", "resample"), [("after", 1), ("before", 1), ("after", 2), ("before", 2)]
 )
 def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled(
-    blend, resample, sampler
+    blend, resample, sampler, subtests
 ):
     """What the denoiser sees of a kept part is the known motion, corrupted to exactly the step it is told.
 
@@ -490,14 +493,17 @@ def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled
     torch.testing.assert_close(x, known, rtol=0, atol=1e-4)
     assert len(seen) == 5 * resample + 1
     for number, (step, x_t) in enumerate(seen):
-        signal, noise = (process.schedule.tables[name][step].item() for name in ("signal", "noise"))
-        for part in (x_t[edit.keep], x_t[~edit.keep])[: 2 if number % resample else 1]:
-            assert part.mean().item() == pytest.approx(2 * signal, abs=0.08)
-            assert part.std().item() == pytest.approx(noise, rel=0.06)
+        with subtests.test(number=number, step=step):
+            signal, noise = (
+                process.schedule.tables[name][step].item() for name in ("signal", "noise")
+            )
+            for part in (x_t[edit.keep], x_t[~edit.keep])[: 2 if number % resample else 1]:
+                assert part.mean().item() == pytest.approx(2 * signal, abs=0.08)
+                assert part.std().item() == pytest.approx(noise, rel=0.06)
 
 
 @pytest.mark.parametrize("sampler", CALLS)
-def test_rewriting_ends_at_its_threshold(sampler):
+def test_rewriting_ends_at_its_threshold(sampler, subtests):
     start, known, seen = drawn((1, 6, 3))(0), torch.full((1, 6, 3), -2.0), []
     edit = Edit(known, half_kept(known), "trajectory", until=0.2)
 
@@ -511,11 +517,12 @@ def test_rewriting_ends_at_its_threshold(sampler):
     calls = seen[:: CALLS[sampler]]
     assert len(calls) == 25
     for i, (time, x) in enumerate(calls):
-        share = min(i, 5) / 25
-        assert time == pytest.approx(i / 25)
-        torch.testing.assert_close(
-            x, torch.where(edit.keep, (1 - share) * start + share * known, start)
-        )
+        with subtests.test(step=i):
+            share = min(i, 5) / 25
+            assert time == pytest.approx(i / 25)
+            torch.testing.assert_close(
+                x, torch.where(edit.keep, (1 - share) * start + share * known, start)
+            )
 
 
 REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {

@@ -184,7 +184,7 @@ def outcome(path: Path) -> tuple[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("ending", [".fbx", ".glb", ".vrma"])
-def test_mutated_files_give_one_line_or_a_motion(ending: str, tmp_path: Path):
+def test_mutated_files_give_one_line_or_a_motion(ending: str, tmp_path: Path, subtests):
     """Ten mutations of each kind of file; with FLAME_MDM_FUZZ=all, 150."""
     motion = synthetic("kick")
     motion = Motion(motion.joints[:12], motion.fps)
@@ -192,12 +192,13 @@ def test_mutated_files_give_one_line_or_a_motion(ending: str, tmp_path: Path):
     content = (tmp_path / f"kick{ending}").read_bytes()
     path = tmp_path / f"mutated{ending}"
     for number in range(150 if os.environ.get("FLAME_MDM_FUZZ") == "all" else 10):
-        path.write_bytes(mutated(content, number))
-        with bounded():
-            message, joints = outcome(path)
-        assert np.isfinite(joints).all(), number
-        assert not message or str(path) in message, number
-        assert "\n" not in message, number
+        with subtests.test(number=number):
+            path.write_bytes(mutated(content, number))
+            with bounded():
+                message, joints = outcome(path)
+            assert np.isfinite(joints).all(), number
+            assert not message or str(path) in message, number
+            assert "\n" not in message, number
 
 
 def test_a_track_of_steps_holds_each_value_until_the_next_key():

@@ -33,7 +33,7 @@ def model() -> flame_mdm.MotionGenerator:
 
 @pytest.mark.parametrize("lengths", [[40], [30, 50, 24], [100], [200, 24, 61]])
 @pytest.mark.parametrize("loop", [False, True])
-def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop):
+def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop, subtests):
     windows = spans(lengths, longest=60, overlap=16, loop=loop)
     total = sum(lengths)
     assert max(size for *_, size in windows) <= 60
@@ -42,7 +42,8 @@ def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop):
         assert windows[0][1] == 0
         assert windows[-1][1] + windows[-1][2] == total
     for (_, first, size), (_, after, _) in itertools.pairwise(windows):
-        assert first + size - after >= 16
+        with subtests.test(first=first):
+            assert first + size - after >= 16
     covered = cover([(0, *window[1:]) for window in windows], [total], 16, 60, CPU)
     index = covered.rows[:, None].expand_as(covered.frames), covered.frames
     sums = torch.zeros(1, total).index_put(index, covered.weights, accumulate=True)

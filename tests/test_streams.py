@@ -300,7 +300,7 @@ def test_a_batch_of_streams_gives_what_single_ones_give(model):
         assert_same(joints(blocks), joints(islice(alone, 3)))
 
 
-def test_options_of_the_sampler_reach_the_stream(model):
+def test_options_of_the_sampler_reach_the_stream(model, subtests):
     first = next(stream(model, "a person walks")).joints
     changes: list[SamplerKeywords] = [
         {"guidance_scale": 1.0},
@@ -308,9 +308,10 @@ def test_options_of_the_sampler_reach_the_stream(model):
         {"num_inference_steps": 2},
     ]
     for options in changes:
-        assert not np.allclose(
-            next(stream(model, "a person walks", **options)).joints, first, atol=1e-4
-        )
+        with subtests.test(options=options):
+            assert not np.allclose(
+                next(stream(model, "a person walks", **options)).joints, first, atol=1e-4
+            )
     with pytest.raises(UserError, match="unknown sampler 'dddim'"):
         stream(model, "a person walks", sampler="dddim")
 
@@ -481,25 +482,27 @@ def gliding(step: float) -> MotionGenerator:
         [(0.5, 0.0)],
     ],
 )
-def test_the_person_passes_waypoints_in_order(walking, points):
+def test_the_person_passes_waypoints_in_order(walking, points, subtests):
     running = stream(walking, "a person walks")
     running.lead(points)
     places = joints(islice(running, 7))[:, 0, [0, 2]]
     assert len(running.reached) == len(points)
     assert running.reached == sorted(running.reached)
     for frame, point in zip(running.reached, points, strict=True):
-        assert np.linalg.norm(places[frame] - point) < 0.3
+        with subtests.test(point=point):
+            assert np.linalg.norm(places[frame] - point) < 0.3
     free = joints(islice(stream(walking, "a person walks"), 7))[:, 0, [0, 2]]
     assert np.linalg.norm(free - points[0], axis=1).min() > 0.4
 
 
-def test_the_way_bends_no_more_than_feet_allow():
+def test_the_way_bends_no_more_than_feet_allow(subtests):
     rng = np.random.default_rng(0)
     for speed in (0.0, 0.01, 0.06):
         steps = [(0.0, speed)] * 40
         for goal in rng.uniform(-4, 4, (20, 2)).tolist():
-            added = bends([0.0] * 40, steps, 0.0, (0.0, 0.0), [tuple(goal)], FPS)
-            assert np.abs(added).max() <= min(1.3 / FPS, speed / 0.7) + 1e-9
+            with subtests.test(speed=speed, goal=goal):
+                added = bends([0.0] * 40, steps, 0.0, (0.0, 0.0), [tuple(goal)], FPS)
+                assert np.abs(added).max() <= min(1.3 / FPS, speed / 0.7) + 1e-9
 
 
 def test_a_person_who_stands_does_not_turn_to_a_waypoint():
@@ -535,20 +538,21 @@ def test_waypoints_are_two_numbers(walking, point):
         running.lead([point])
 
 
-def test_every_waypoint_is_reached_at_any_speed():
+def test_every_waypoint_is_reached_at_any_speed(subtests):
     rng = np.random.default_rng(1)
     turns = [0.0] * BLOCK
     for speed in (0.02, 0.05, 0.15):
         steps = [(0.0, speed)] * BLOCK
         for goal in [(0.0, -1.0), (0.4, 0.0), *rng.uniform(-4, 4, (10, 2)).tolist()]:
-            heading, x, z, nearest = 0.0, 0.0, 0.0, math.inf
-            for _ in range(20):
-                for bend in bends(turns, steps, heading, (x, z), [(goal[0], goal[1])], FPS):
-                    x += speed * math.sin(heading)
-                    z += speed * math.cos(heading)
-                    heading += bend
-                    nearest = min(nearest, math.dist((x, z), goal))
-            assert nearest < 0.3, (speed, goal)
+            with subtests.test(speed=speed, goal=goal):
+                heading, x, z, nearest = 0.0, 0.0, 0.0, math.inf
+                for _ in range(20):
+                    for bend in bends(turns, steps, heading, (x, z), [(goal[0], goal[1])], FPS):
+                        x += speed * math.sin(heading)
+                        z += speed * math.cos(heading)
+                        heading += bend
+                        nearest = min(nearest, math.dist((x, z), goal))
+                assert nearest < 0.3, (speed, goal)
 
 
 @pytest.mark.tools
@@ -596,7 +600,7 @@ def test_steps_at_seams_are_told_from_steps_inside_blocks():
     assert figures["change of step, inside, percentile 99"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_an_action_counts_as_recognized_if_it_is_shown_in_time():
+def test_an_action_counts_as_recognized_if_it_is_shown_in_time(subtests):
     drift = script("tools/stream_drift.py")
     source = Synthetic(clips=1)
     clips = (source.clip(index, FPS) for index in range(100))
@@ -604,6 +608,7 @@ def test_an_action_counts_as_recognized_if_it_is_shown_in_time():
     kick = np.asarray(clip.motion)
     still = np.repeat(kick[:1], 100, 0)
     for frames, right in ((10, 1), (90, 0)):  # half a second, or too late
-        motion = np.concatenate([still[:frames], kick, np.repeat(kick[-1:], 100, 0)])[None]
-        request = [[("kicks", {"action": "kick"})]]
-        assert drift.recognized(motion, request, FPS)["right"] == right
+        with subtests.test(frames=frames):
+            motion = np.concatenate([still[:frames], kick, np.repeat(kick[-1:], 100, 0)])[None]
+            request = [[("kicks", {"action": "kick"})]]
+            assert drift.recognized(motion, request, FPS)["right"] == right

@@ -113,27 +113,29 @@ def check_positions(file: Written, frames: list[int], theirs: list[dict[str, lis
 
 
 @of_all_rigs
-def test_autodesk_reads_what_was_written(on_rig: list[Written], node_modules: Path):
+def test_autodesk_reads_what_was_written(on_rig: list[Written], node_modules: Path, subtests):
     for file in on_rig:
-        # both have frames at whole tenths of a second
-        tenths = np.arange(int((len(file.read.positions) - 1) / file.fps * 10) + 1) / 10
-        converted = autodesk(node_modules, file.path)
-        other, scene = glb_animation.read(converted), glb.read(converted)
-        theirs = np.round(tenths * other.fps).astype(int).tolist()
-        expected = file.positions(np.round(tenths * file.fps).astype(int).tolist())
-        assert largest_difference(file.joints, expected, other, theirs) < 0.01 * MILLIMETER
-        assert len(scene.skins) == 1
-        assert len(scene.document["materials"]) == 5
+        with subtests.test(file=file.path.name):
+            # both have frames at whole tenths of a second
+            tenths = np.arange(int((len(file.read.positions) - 1) / file.fps * 10) + 1) / 10
+            converted = autodesk(node_modules, file.path)
+            other, scene = glb_animation.read(converted), glb.read(converted)
+            theirs = np.round(tenths * other.fps).astype(int).tolist()
+            expected = file.positions(np.round(tenths * file.fps).astype(int).tolist())
+            assert largest_difference(file.joints, expected, other, theirs) < 0.01 * MILLIMETER
+            assert len(scene.skins) == 1
+            assert len(scene.document["materials"]) == 5
 
 
 @of_all_rigs
-def test_three_reads_what_was_written(on_rig: list[Written], node_modules: Path):
+def test_three_reads_what_was_written(on_rig: list[Written], node_modules: Path, subtests):
     for fps, files in by_rate(on_rig):
         scenes = node("three_fbx.mjs", node_modules, seconds(fps), *(file.path for file in files))
         for file, scene in zip(files, scenes, strict=True):
-            check_positions(file, FRAMES, scene["frames"])
-            assert scene["meshes"] >= 1
-            assert len(scene["materials"]) == 5
+            with subtests.test(file=file.path.name):
+                check_positions(file, FRAMES, scene["frames"])
+                assert scene["meshes"] >= 1
+                assert len(scene["materials"]) == 5
 
 
 @of_all_rigs
@@ -148,26 +150,28 @@ def test_ufbx_reads_what_was_written(on_rig: list[Written]):
 
 
 @of_all_rigs
-def test_blender_reads_what_was_written(on_rig: list[Written], tmp_path: Path):
+def test_blender_reads_what_was_written(on_rig: list[Written], tmp_path: Path, subtests):
     for fps, files in by_rate(on_rig):
         scenes = in_blender(tmp_path / "out.json", fps, [file.path for file in files])
         for file, scene in zip(files, scenes, strict=True):
-            check_blender(file, file.joints, scene)
-            assert scene["fps"] == fps
+            with subtests.test(file=file.path.name):
+                check_blender(file, file.joints, scene)
+                assert scene["fps"] == fps
 
 
 @of_all_rigs
-def test_assimp_finds_skeleton_skin_and_animation(on_rig: list[Written]):
+def test_assimp_finds_skeleton_skin_and_animation(on_rig: list[Written], subtests):
     if shutil.which("assimp") is None:
         pytest.skip("assimp is not installed: apt-get install assimp-utils")
     for file in on_rig:
-        command = ["assimp", "info", str(file.path)]
-        report = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        lines = [line.split(":") for line in report.splitlines() if ":" in line]
-        facts = {name.strip(): value.strip() for name, value, *_ in lines}
-        assert int(facts["Animations"]) == 1
-        assert int(facts["Bones"]) >= 22
-        assert int(facts["Materials"]) >= 5
+        with subtests.test(file=file.path.name):
+            command = ["assimp", "info", str(file.path)]
+            report = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+            lines = [line.split(":") for line in report.splitlines() if ":" in line]
+            facts = {name.strip(): value.strip() for name, value, *_ in lines}
+            assert int(facts["Animations"]) == 1
+            assert int(facts["Bones"]) >= 22
+            assert int(facts["Materials"]) >= 5
 
 
 def by_rate(files: list[Written]) -> list[tuple[float, list[Written]]]:
@@ -202,7 +206,7 @@ def check_blender(file: Written, joints: list[str], scene: dict[str, Any]) -> No
 @pytest.mark.tools
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_path: Path):
+def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_path: Path, subtests):
     """The vertices of the file that Autodesk's SDK made, skinned, against the vertices of the motion's .glb file."""
     motion = synthetic("kick")
     motion.save(tmp_path / "kick.fbx", rig="mixamo")
@@ -214,40 +218,42 @@ def test_the_surface_in_autodesk_is_that_of_pictures(node_modules: Path, tmp_pat
     ):
         surfaces.append(skinned(path, frame))
     # the SDK's file has a vertex once per material that meets there, in another order
-    for first, second in (surfaces, surfaces[::-1]):
-        nearest, _ = KDTree(first).query(second)
-        assert nearest.max() < 0.02 * MILLIMETER
+    for name, first, second in (("ours", *surfaces), ("theirs", *surfaces[::-1])):
+        with subtests.test(surface=name):
+            nearest, _ = KDTree(first).query(second)
+            assert nearest.max() < 0.02 * MILLIMETER
 
 
 @pytest.mark.tools
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_character_becomes_fbx_with_its_own_skin(node_modules: Path, tmp_path: Path):
+def test_a_character_becomes_fbx_with_its_own_skin(node_modules: Path, tmp_path: Path, subtests):
     synthetic("kick").save(tmp_path / "hero.glb", rig="mixamo")
     odd_character(tmp_path / "odd.glb", synthetic("kick"))
     write_names(tmp_path / "odd.yaml")
     for name in ("hero", "odd"):
-        motion = synthetic("wave")
-        motion.save(tmp_path / "wave.fbx", character=tmp_path / f"{name}.glb")
-        motion.save(tmp_path / "wave.glb", character=tmp_path / f"{name}.glb")
-        expected = glb_animation.read(tmp_path / "wave.glb")
-        ours = fbx_scene.read(tmp_path / "wave.fbx")
-        joints = [joint for joint in expected.names if joint in ours.names]
-        numbers = [expected.names.index(joint) for joint in joints]
-        frames = list(range(len(expected.positions)))
-        assert (
-            largest_difference(joints, expected.positions[:, numbers], ours, frames)
-            < 0.01 * MILLIMETER
-        )
-        theirs = glb_animation.read(autodesk(node_modules, tmp_path / "wave.fbx"))
-        shared = [joint for joint in joints if joint in theirs.names]
-        assert len(shared) >= 22
-        numbers = [expected.names.index(joint) for joint in shared]
-        whole = [0, 20, 40]
-        difference = largest_difference(
-            shared, expected.positions[whole][:, numbers], theirs, [0, 30, 60]
-        )
-        assert difference < 0.01 * MILLIMETER
+        with subtests.test(name=name):
+            motion = synthetic("wave")
+            motion.save(tmp_path / "wave.fbx", character=tmp_path / f"{name}.glb")
+            motion.save(tmp_path / "wave.glb", character=tmp_path / f"{name}.glb")
+            expected = glb_animation.read(tmp_path / "wave.glb")
+            ours = fbx_scene.read(tmp_path / "wave.fbx")
+            joints = [joint for joint in expected.names if joint in ours.names]
+            numbers = [expected.names.index(joint) for joint in joints]
+            frames = list(range(len(expected.positions)))
+            assert (
+                largest_difference(joints, expected.positions[:, numbers], ours, frames)
+                < 0.01 * MILLIMETER
+            )
+            theirs = glb_animation.read(autodesk(node_modules, tmp_path / "wave.fbx"))
+            shared = [joint for joint in joints if joint in theirs.names]
+            assert len(shared) >= 22
+            numbers = [expected.names.index(joint) for joint in shared]
+            whole = [0, 20, 40]
+            difference = largest_difference(
+                shared, expected.positions[whole][:, numbers], theirs, [0, 30, 60]
+            )
+            assert difference < 0.01 * MILLIMETER
 
 
 @pytest.mark.tools
@@ -313,30 +319,33 @@ def test_a_vrm_animation_has_the_positions_of_the_motion_and_the_rest_pose_of_vr
 
 @pytest.mark.tools
 @pytest.mark.slow
-def test_three_vrm_animation_reads_the_motion(node_modules: Path, tmp_path: Path):
+def test_three_vrm_animation_reads_the_motion(node_modules: Path, tmp_path: Path, subtests):
     """Its normalized tracks, applied to the rest pose by forward kinematics, give our joints."""
     for action in ("walk", "jump", "kick"):
-        path = tmp_path / f"{action}.vrma"
-        synthetic(action).save(path)
-        issues = node("gltf_validate.mjs", node_modules, path)
-        assert (issues["numErrors"], issues["numWarnings"]) == (0, 0)
-        tracks = node("three_vrma.mjs", node_modules, path)
-        file, ours = glb.read(path), glb_animation.read(path)
-        frames = len(ours.positions)
-        positions = np.zeros((frames, len(file.names), 3))
-        turned = np.tile(np.eye(3), (frames, len(file.names), 1, 1))
-        for number, (name, parent) in enumerate(zip(file.names, file.parents, strict=True)):
-            turn = Rotation.from_quat(
-                np.array(tracks["rotation"][name]).reshape(frames, 4)
-            ).as_matrix()
-            if parent < 0:
-                positions[:, number] = np.array(tracks["translation"]["hips"]).reshape(frames, 3)
-                turned[:, number] = turn
-            else:
-                offset = file.worlds[number, :3, 3] - file.worlds[parent, :3, 3]
-                positions[:, number] = positions[:, parent] + turned[:, parent] @ offset
-                turned[:, number] = turned[:, parent] @ turn
-        assert np.abs(positions - ours.positions).max() < 0.01 * MILLIMETER
+        with subtests.test(action=action):
+            path = tmp_path / f"{action}.vrma"
+            synthetic(action).save(path)
+            issues = node("gltf_validate.mjs", node_modules, path)
+            assert (issues["numErrors"], issues["numWarnings"]) == (0, 0)
+            tracks = node("three_vrma.mjs", node_modules, path)
+            file, ours = glb.read(path), glb_animation.read(path)
+            frames = len(ours.positions)
+            positions = np.zeros((frames, len(file.names), 3))
+            turned = np.tile(np.eye(3), (frames, len(file.names), 1, 1))
+            for number, (name, parent) in enumerate(zip(file.names, file.parents, strict=True)):
+                turn = Rotation.from_quat(
+                    np.array(tracks["rotation"][name]).reshape(frames, 4)
+                ).as_matrix()
+                if parent < 0:
+                    positions[:, number] = np.array(tracks["translation"]["hips"]).reshape(
+                        frames, 3
+                    )
+                    turned[:, number] = turn
+                else:
+                    offset = file.worlds[number, :3, 3] - file.worlds[parent, :3, 3]
+                    positions[:, number] = positions[:, parent] + turned[:, parent] @ offset
+                    turned[:, number] = turned[:, parent] @ turn
+            assert np.abs(positions - ours.positions).max() < 0.01 * MILLIMETER
 
 
 # The page in the browser writes FBX with tools/web/fbx.js
@@ -358,7 +367,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_page_finds_in_its_template_what_it_changes(template: Path):
+def test_the_page_finds_in_its_template_what_it_changes(template: Path, subtests):
     root = fbx.read(template / "template.fbx")
     figure = json.loads((template / "figure.json").read_text())
     objects, connections = root.first("Objects"), root.first("Connections")
@@ -372,12 +381,13 @@ def test_the_page_finds_in_its_template_what_it_changes(template: Path):
         for record in objects.all("Model")
     }
     assert list(models) == [*figure["names"], "person"]
-    for properties in models.values():
-        assert properties is not None
-        values = {record.properties[0]: record.properties[4:] for record in properties.children}
-        # the page writes rotations relative to a rest pose without rotations
-        assert values["PreRotation"] == [0, 0, 0]
-        assert len(values["Lcl Translation"]) == 3
+    for name, properties in models.items():
+        with subtests.test(name=name):
+            assert properties is not None
+            values = {record.properties[0]: record.properties[4:] for record in properties.children}
+            # the page writes rotations relative to a rest pose without rotations
+            assert values["PreRotation"] == [0, 0, 0]
+            assert len(values["Lcl Translation"]) == 3
     targets = Counter(
         record.properties[3] for record in connections.children if record.properties[0] == "OP"
     )
@@ -461,7 +471,7 @@ def test_autodesk_reads_the_file_of_the_page(from_page: tuple[Written, Motion], 
 @of_page
 @pytest.mark.parametrize(("size", "tolerance"), [(1.0, 13), (1.03, 20)])
 def test_the_skin_of_the_page_has_the_size_of_the_template(
-    size: float, tolerance: float, template: Path, node_modules: Path, tmp_path: Path
+    size: float, tolerance: float, template: Path, node_modules: Path, tmp_path: Path, subtests
 ):
     """In a file of the page, skin moves with its joints; it is not stretched as in a file of the package.
 
@@ -476,9 +486,10 @@ def test_the_skin_of_the_page_has_the_size_of_the_template(
         skinned(tmp_path / "python.glb", 20),
         skinned(autodesk(node_modules, file.path), 30),
     ]
-    for first, second in (surfaces, surfaces[::-1]):
-        nearest, _ = KDTree(first).query(second)
-        assert nearest.max() < tolerance * MILLIMETER
+    for name, first, second in (("ours", *surfaces), ("theirs", *surfaces[::-1])):
+        with subtests.test(surface=name):
+            nearest, _ = KDTree(first).query(second)
+            assert nearest.max() < tolerance * MILLIMETER
 
 
 @of_page

@@ -32,10 +32,12 @@ def clips() -> list[Clip]:
 
 def test_a_clip_depends_on_seed_and_number_alone_and_frame_rates_sample_the_same_motion(
     clips: list[Clip],
+    subtests,
 ):
     for clip, same in zip(Synthetic(3, seed=3).clips(FPS), clips, strict=False):
-        assert (clip.id, clip.captions) == (same.id, same.captions)
-        np.testing.assert_array_equal(clip.motion, same.motion)
+        with subtests.test(clip=clip.id):
+            assert (clip.id, clip.captions) == (same.id, same.captions)
+            np.testing.assert_array_equal(clip.motion, same.motion)
     other = Synthetic(1, seed=4).clip(0, FPS)
     assert other.id != clips[0].id
     assert not np.array_equal(other.motion, clips[0].motion)
@@ -155,7 +157,7 @@ def test_a_quarter_of_the_training_clips_leaves_something_out_and_no_other_clip(
     assert set(less[1]) == {False}
 
 
-def test_verbs_agree_with_their_subjects():
+def test_verbs_agree_with_their_subjects(subtests):
     rng = np.random.default_rng(0)
     sentences = [
         caption.split()
@@ -166,8 +168,9 @@ def test_verbs_agree_with_their_subjects():
         ("he she someone", "sits takes lowers is"),
         ("they you people", "sit take lower are"),
     ):
-        said = {sentence[1] for sentence in sentences if sentence[0] in subjects.split()}
-        assert said == {*verbs.split(), *["sat", "took", "lowered", "will"]}
+        with subtests.test(subjects=subjects):
+            said = {sentence[1] for sentence in sentences if sentence[0] in subjects.split()}
+            assert said == {*verbs.split(), *["sat", "took", "lowered", "will"]}
     bare = {sentence[0] for sentence in sentences if sentence[0].startswith(("sit", "tak"))}
     assert bare == {"sit", "take", "sitting", "taking"}
 
@@ -203,20 +206,25 @@ def generated(motion: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_the_ground_truth_and_noisy_motions_are_read_right(clips: list[Clip]):
+def test_the_ground_truth_and_noisy_motions_are_read_right(clips: list[Clip], subtests):
     rng, requested = np.random.default_rng(0), [dict(clip.attributes) for clip in clips]
     real, noisy = [clip.motion for clip in clips], [generated(clip.motion, rng) for clip in clips]
     for motions, least in ((real, 0.99), (noisy, 0.95)):
-        shares = accuracy(motions, requested)
-        assert all(share is not None and share >= least for share in shares.values()), shares
+        with subtests.test(least=least):
+            shares = accuracy(motions, requested)
+            assert all(share is not None and share >= least for share in shares.values()), shares
 
 
 def test_place_heading_and_frame_rate_do_not_matter(clips: list[Clip]):
     turn, shift = np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]]), np.array([3.0, 0.0, -5.0])
-    for clip in clips[:60]:
-        assert clip.attributes.items() <= read_attributes(clip.motion @ turn.T + shift, FPS).items()
-    for clip in Synthetic(60, seed=20_000).clips(30):
-        assert clip.attributes.items() <= read_attributes(clip.motion, 30).items()
+    moved = [(clip, clip.motion @ turn.T + shift, FPS) for clip in clips[:60]]
+    faster = [(clip, clip.motion, 30) for clip in Synthetic(60, seed=20_000).clips(30)]
+    misread = [
+        (clip.id, fps)
+        for clip, motion, fps in [*moved, *faster]
+        if not clip.attributes.items() <= read_attributes(motion, fps).items()
+    ]
+    assert not misread
 
 
 def test_a_mirrored_motion_shows_the_other_side(clips: list[Clip]):
@@ -227,12 +235,13 @@ def test_a_mirrored_motion_shows_the_other_side(clips: list[Clip]):
         "clockwise": "counterclockwise",
         "counterclockwise": "clockwise",
     }
+    misread = []
     for clip in clips[:100]:
         expected = {name: other.get(str(value), value) for name, value in clip.attributes.items()}
-        assert (
-            expected.items()
-            <= read_attributes(clip.motion[:, swap] * np.array([-1, 1, 1]), FPS).items()
-        )
+        shown = read_attributes(clip.motion[:, swap] * np.array([-1, 1, 1]), FPS)
+        if not expected.items() <= shown.items():
+            misread.append(clip.id)
+    assert not misread
 
 
 def test_noise_and_frozen_bodies_do_not_score(clips: list[Clip], subtests):

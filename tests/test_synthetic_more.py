@@ -159,13 +159,16 @@ def test_captions_state_the_attributes_and_contradict_none():
             assert not sides or not ({"left", "right"} - sides) & said, caption
 
 
-def test_every_action_has_six_captions_and_known_verbs():
+def test_every_action_has_six_captions_and_known_verbs(subtests):
     grammar = content()
     for name in MORE:
-        templates = next(
-            grammar["captions"][key] for key in (name, f"{name} left") if key in grammar["captions"]
-        )
-        assert len(templates) >= 6, name
+        with subtests.test(name=name):
+            templates = next(
+                grammar["captions"][key]
+                for key in (name, f"{name} left")
+                if key in grammar["captions"]
+            )
+            assert len(templates) >= 6, name
     assert {key for key in grammar["captions"] if key.endswith(" cycle")} == {
         f"{name} cycle" for name in CYCLES
     }
@@ -204,14 +207,17 @@ def drawn(name: str, number: int) -> tuple[np.ndarray, Attributes]:
 
 
 @pytest.mark.parametrize("name", CHECKED)
-def test_checks_read_side_count_and_direction_and_a_mirrored_motion_the_other_side(name: str):
+def test_checks_read_side_count_and_direction_and_a_mirrored_motion_the_other_side(
+    name: str, subtests
+):
     other = {"left": "right", "right": "left"}
     for number in range(3):
-        motion, attributes = drawn(name, number)
-        assert check(name, View.of(motion, FPS)) == attributes
-        mirrored = motion[:, SWAP] * np.array([-1, 1, 1])
-        expected = {key: other.get(str(value), value) for key, value in attributes.items()}
-        assert check(name, View.of(mirrored, FPS)) == expected
+        with subtests.test(number=number):
+            motion, attributes = drawn(name, number)
+            assert check(name, View.of(motion, FPS)) == attributes
+            mirrored = motion[:, SWAP] * np.array([-1, 1, 1])
+            expected = {key: other.get(str(value), value) for key, value in attributes.items()}
+            assert check(name, View.of(mirrored, FPS)) == expected
 
 
 def test_standing_shows_none_of_the_checked_actions():

@@ -117,17 +117,19 @@ def test_planted_feet_do_not_slide(clips: list[Clip]):
     assert (np.concatenate(moved) > 0.01).mean() < 0.01
 
 
-def test_who_walks_does_not_stop_and_who_sits_stays_seated(clips: list[Clip]):
+def test_who_walks_does_not_stop_and_who_sits_stays_seated(clips: list[Clip], subtests):
     walks = [clip for clip in clips if clip.attributes.get("direction") == "forward"]
     walks = [c for c in walks if c.attributes["action"] == "walk" and "while" not in c.attributes]
     assert len(walks) > 2
     for clip in walks:
-        speed = np.linalg.norm(np.diff(clip.motion[-12:, 0, [0, 2]], axis=0), axis=-1) * FPS
-        assert speed.min() > 0.3, clip.id
+        with subtests.test(clip=clip.id):
+            speed = np.linalg.norm(np.diff(clip.motion[-12:, 0, [0, 2]], axis=0), axis=-1) * FPS
+            assert speed.min() > 0.3, clip.id
     sits = [clip for clip in clips if clip.attributes["action"] in ("sit", "seated", "type")]
     assert len(sits) > 2
     for clip in sits:
-        assert (clip.motion[-5:, 0, 1] < 0.65).all(), clip.id
+        with subtests.test(clip=clip.id):
+            assert (clip.motion[-5:, 0, 1] < 0.65).all(), clip.id
 
 
 def test_motions_follow_others_in_every_posture(clips: list[Clip]):

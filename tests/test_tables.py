@@ -246,7 +246,9 @@ def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model(subtests)
     )
 
 
-def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_chosen(folder):
+def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_chosen(
+    folder, subtests
+):
     left_out = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
     for label in ("MDM", "MFM", "FLAME <b>"):
         change(
@@ -292,9 +294,10 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
         ),
         ({"stand_in": False, "smpl_sha256": None}, ""),
     ):
-        change(folder, "MDM", skeleton=skeleton)
-        notes = [text for _, text in made(folder).parts[0].notes if "Joints have" in text]
-        assert [note in text for text in notes] == [True] * bool(note)
+        with subtests.test(note=note):
+            change(folder, "MDM", skeleton=skeleton)
+            notes = [text for _, text in made(folder).parts[0].notes if "Joints have" in text]
+            assert [note in text for text in notes] == [True] * bool(note)
 
 
 def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
@@ -365,18 +368,26 @@ figures:
 """
 
 
-def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
+def test_times_are_compared_in_batches_of_the_same_size_alone(folder, subtests):
     (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
     spec = load_spec(str(folder / "timed.yaml"))
     for row, needed in evaluations(spec["parts"]["all"]):
-        size = row.get("batch_size", 1)
-        content = measured(
-            0, 0, 0, cost={"nfe": 10.0, "seconds_per_sample": 1 / size, "batch_size": float(size)}
-        )
-        trained = {"prediction": "velocity", "training_hours": 12.25, "training_memory_gib": 7.5}
-        content["checkpoint"] |= trained if row["label"] == "MFM" else {}
-        put(needed[0], folder, content)
-        assert needed[0].keys.get("batch_size") == row.get("batch_size")
+        with subtests.test(row=row["label"]):
+            size = row.get("batch_size", 1)
+            content = measured(
+                0,
+                0,
+                0,
+                cost={"nfe": 10.0, "seconds_per_sample": 1 / size, "batch_size": float(size)},
+            )
+            trained = {
+                "prediction": "velocity",
+                "training_hours": 12.25,
+                "training_memory_gib": 7.5,
+            }
+            content["checkpoint"] |= trained if row["label"] == "MFM" else {}
+            put(needed[0], folder, content)
+            assert needed[0].keys.get("batch_size") == row.get("batch_size")
     (part,) = build("timed", spec, folder / "results").parts
     lines = [line for line in part.lines if line.kind == "measured"]
     texts = [[cell and cell.text for cell in line.cells] for line in lines]

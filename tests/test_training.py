@@ -55,7 +55,7 @@ def same_weights(first: Path, second: Path) -> bool:
 
 
 @pytest.mark.slow
-def test_training_learns_and_leaves_what_a_user_looks_for(tiny, tmp_path):
+def test_training_learns_and_leaves_what_a_user_looks_for(tiny, tmp_path, subtests):
     words = [
         *tiny,
         "trainer.val_check_interval=30",
@@ -75,7 +75,8 @@ def test_training_learns_and_leaves_what_a_user_looks_for(tiny, tmp_path):
         "checkpoints/best.ckpt",
     )
     for name in (*files, "samples/step_0000060/player.html"):
-        assert (folder / name).is_file(), name
+        with subtests.test(name=name):
+            assert (folder / name).is_file(), name
     events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     assert {"val/loss", "epoch"} & set(events.Tags()["scalars"]) == {"val/loss"}, (
@@ -280,7 +281,9 @@ def test_unconditioned_samples_ignore_guidance(trained):
 
 
 @pytest.mark.slow
-def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tmp_path, capsys):
+def test_sampling_writes_motions_and_a_player_and_takes_every_option(
+    trained, tmp_path, capsys, subtests
+):
     out, text = tmp_path / "samples", "a person's walk (slow), 100%"
     how: dict[str, Any] = {
         "frames": 24,
@@ -301,7 +304,7 @@ def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tm
         return generate(model, text, **options)[0].features
 
     for name in ("motion_000.npz", "motion_001.npz"):  # of the same noise
-        with np.load(out / name) as motion:
+        with subtests.test(name=name), np.load(out / name) as motion:
             np.testing.assert_allclose(motion["features"], features(), atol=1e-5)
             facts = [motion[key].item() for key in ("text", "seed", "fps")]
             assert (*facts, motion["joints"].shape, len(str(motion["checkpoint"]))) == (
@@ -314,7 +317,8 @@ def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tm
     five = features(num_inference_steps=5)
     np.testing.assert_array_equal(features(num_inference_steps=[0, 2, 4, 7, 9]), five)
     for change in ({"spacing": "stride"}, {"eta": 0.0}, {"shared_noise": False}):
-        assert not np.allclose(features(num_inference_steps=5, **change), five)
+        with subtests.test(change=change):
+            assert not np.allclose(features(num_inference_steps=5, **change), five)
     with Image.open(out / "trajectory.png") as sheet, Image.open(out / "motions.png") as motions:
         # The sheet shows four estimates and the result.
         assert sheet.height / 5 == pytest.approx(motions.height / 2, rel=0.2)

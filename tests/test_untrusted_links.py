@@ -309,14 +309,15 @@ def test_a_link_at_the_name_of_a_file_does_not_lead_to_the_file_of_somebody_else
 
 
 @pytest.mark.parametrize("writer", ["audit cache", "text cache", "evaluate", "prepare", "train"])
-def test_a_link_to_a_file_that_does_not_exist_does_not_create_it(tmp_path, writer):
+def test_a_link_to_a_file_that_does_not_exist_does_not_create_it(tmp_path, writer, subtests):
     write, names = WRITERS[writer]
     for name in names:
-        victim, folder = tmp_path / "victim", tmp_path / name.replace("/", "-")
-        (folder / name).parent.mkdir(parents=True)
-        (folder / name).symlink_to(victim)
-        attempt(write, folder)
-        assert not victim.exists()
+        with subtests.test(name=name):
+            victim, folder = tmp_path / "victim", tmp_path / name.replace("/", "-")
+            (folder / name).parent.mkdir(parents=True)
+            (folder / name).symlink_to(victim)
+            attempt(write, folder)
+            assert not victim.exists()
 
 
 @pytest.mark.parametrize(("writer", "name"), FOLDERS)

@@ -25,16 +25,19 @@ except ImportError:
 MP4 = pytest.mark.skipif(av is None, reason="av is not installed: pip install flame-mdm[video]")
 
 
-def test_player_holds_the_joints_to_half_a_millimetre_and_huge_ones_coarser(tmp_path):
+def test_player_holds_the_joints_to_half_a_millimetre_and_huge_ones_coarser(tmp_path, subtests):
     # Motions on one page may differ in length, rate and skeleton.
     motions = [
         sway(contacts=True),
         sway(7, 12.5, SKELETONS["kit21"]),
     ]
     write_player(tmp_path / "p.html", motions, "t")
-    for packed, motion in zip(Page(tmp_path / "p.html").motions, motions, strict=True):
-        np.testing.assert_allclose(unpacked(packed), motion.joints, rtol=0, atol=0.0005 + 1e-6)
-        assert (packed["fps"], packed["parents"]) == (motion.fps, list(motion.skeleton.parents))
+    for number, (packed, motion) in enumerate(
+        zip(Page(tmp_path / "p.html").motions, motions, strict=True)
+    ):
+        with subtests.test(motion=number):
+            np.testing.assert_allclose(unpacked(packed), motion.joints, rtol=0, atol=0.0005 + 1e-6)
+            assert (packed["fps"], packed["parents"]) == (motion.fps, list(motion.skeleton.parents))
     contacts = np.frombuffer(
         base64.b64decode(Page(tmp_path / "p.html").motions[0]["contacts"]), "u1"
     )
@@ -159,16 +162,17 @@ def test_player_runs_in_a_browser(tmp_path):
     assert sides["blue"] != sticks["blue"]
 
 
-def test_gif_keeps_frames_and_time_and_holds_a_motion_that_ended(tmp_path):
+def test_gif_keeps_frames_and_time_and_holds_a_motion_that_ended(tmp_path, subtests):
     for fps, frames, shown in ((20, 30, 30), (30, 30, 30), (12.5, 10, 10), (120, 120, 40)):
-        write_gif(tmp_path / "m.gif", [sway(frames, fps, text="walks")], size=64)
-        with Image.open(tmp_path / "m.gif") as image:
-            durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
-            assert image.info["loop"] == 0
-        assert len(durations) == shown
-        assert sum(durations) == pytest.approx(1000 * frames / fps, abs=5)
-        assert min(durations) >= 20  # browsers slow shorter ones down
-        assert max(durations) - min(durations) <= 10
+        with subtests.test(fps=fps):
+            write_gif(tmp_path / "m.gif", [sway(frames, fps, text="walks")], size=64)
+            with Image.open(tmp_path / "m.gif") as image:
+                durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
+                assert image.info["loop"] == 0
+            assert len(durations) == shown
+            assert sum(durations) == pytest.approx(1000 * frames / fps, abs=5)
+            assert min(durations) >= 20  # browsers slow shorter ones down
+            assert max(durations) - min(durations) <= 10
     write_gif(tmp_path / "m.gif", [sway(8), sway(16)], size=64)
     with Image.open(tmp_path / "m.gif") as image:
         assert image.width == 128
@@ -219,16 +223,22 @@ def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
 
 @pytest.mark.slow
 @MP4
-def test_mp4_has_the_frames_of_the_motion_and_the_colors_of_the_gif(tmp_path):
+def test_mp4_has_the_frames_of_the_motion_and_the_colors_of_the_gif(tmp_path, subtests):
     for fps, size in ((12.5, 65), (29.97, 64), (120, 64)):
-        write_mp4(tmp_path / "m.mp4", [sway(12, fps, text="walks"), sway(5, fps)], size=size)
-        with av.open(str(tmp_path / "m.mp4")) as file:
-            stream, frames = file.streams.video[0], list(file.decode(video=0))
-            assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
-            assert float(stream.average_rate or 0) == pytest.approx(fps, rel=1e-6)
-        assert len(frames) == 12
-        assert (frames[-1].time or 0) - (frames[0].time or 0) == pytest.approx(11 / fps, rel=1e-3)
-        assert (frames[0].width, frames[0].height % 2) == (2 * size, 0)
+        with subtests.test(fps=fps, size=size):
+            write_mp4(tmp_path / "m.mp4", [sway(12, fps, text="walks"), sway(5, fps)], size=size)
+            with av.open(str(tmp_path / "m.mp4")) as file:
+                stream, frames = file.streams.video[0], list(file.decode(video=0))
+                assert (stream.codec_context.name, stream.codec_context.pix_fmt) == (
+                    "h264",
+                    "yuv420p",
+                )
+                assert float(stream.average_rate or 0) == pytest.approx(fps, rel=1e-6)
+            assert len(frames) == 12
+            assert (frames[-1].time or 0) - (frames[0].time or 0) == pytest.approx(
+                11 / fps, rel=1e-3
+            )
+            assert (frames[0].width, frames[0].height % 2) == (2 * size, 0)
 
     # it shows what a GIF shows, in its colors
     motions = [sway(8, text="walks"), sway(16)]

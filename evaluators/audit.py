@@ -48,7 +48,7 @@ CACHE = 2  # version of the cached metric inputs
 OF_TEXTS = {"text", "text_keys", "captions", "requested"}
 """Inputs that depend on the captions of the motions."""
 AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real"}
-"""Inputs that an audit has. Metrics that require other inputs are not audited."""
+"""Inputs that an audit can provide. Metrics that require other inputs are not audited."""
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
@@ -233,7 +233,7 @@ class _Measure:
             _named(name, part): x for part, x in computed.items() if _is_audited(metric, part)
         }
         if inputs is self.inputs[BASE] and not OF_TEXTS.intersection(required_inputs(metric)):
-            self.of_motions[name] = values  # values of motions do not depend on captions
+            self.of_motions[name] = values  # these values do not depend on the captions
         return values
 
     def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
@@ -289,9 +289,7 @@ class _Measure:
     def _rows(
         self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]
     ) -> dict[str, Any] | None:
-        """Returns the inputs of a metric, float64, with its readings;
-        None if some are unknown.
-        """
+        """Returns the inputs and readings of a metric in float64; None if an input is missing."""
         required = set(required_inputs(metric)) | (
             {"generated"} if "generated" in metric.states else set()
         )
@@ -339,9 +337,7 @@ def _is_audited(metric: SampleMetric, part: str) -> bool:
 
 
 def _interval(values: np.ndarray) -> list[float | None]:
-    """Returns a value and the half width of its 95 % interval;
-    None for values that cannot be computed.
-    """
+    """Returns a value and the half width of its 95 % interval; None if it cannot be computed."""
     pair = [float(values[0]), float(1.96 * values[1:].std())]
     return [float(f"{x:.6g}") for x in pair] if np.isfinite(pair).all() else [None, None]
 
@@ -349,9 +345,7 @@ def _interval(values: np.ndarray) -> list[float | None]:
 def _differences(
     values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]
 ) -> dict[str, list[float | None]]:
-    """Returns for each metric its value and interval,
-    and its difference from real motions with interval.
-    """
+    """Returns the value of each metric and its difference from real motions, with intervals."""
     pairs = {
         name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()
     }

@@ -15,8 +15,8 @@ Joints = np.ndarray
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
     """Encodes motions as features (F, D) float32, with one row per frame and at their own height.
 
-    The encoder of a representation needs one more frame. It also puts the lowest joint on the
-    floor, which would hide floating and sinking; here, the height is restored.
+    The encoder of a representation needs one more frame. The encoder also puts the lowest joint
+    on the floor, which would hide floating and sinking; here, the height is restored.
     """
     longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
     encoded = []

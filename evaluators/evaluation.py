@@ -74,14 +74,19 @@ class Evaluation:
     All ranks create and run it together.
     """
 
-    protocol: Protocol  # what is measured
-    clips: Clips  # the split
+    # Protocol to follow
+    protocol: Protocol
+    # Clips of the evaluated split
+    clips: Clips
     # The opened extractor. With None, metrics that need features have no value.
     extractor: Extractor | None
-    representation: Representation  # representation of the motions, on the device to compute on
-    seed: int = 0  # seed of all random draws
-    batch_size: int = 64  # batch size of the extractor
-    # the training split, for metrics that look for copies of its motions
+    # Representation of the motions, on the device to compute on
+    representation: Representation
+    # Seed of all random draws
+    seed: int = 0
+    # Batch size of the extractor
+    batch_size: int = 64
+    # The training split, for metrics that look for copies of its motions
     training: Clips | None = None
 
     def run(
@@ -231,7 +236,10 @@ class Evaluation:
         return lines
 
     def _expected(self) -> dict[str, list[float]]:
-        """Returns value and tolerance of real motions by metric; {} for other splits than the test split."""
+        """Returns the expected value of real motions and its tolerance for each metric.
+
+        Returns {} unless the test split is evaluated.
+        """
         # A data set without test clips (HumanAct12) is tested on its training clips, so they are
         # checked.
         info = self.clips.store.info
@@ -274,9 +282,7 @@ class Evaluation:
     def _measure(
         self, source: Source, real_sets: Sequence[tuple[Rows, Rows]], resamples: int
     ) -> Outcome:
-        """Measures the source's motions of each replication,
-        in comparison with the real motions.
-        """
+        """Measures the source's motions of each replication."""
         scores, costs, warnings = [], [], []
         resampled: Mapping[str, list[float | None]] = {}
         for replication, (paired, real) in enumerate(real_sets):

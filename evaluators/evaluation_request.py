@@ -25,7 +25,9 @@ class EvaluationKeys:
     """Keys of an evaluation that the command line and Python share, with their help texts."""
 
     protocol: str | None = option(
-        None, "a name in experiments/evaluation, or a file; default: the model decides"
+        None,
+        "protocol: a name in experiments/evaluation, or a file; default: the protocol for "
+        "the condition and data set of the model",
     )
     extractor: str | None = option(
         None,
@@ -34,7 +36,7 @@ class EvaluationKeys:
     )
     smpl: str | None = option(
         lambda: os.environ.get("FLAME_MDM_SMPL"),
-        "SMPL's model file (.pkl or .npz), to compute joints",
+        "SMPL's model file (.pkl or .npz), from which the skeleton of the joints is taken",
     )
     from_samples: str | None = option(
         None,

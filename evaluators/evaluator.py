@@ -28,7 +28,8 @@ from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.seeds import key
 
-CHUNK = 64  # motions per update of a metric; more motions do not fit into a processor's cache
+# Motions per update of a metric; more motions do not fit into a processor's cache
+CHUNK = 64
 # inputs of metrics that come from an extractor
 FEATURES = {"generated", "real", "text", "logits"}
 PAIRED = {
@@ -46,9 +47,12 @@ and the names of the same inputs from generated motions.
 class Motions:
     """N real or generated motions, with their conditions."""
 
-    ids: list[str]  # unique names
-    features: list[np.ndarray]  # (F, D) float32 each, in the data's units
-    captions: list[str] | None = None  # captions of motions with text
+    # Unique names
+    ids: list[str]
+    # (F, D) float32 each, in the data's units
+    features: list[np.ndarray]
+    # Captions of motions with text
+    captions: list[str] | None = None
     # "word/PART" tokens of the captions, if the data has tokens
     tokens: list[list[str] | None] | None = None
     # Further inputs by their names in `evaluators.metrics`
@@ -83,8 +87,10 @@ class Evaluator:
         ({'penetration': 0.0}, {})
     """
 
-    extractor: Extractor | None  # computes the features for metrics; None = no features
-    metrics: Mapping[str, Config]  # mappings with the `_target_` of a metric, by name
+    # Computes the features for metrics; None = no features
+    extractor: Extractor | None
+    # Mappings with the `_target_` of a metric, by name
+    metrics: Mapping[str, Config]
     representation: Representation
     batch_size: int = 64
     # whether metrics that lack features have no value, instead of raising an error
@@ -132,8 +138,9 @@ class Evaluator:
         return rows
 
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
-        """Returns the training motions for comparisons:
-        all their frames, and the features of windows.
+        """Returns the training motions for comparisons.
+
+        They are the poses of all frames, and the features of windows.
         """
         facing = self.representation.skeleton.facing
         joints = replace(self, extractor=None).extract(whole)["joints"]
@@ -145,8 +152,9 @@ class Evaluator:
 
     @torch.no_grad()
     def reference(self) -> Rows | None:
-        """Returns features of the extractor's own real motions;
-        None = sets are compared with the data set.
+        """Returns the features of the real motions that the extractor brings with it.
+
+        Returns None if it brings none; sets are then compared with the data set.
         """
         features = self.extractor and self.extractor.reference()
         if features is None:

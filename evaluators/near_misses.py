@@ -19,8 +19,8 @@ _Stated = frozenset[tuple[str, str | int | float]]
 def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
     """Returns sorted near misses of each clip, by the attribute that differs.
 
-    A caption of another clip is a near miss if both clips show the same action, and exactly one
-    differs of the attributes that both clips have (side, style, count, ...). For example, "walks
+    A caption of another clip is a near miss if both clips show the same action, and differ in
+    exactly one of the attributes that both have (side, style, count, ...). For example, "walks
     backward" is a near miss of a slow walk forward.
     """
     stated = [_stated(clip) for clip in clips]

@@ -29,9 +29,12 @@ from flame_mdm.seeds import key
 
 Draws = np.random.Generator
 GROUND = np.array([1.0, 0.0, 1.0])
-WOBBLE = 1.0  # frequency of the wobble, in Hz
-BLEND = 0.4  # seconds over which a motion is blended into another motion
-SHARES = (5, 10, 20, 50, 100)  # grades of replaced motions, in percent
+# Frequency of the wobble, in Hz
+WOBBLE = 1.0
+# Seconds over which a motion is blended into another motion
+BLEND = 0.4
+# Grades of perturbations that replace motions: percentage of the motions
+SHARES = (5, 10, 20, 50, 100)
 
 
 def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
@@ -178,8 +181,10 @@ class Perturbation:
     name: str
     group: str  # kind of perturbation: joints, meaning, set or plumbing
     about: str
-    unit: str = ""  # unit of the grades
-    grades: Sequence[float] = (1,)  # the grades, from weak to strong
+    # Unit of the grades
+    unit: str = ""
+    # The grades, from weak to strong
+    grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
         """Returns the perturbation with the grades that the motions allow, or one per kind;

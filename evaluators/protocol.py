@@ -29,7 +29,7 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
-CONTEXT_STARTS = 5  # DiP's code begins the context at one of this number of first frames
+CONTEXT_STARTS = 5  # In DiP's code, the context begins at one of this many first frames of a clip
 Count = Annotated[Int, Field(ge=1)]
 
 

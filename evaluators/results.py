@@ -34,8 +34,10 @@ class Scores:
 
     # values by name, `metric` or `metric/part`; None = cannot be computed
     values: Mapping[str, float | None]
-    reasons: Mapping[str, str]  # why a value is missing, by metric
-    count: int  # number of motions
+    # Why a value is missing, by metric
+    reasons: Mapping[str, str]
+    # Number of motions
+    count: int
     # Numbers of real motions in comparisons of sets, by the names of the values
     real_counts: Mapping[str, int]
     units: Mapping[str, str]  # units of the values by name
@@ -47,8 +49,9 @@ class Outcome:
     real motions, generated motions, or several per prompt.
     """
 
-    scores: Sequence[Scores] = ()  # scores by replication
-    # Values drawn for intervals over motions, by name; see `Value`
+    # Scores by replication
+    scores: Sequence[Scores] = ()
+    # Bootstrap values for intervals over motions, by name; see `Value`
     resampled: Mapping[str, list[float | None]] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     costs: Sequence[Cost] = ()
@@ -158,7 +161,10 @@ def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
 
 
 def _checkpoint(plan: Plan) -> Checkpoint | None:
-    """Describes the checkpoint. Its file name shows how it was selected from its run."""
+    """Describes the checkpoint.
+
+    The file name of the checkpoint shows how it was selected from its run.
+    """
     model, file = plan.model, plan.file
     if model is None or file is None:
         return None
@@ -245,7 +251,7 @@ def show(result: Result, path: Path) -> None:
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns the end of a line that explains the intervals; "" without intervals."""
+    """Returns the text at the end of a line that explains the intervals; "" without intervals."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""
@@ -255,8 +261,9 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
 
 
 def _cell(value: Value | None, usual: str) -> str:
-    """Formats a value with its interval, if any,
-    and with its numbers of motions if they are unusual.
+    """Formats a value with its interval, if any.
+
+    The numbers of motions are added if they differ from the numbers of most values.
     """
     if value is None or value.mean is None:
         return "-"

@@ -20,8 +20,8 @@ class MotionBatch:
     Attributes:
         x: (B, F, D) float32, normalized features, 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, unique in the data set. They seed the noise of each sample, and tables are
-            joined by them.
+        ids: B names, unique in the data set. The names seed the noise of each sample, and tables
+            are joined by name.
         text: one caption per motion. None: the data has no captions.
         action: (B,) int64 class labels. None: the data has no classes.
 
@@ -39,7 +39,7 @@ class MotionBatch:
 
     @property
     def lengths(self) -> Tensor:
-        """Number of real frames (B,) int64 of each motion."""
+        """The number of real frames of each motion, (B,) int64."""
         return self.mask.sum(1)
 
     def __len__(self) -> int:
@@ -225,7 +225,7 @@ class Edit:
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
 """The function (x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features).
 
-It is a denoiser, with or without guidance.
+The function is a denoiser, with or without guidance.
 """
 
 Noise = Callable[[int], Tensor]
@@ -242,7 +242,9 @@ def pad_to(x: Tensor, size: int) -> Tensor:
 
 
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
-    """Returns the mask (B, F) bool of lengths (B,). Default of `frames` F: the maximum length.
+    """Returns the mask (B, F) bool of lengths (B,).
+
+    `frames` is F; its default is the maximum length.
 
     Example:
         >>> length_mask(torch.tensor([1, 2])).tolist()
@@ -253,7 +255,7 @@ def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
 
 
 def ceil_div(count: int, size: int) -> int:
-    """Returns how many groups of `size` things are needed for `count` things."""
+    """Returns the number of groups of `size` items that hold `count` items."""
     return -(-count // size)
 
 

@@ -37,7 +37,7 @@ def first_line(error: BaseException) -> str:
 def did_you_mean(name: str, names: Iterable[str]) -> str:
     """Returns " Did you mean a, b?" with the names most similar to `name`.
 
-    It suggests up to three of `names`; "" if none is similar.
+    The text suggests up to three of `names`; it is "" if none is similar.
     """
     near = difflib.get_close_matches(name, list(names), 3, 0.5)
     return f" Did you mean {', '.join(near)}?" if near else ""
@@ -55,7 +55,7 @@ def shortened(text: str, most: int = MAX_LINE) -> str:
 def printable(text: str) -> str:
     r"""Returns the text with control and direction characters escaped (`\x1b`).
 
-    It can then not control a terminal.
+    Such a text cannot control a terminal.
     """
     return "".join(
         char
@@ -79,9 +79,9 @@ _shown: dict[str, str] = {}
 
 
 def show_as(path: str, name: str) -> None:
-    """Makes messages show a name for a path from now on.
+    """Makes messages show a name instead of a path from now on.
 
-    It is for temporary copies: the user sees the name that he typed.
+    For a temporary copy of a file, the user then sees the name that he typed.
     """
     _shown[path] = name
 

@@ -321,7 +321,7 @@ class MotionGenerator(Model, nn.Module):
 
 
 FADE = 0.5
-"""Seconds over which a jump between two blocks of a stream fades away."""
+"""Number of seconds over which a jump between two blocks of a stream fades."""
 
 
 class Blocks:
@@ -337,7 +337,7 @@ class Blocks:
         options: options of the sampler; all of them have a value.
         seed: seed of the noise.
         replication: number of the repetition, to sample several motions per id.
-        unconditioned: the conditions are null conditions already.
+        unconditioned: whether the conditions are null conditions, so that no guidance is needed.
         fade: number of frames after a seam over which a jump between two blocks fades away, see
             `joined`; 0 = blocks as DiP's code has them.
 

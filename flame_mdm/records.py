@@ -55,8 +55,8 @@ def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
     """Returns the 95 % interval of a value from its bootstrap values, centered at the value.
 
     See Efron and Tibshirani 1993, section 13.3. Values such as Fréchet distances are larger for
-    sets with repetitions (section 10.6), so the interval is shifted to the value. It is valid for
-    the same number of motions.
+    sets with repetitions (section 10.6), so the interval is shifted to the value. The interval is
+    valid for the same number of motions.
 
     Example:
         >>> percentiles([1.0, 2.0, 3.0], 5.0)

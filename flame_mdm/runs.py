@@ -35,7 +35,7 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """The key `data` of a provenance file. It may contain other facts about the data."""
+    """The key `data` of a provenance file. The key may contain other facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
@@ -75,7 +75,8 @@ class Fault(Schema):
 def made_by(path: str | Path) -> str:
     """Returns how to get a missing checkpoint or extractor.
 
-    This is the command that creates it or, for other files, the page that says where to find it.
+    The text names the command that creates the file or, if no command creates it, the page that
+    says where to find it.
     """
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)

@@ -39,8 +39,9 @@ class SamplerOptions:
     )
     sampler: str | None = option(
         None,
-        "for diffusion: ancestral, ddim, dpm_solver_pp_2m; for flow matching: euler, midpoint, heun, rk4, dopri5; for "
-        "distilled models: consistency. Default: the recipe's",
+        "name of the sampler. For diffusion: ancestral, ddim, dpm_solver_pp_2m; for flow "
+        "matching: euler, midpoint, heun, rk4, dopri5; for distilled models: consistency. "
+        "Default: the recipe's",
     )
     num_inference_steps: int | Sequence[int] | None = option(
         None,

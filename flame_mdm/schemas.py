@@ -92,13 +92,14 @@ def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> 
 
     Raises `UserError`, also if the content is nested too deeply, or contains itself.
     """
-    # before the shape, whose check would follow content that contains itself
+    # checked before the shape: the check of the shape would not end for content that contains
+    # itself
     for name, value in content.items():
         plain(value, f"{path}: {name}")
     try:
         return check_shape(content, kind)
     except ValueError as error:
-        raise UserError(f"{path}: damaged: {error}") from error
+        raise UserError(f"{path} is damaged: {error}") from error
 
 
 def _too_large(content: Any) -> str:
@@ -148,4 +149,4 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
     except UserError as error:
         raise UserError(f"{error}{message}") from error
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: damaged: {error}{message}") from error
+        raise UserError(f"{path} is damaged: {error}{message}") from error

@@ -1,9 +1,11 @@
-"""Counter-based random numbers. They depend on their purpose, not on the order of the draws.
+"""Counter-based random numbers.
 
-In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id). It
-does not depend on batch, padding, number of ranks or device. A counter is hashed (splitmix64:
-Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators"). The hash is mapped
-to the normal distribution (Box and Muller 1958).
+Random numbers depend on their purpose, not on the order of the draws.
+
+In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id).
+The noise does not depend on batch, padding, number of ranks or device. A counter is hashed
+(splitmix64: Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators"). The
+hash is mapped to the normal distribution (Box and Muller 1958).
 """
 
 import hashlib

@@ -251,7 +251,7 @@ class GeneratorTask(Task):
         return self.generator.describe()
 
     def setup(self, stage: str) -> None:
-        """Also stores the vocabulary of the training captions, for the text encoder, too."""
+        """Also stores the vocabulary of the training captions, which the text encoder gets."""
         super().setup(stage)
         data = self.data
         context = self.generator.denoiser.context_frames
@@ -391,7 +391,7 @@ def _conditioned(
 ) -> tuple[MotionBatch, Condition]:
     """Returns the motions to predict, without the frames of the prefix, and their conditions.
 
-    `u` (B,) are uniform numbers in (0, 1). They determine which targets are requested.
+    `u` (B,) are uniform numbers in (0, 1). These numbers determine which targets are requested.
     """
     prefix, batch = generator.split_prefix(batch)
     cond = replace(generator.condition(batch), prefix=prefix)

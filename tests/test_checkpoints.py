@@ -681,7 +681,7 @@ def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
     assert main(["import", *words, "run_code=true"]) == 0
     for content in (b"not a checkpoint", (bad / "model.pt").read_bytes()[:-500]):
         (bad / "model.pt").write_bytes(content)
-        refused("import", *words, says="model.pt: damaged, or not a ")
+        refused("import", *words, says="model.pt is damaged, or is not a ")
 
 
 def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, subtests):
@@ -730,7 +730,7 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtes
     flipped = bytearray(whole)
     flipped[-100] ^= 1
     for content, message in (
-        (whole[:-10], "damaged, or not a .safetensors file"),
+        (whole[:-10], "damaged, or is not a .safetensors file"),
         (bytes(flipped), "it has changed since it was written"),
         (
             whole.replace(b'\\"steps\\": 2', b'\\"steps\\": 9'),

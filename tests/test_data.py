@@ -135,7 +135,7 @@ def test_damaged_files_are_named(store, tmp_path, subtests):
     data = bytearray(path.read_bytes())
     data[-5] ^= 1
     path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"features\.npy: damaged: its hash"):
+    with pytest.raises(ValueError, match=r"features\.npy is damaged: its hash"):
         Store(path.parent).verify()
 
 

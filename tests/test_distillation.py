@@ -448,7 +448,7 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
         flame_mdm.load(
             taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2]
         )
-    with pytest.raises(UserError, match="an adapter, which changes a model"):
+    with pytest.raises(UserError, match="an adapter, which needs a model"):
         flame_mdm.load(taught / "limp.safetensors")
     model = build()
     model.denoiser = torch.nn.Linear(1, 1)  # type: ignore[assignment]

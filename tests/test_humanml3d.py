@@ -267,7 +267,7 @@ def motion(folder, name="000001"):
             lambda f: np.save(motion(f), np.zeros((3, 4, 5))),
             r"000001\.npy: it has shape \(3, 4, 5\)",
         ),
-        (lambda f: np.save(f / "Std.npy", np.zeros(263)), "is not a mean or positive std"),
+        (lambda f: np.save(f / "Std.npy", np.zeros(263)), "is not a positive standard deviation"),
         (
             lambda f: (f / "test.txt").write_text("000000\n"),
             r"test\.txt: 000000 is also in train\.txt",

@@ -144,7 +144,7 @@ def test_stores_without_recordings_are_prepared_again(mmm, tmp_path, capsys):
     path = store.folder / "references.npz"
     path.write_bytes(path.read_bytes()[:-1])
     assert evaluated(mmm, tmp_path / "a.json", "reconstruction_kit") == 1
-    assert "references.npz: damaged: its hash" in capsys.readouterr().err
+    assert "references.npz is damaged: its hash" in capsys.readouterr().err
     path.unlink()
     del store.info["sha256"]["references.npz"]
     (store.folder / "store.json").write_text(json.dumps(store.info))

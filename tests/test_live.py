@@ -71,7 +71,7 @@ def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were
     assert json.dumps(changed)
     assert live.file(name, ".bvh").startswith(b"HIERARCHY")
     assert b"Frames: 72" in live.file(name, ".bvh")
-    with pytest.raises(UserError, match="not a format of a stream"):
+    with pytest.raises(UserError, match="a stream cannot be saved in this format"):
         live.file(name, ".exe")
 
 

@@ -249,7 +249,9 @@ def test_frames_that_were_not_used_can_be_replaced(model):
     for at in (0, 30):
         with pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at 135\."):
             late.go_back(at)
-    with pytest.raises(UserError, match="cleanup=true: a block depends on the block after it"):
+    with pytest.raises(
+        UserError, match="cleanup=true: a cleaned block depends on the block after it"
+    ):
         stream(model, "a person walks", cleanup=True).go_back(1)
 
 

@@ -412,7 +412,7 @@ def test_prepare_replaces_an_intact_store_only_and_keeps_the_files_of_others(tmp
     assert (folder / "features.npy").read_bytes() != before
     features = (folder / "features.npy").read_bytes()
     (folder / "features.npy").write_bytes(features[:-4] + b"\0\0\0\1")
-    with one_line_error(r"features\.npy: damaged: .* Delete .* and prepare"):
+    with one_line_error(r"features\.npy is damaged: .* Delete .* and prepare"):
         prepare(tmp_path)
     assert (folder / "features.npy").stat().st_size == len(features)
 

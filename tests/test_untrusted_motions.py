@@ -527,16 +527,16 @@ def test_every_field_of_a_store_is_checked(tmp_path: Path):
     Store(tmp_path).verify()
     for name, value in [(name, value) for name, values in CLIPS.items() for value in values]:
         small_store(tmp_path, {name: value}, {})
-        refuses("clips.jsonl: damaged: line 1: ", opened, tmp_path)
+        refuses("clips.jsonl is damaged: line 1: ", opened, tmp_path)
     for name, value in INFOS:
         small_store(tmp_path, {}, {name: value})
-        refuses("store.json: damaged: ", opened, tmp_path)
+        refuses("store.json is damaged: ", opened, tmp_path)
     small_store(tmp_path, {}, {"fingerprint": "0123456789abcdef"})
-    refuses("store.json: damaged: its fingerprint", opened, tmp_path)
+    refuses("store.json is damaged: its fingerprint", opened, tmp_path)
     for content in (zipped({"a.npy": b"x"}), header((2**70, 263), "<f4"), header((-1, 263), "<f4")):
         small_store(tmp_path, {}, {})
         (tmp_path / "features.npy").write_bytes(content)
-        refuses("features.npy: damaged", opened, tmp_path)
+        refuses("features.npy is damaged", opened, tmp_path)
 
 
 def test_samples_of_other_kinds_and_recordings_of_amass_are_bounded(tmp_path: Path):

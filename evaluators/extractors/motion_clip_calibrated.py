@@ -25,10 +25,11 @@ from flame_mdm.seeds import key
 NEAR_MISSES = 2
 # Noise of strength 1 on the joints has this standard deviation, in meters.
 JITTER = 0.02
-# Noise of strength 1 on the features has this standard deviation, in normalized features. It also
-# moves joints by about 20 mm.
+# Noise of strength 1 on the features has this standard deviation, in normalized features. This
+# noise moves joints by about 20 mm.
 FEATURE_NOISE = 0.3
-WEIGHT = 5.0  # weight of `calibration_error` relative to `info_nce`
+# Weight of `calibration_error` relative to `info_nce`
+WEIGHT = 5.0
 # Length of all features. Noise of strength s moves all motions alike, so its FID is about (10
 # s)^2.
 LENGTH = 10.0

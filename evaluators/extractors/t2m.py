@@ -25,9 +25,12 @@ from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
-SLOTS = MAX_TOKENS + 2  # number of tokens of a caption, including start and end marks
-UNIT = 4  # frames per vector of the movement encoder
-CONTACTS = 4  # number of features at the end of each frame that the evaluator ignores
+# Number of tokens of a caption, including start and end marks
+SLOTS = MAX_TOKENS + 2
+# Frames per vector of the movement encoder
+UNIT = 4
+# Number of features at the end of each frame that the evaluator ignores
+CONTACTS = 4
 PARTS_OF_SPEECH = (
     *("VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV"),
     *("Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP", "Desc_VIP", "OTHER"),
@@ -47,15 +50,16 @@ SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in word
 class Words(NamedTuple):
     """Input of the text encoder for B captions."""
 
-    vectors: Tensor  # (B, 22, 300) GloVe vectors
-    parts: Tensor  # (B, 22, 15) one-hot parts of speech
-    lengths: Tensor  # (B,) int64, number of slots up to and including the end mark
+    # (B, 22, 300) GloVe vectors
+    vectors: Tensor
+    # (B, 22, 15) one-hot parts of speech
+    parts: Tensor
+    # (B,) int64, number of slots up to and including the end mark
+    lengths: Tensor
 
 
 class WordVectors:
-    """Word vectors (N, 300),
-    such as GloVe's for the captions of HumanML3D and KIT-ML, with each word's row.
-    """
+    """Word vectors (N, 300), such as GloVe's, and the row of each word."""
 
     def __init__(self, rows: dict[str, int], vectors: Tensor):
         self.rows, self.vectors = rows, vectors

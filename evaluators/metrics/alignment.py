@@ -85,7 +85,7 @@ class RPrecision(SampleMetric):
         # Half of the candidates at an equal distance count as closer.
         others = distance.shape[1] - 1
         if others + 1 < self.pool:
-            raise UserError(f"{others + 1} candidates are fewer than a pool of {self.pool}")
+            raise UserError(f"a pool needs {self.pool} candidates, but there are only {others + 1}")
         at = distance.gather(1, correct[:, None])
         closer = (distance < at).sum(1) + ((distance == at).sum(1) - 1) // 2
         probable = {
@@ -340,7 +340,7 @@ class MutualInformationDivergence(SampleMetric):
         """Returns the pointwise mutual information of each motion; raises `UserError` if there are too few motions."""
         real, real_text = rows["paired"], rows["paired_text"]
         if len(real) <= real.shape[1] + real_text.shape[1]:
-            raise UserError(f"{len(real)} motions are too few for its covariances")
+            raise UserError(f"{len(real)} motions are too few to estimate the covariances")
         terms = pointwise_mutual_information(
             real, real_text, rows["generated"], rows["text"], self.eps
         )

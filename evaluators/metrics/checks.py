@@ -82,8 +82,9 @@ class View:
         return ((joints - origin)[..., [0, 2]] * self.left[:, None]).sum(-1)
 
     def path(self) -> np.ndarray:
-        """Returns how far the pelvis is to the left of its start and in front of it (F, 2),
-        in the first heading.
+        """Returns how far the pelvis is to the left and in front of its start, (F, 2).
+
+        Left and front refer to the heading in the first frame.
         """
         moved = (self.smooth[:, PELVIS] - self.smooth[0, PELVIS])[:, [0, 2]]
         return np.stack([moved @ self.left[0], moved @ self.forward[0]], -1)

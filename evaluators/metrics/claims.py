@@ -15,7 +15,7 @@ from flame_mdm.sampling.referee.judging import SHORTEST, Verdict, verdicts
 from flame_mdm.sampling.referee.kinds import GROUPS
 from flame_mdm.sampling.referee.sentences import read_claims
 
-# Seconds of a motion that an audit keeps, so that all sets of motions have the same size
+# An audit keeps this many seconds of each motion, so that all sets of motions have the same size
 KEPT_SECONDS = 10.0
 STEP = 0.0005  # meters per unit of the kept positions
 

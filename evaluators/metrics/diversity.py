@@ -194,10 +194,10 @@ class JointVariance(SampleMetric):
     """Variance of joint positions among the motions of a text, in square meters.
 
     The variance over the `samples` motions of a text, which have equal length, is summed over x,
-    y and z, and averaged over joints, frames and texts. Its denominator is n - 1. The value is
-    not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of joints for the
-    10 generated motions"; according to eq. 18, this is a variance over the frames of one motion.
-    There is no code for it.
+    y and z, and averaged over joints, frames and texts. The denominator of the variance is n - 1.
+    The value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of
+    joints for the 10 generated motions"; according to eq. 18, this is a variance over the frames
+    of one motion. There is no code for it.
 
     Args:
         samples: number of motions per text.

@@ -40,7 +40,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 
 @dataclass
 class TrainingMotions:
-    """The training motions, to find the nearest one of a motion."""
+    """The training motions, among which the nearest neighbor of a motion is found."""
 
     #: (N, 3J) poses of all frames of all motions, one after another; see `poses`.
     poses: Tensor

@@ -40,7 +40,7 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
 def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:
     """Returns the positions that FLAME's code compares.
 
-    They are root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3).
+    The positions are root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3).
 
     Args:
         joints: (F, J, 3) in meters.
@@ -182,7 +182,10 @@ class TemosPositionErrors(PositionErrors):
         Raises `UserError` for other skeletons.
         """
         if joints.shape[1] != 21:
-            raise self.error(f"{joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
+            raise self.error(
+                f"the motions have {joints.shape[1]} joints, but the metric is only defined for "
+                "KIT's 21 joints (MMM)"
+            )
         return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -145,9 +145,9 @@ class MultiPositiveRPrecision(CaptionMetric):
       mean rank.
     - `proper`: R-precision as in information retrieval. A text with R correct motions adds the
       fraction of them among its R nearest motions.
-    - `single_topK`: only the text's own motion is correct. Except for ties, the values equal
-      those of `MotionsForText`.
-    - `chance_topK`: values expected from a random order, for comparison: similar captions raise
+    - `single_topK`: only the text's own motion is correct. Except for ties, the values equal the
+    values of `MotionsForText`. - `chance_topK`: values expected from a random order, for
+    comparison: similar captions raise
       all values.
     - `positives`: the mean number R of correct motions.
 
@@ -243,8 +243,8 @@ class TMRRetrieval(CaptionMetric):
 
     TMR's encoder of captions is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
     for HumanML3D and KIT. Here, batches are drawn. Without `ids`, the dissimilar subset starts
-    with the first motion by key. Then the motion whose caption is least similar to the captions
-    already chosen is added, again and again.
+    with the first motion by key. The motion whose caption is least similar to the captions
+    already chosen is added next, until the subset is complete.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as

@@ -50,7 +50,7 @@ class Declared:
     depends_on_count = False
 
     def unit_of(self, name: str) -> str:
-        """Returns the unit of the value with this name; the name of an only value is ""."""
+        """Returns the unit of the value with this name; an only value has the name ""."""
         return self.units.get(name, self.unit)
 
     def direction_of(self, name: str) -> bool | None:
@@ -98,7 +98,7 @@ class SampleMetric(Declared, Metric):
     may have no samples. `value` is the formula. If a metric draws at random, its argument `seed`
     determines the draws.
 
-    A class also declares facts that readers of its values need; see `Declared`.
+    A class also declares facts that are needed to interpret its values; see `Declared`.
 
     Attributes:
         states: names of the tensors with one row per sample, in the order of the arguments of

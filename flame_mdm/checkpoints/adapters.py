@@ -246,7 +246,7 @@ def _merge(
             state[name] = changed(state[name].float(), parts, rows, strength)
     except (KeyError, RuntimeError, IndexError) as error:
         raise UserError(
-            f"{path}: damaged: the adapter does not fit the weights: {first_line(error)}"
+            f"{path} is damaged: the adapter does not fit the weights ({first_line(error)})"
         ) from error
 
 
@@ -259,4 +259,4 @@ def _read(path: Path) -> tuple[About, dict[str, Tensor]]:
     try:
         return check_shape(parse_json(metadata[ADAPTER]), About), changes
     except ValueError as error:
-        raise UserError(f"adapter={path}: damaged: {error}") from error
+        raise UserError(f"adapter={path} is damaged: {error}") from error

@@ -20,8 +20,7 @@ from flame_mdm.safe_io import atomic_folder, read_text, read_yaml, regular_file,
 CARD = Path(__file__).with_name("card.md")
 MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
-"""Files that `push` writes next to the model,
-and the texts in them by which `push` recognizes its files.
+"""Files that `push` writes next to the model, and the text by which it recognizes each.
 
 The card also has the hash of the model file.
 """

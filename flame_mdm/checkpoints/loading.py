@@ -114,7 +114,8 @@ def load_task(
     try:
         model = _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # a nonsensical recipe may fail anywhere
-        if isinstance(error, FileNotFoundError):  # the missing file belongs to a text encoder
+        # The missing file belongs to a text encoder
+        if isinstance(error, FileNotFoundError):
             raise
         kind_of_error = (
             ""
@@ -130,7 +131,7 @@ def check_device(device: str | torch.device) -> None:
     """Raises `UserError` if this machine has no such device."""
     try:
         if torch.device(device).type == "meta":
-            raise RuntimeError("no device that computes")
+            raise RuntimeError("the device meta computes nothing")
         torch.empty(0, device=device)
     # torch raises either error for a missing device
     except (RuntimeError, AssertionError) as error:

@@ -16,7 +16,7 @@ Which = Literal["last", "best"]
 SHIPPED = {
     path.stem: path for path in sorted((Path(__file__).parents[1] / "models").glob("*.safetensors"))
 }
-"""Models in this package, by name; `docs/checkpoints.md` describes their training."""
+"""Models in this package by name; `docs/checkpoints.md` describes how they were trained."""
 
 
 def find(source: str | Path, which: Which = "last") -> Path:

@@ -26,8 +26,10 @@ from flame_mdm.schemas import Number, check_plain
 if TYPE_CHECKING:
     from torch import Tensor
 
-FORMAT = 2  # format of checkpoints and model files: 2 since version 0.2.0
-FORMAT_KEY = "flame_mdm_format"  # key of the format in a checkpoint
+# Format of checkpoints and model files: 2 since version 0.2.0
+FORMAT = 2
+# Key of the format in a checkpoint
+FORMAT_KEY = "flame_mdm_format"
 # Keys of the metadata of model files and of adapters
 KEY = "flame_mdm"
 ADAPTER = "flame_mdm_adapter"
@@ -46,11 +48,12 @@ def read_model_file(path: Path) -> dict[str, Any]:
     text = metadata.get(KEY)
     if ADAPTER in metadata:
         raise UserError(
-            f"{path}: an adapter, which changes a model. Give the model first: MODEL adapter={path}"
+            f"{path} is an adapter, which needs a model. Give the model first: MODEL adapter={path}"
         )
     if text is None:
         raise UserError(
-            f"{path}: weights without a recipe. Import released weights with `flame-mdm import`"
+            f"{path} holds weights without a recipe. Import released weights with `flame-mdm "
+            "import`"
         )
     try:
         content = parse_json(text)
@@ -77,7 +80,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
             return file.metadata() or {}, tensors
     except (SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{path}: damaged, or not a .safetensors file") from error
+        raise UserError(f"{path} is damaged, or is not a .safetensors file") from error
 
 
 def check_format(path: Path, number: Any) -> None:

@@ -148,7 +148,8 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 def root_units(representation: HumanML) -> list[list[float]]:
     """Returns the mean and standard deviation of each of the first three features.
 
-    They are the turn of the root in radians, and its steps to the left and forward in meters.
+    The three features are the turn of the root in radians, and its steps to the left and forward
+    in meters.
     """
     scale = representation.mean.new_ones(3)
     scale[0] = representation.turn_unit
@@ -161,8 +162,8 @@ def root_units(representation: HumanML) -> list[list[float]]:
 class Probe:
     """Records how a sampler combines noise and clean estimates.
 
-    It takes the place of the denoiser, the noise and the `Guide`. `variance` is the network's
-    output for a learned variance.
+    The probe takes the place of the denoiser, the noise and the `Guide`. `variance` is the
+    network's output for a learned variance.
     """
 
     # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
@@ -259,7 +260,8 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
             after.abs().max()
         ):
             raise UserError(
-                f"sampler={options.sampler} combines more than two clean estimates, and is not exported"
+                f"sampler={options.sampler} combines more than two clean estimates, so it cannot "
+                "be exported"
             )
         rows.append([*row, *np.where(np.abs(solution) > 1e-12, solution, 0.0).tolist()])
     return rows

@@ -31,8 +31,9 @@ NETWORKS = {
     "trans_dec": (MDMDecoder, "seqTransDecoder", theirs.DECODER_LAYER),
     "gru": (MDMGRU, "", {}),
 }
-"""The authors' names of MDM's architectures, with our networks, the authors' names of the
-transformers, and the names in a layer.
+"""Architectures of MDM, by the authors' names.
+
+Each has our network, the authors' name of the transformer, and the names in a layer.
 """
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
@@ -65,8 +66,8 @@ class Released(NamedTuple):
 def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
     """Converts a model of MDM or MFM.
 
-    Its network is an encoder, a decoder, a decoder with token, or a GRU; its condition is text,
-    actions or nothing.
+    The network of the model is an encoder, a decoder, a decoder with token, or a GRU; the
+    condition is text, actions or nothing.
 
     Args:
         state: weights from `released_state`. The sizes of the network are read from their shapes.
@@ -137,7 +138,10 @@ def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
-    """Converts FLAME's network without RoBERTa. Its number of attention heads (8) cannot be read from the weights."""
+    """Converts FLAME's network without RoBERTa.
+
+    FLAME's number of attention heads (8) cannot be read from the weights.
+    """
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
     names, num_layers = theirs.layer_names(learned, "tf_decoder", theirs.DECODER_LAYER)
     ours = theirs.renamed(learned, theirs.NAMES["flame"] | names)

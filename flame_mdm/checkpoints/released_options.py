@@ -95,8 +95,8 @@ def _check_prefix(options: Options) -> None:
         if value not in (0, "add") and not decoder:
             kind = f"{options.arch} with {options.text_encoder_type}"
             raise ValueError(
-                f"{name}={value}: supported for trans_dec with bert, not for {kind}. Import a "
-                f"model without this option"
+                f"{name}={value}: this value is supported only for trans_dec with bert, not for "
+                f"{kind}. Import a model without this option"
             )
     if bool(options.context_len) != bool(options.pred_len):
         lengths = f"context_len={options.context_len}, pred_len={options.pred_len}"

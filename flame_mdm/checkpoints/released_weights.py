@@ -42,7 +42,9 @@ def read_released(
     except Exception as error:  # torch raises many kinds of errors for damaged files
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
-            raise UserError(f"{path}: damaged, or not a PyTorch file. Download it again") from error
+            raise UserError(
+                f"{path} is damaged, or is not a PyTorch file. Download it again"
+            ) from error
         raise UserError(
             f"{path}: holds Python objects ({unsafe[1]}) in addition to the weights, and "
             f"reading them can run any code. {advice}"

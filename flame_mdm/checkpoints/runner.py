@@ -44,11 +44,14 @@ NUMBERS = frozenset(
     ]
 )
 MASK = (1 << 64) - 1
-LONGEST = 600  # default duration in seconds for a model that continues frames
+# Default duration in seconds for a model that continues frames
+LONGEST = 600
 # the last graph exists only for SMPL's joints
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
-MAX_DESCRIPTION = 64 * 2**20  # maximum number of bytes of model.json
-MAX_GRAPH = 2**31  # maximum number of bytes of an ONNX file, the limit of the format
+# Maximum number of bytes of model.json
+MAX_DESCRIPTION = 64 * 2**20
+# Maximum number of bytes of an ONNX file, the limit of the format
+MAX_GRAPH = 2**31
 EXTERNAL_DATA = re.compile(rb"(?:\x08|\x88\x80*\x00)location")
 """Pattern of the key that names a file of external data, after its length.
 
@@ -346,8 +349,9 @@ class Sampler:
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the rest pose and the local rotations, only for SMPL's 22 joints.
 
-        Offsets (22, 3) from the parents are in the rest pose, with the arms out. Quaternions (F,
-        22, 4) are (w, x, y, z); the quaternion of the root is in the world.
+        Offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
+        are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y, z); the quaternion of
+        the root is in the world.
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")

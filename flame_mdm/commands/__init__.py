@@ -149,7 +149,7 @@ class FileSettings:
     )
     up: str | None = option(
         None,
-        "axis of the file that points up: y, z or -y; default: the axis in skeleton.yaml, or y",
+        "axis that points up in the file: y, z or -y; default: the axis in skeleton.yaml, or y",
     )
     animation: str | None = option(
         None, "name or number of an animation in an .fbx or .glb file; default: the first"
@@ -335,7 +335,9 @@ class DataSettings:
         None, "data set, a file in experiments/data; data.KEY=... overrides its keys"
     )
     representation: str | None = option(
-        None, "a file in experiments/representation; default: the representation of the data set"
+        None,
+        "motion representation, a file in experiments/representation; default: the "
+        "representation of the data set",
     )
     data_root: str = option(
         usual_data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"

@@ -21,7 +21,7 @@ class AdaptSettings(ModelSettings):
     COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "lr_warmup", "seed")
     source: str = required("folder of motions with captions: docs/own-data.md")
     name: str = required("one word for prompts such as 'a person walks in NAME style'")
-    out: str | None = option(None, "run directory; default runs/adapt/NAME")
+    out: str | None = option(None, "run directory; default: runs/adapt/NAME")
     action: bool = option(
         False, "true = the clips show an action that the model does not know, instead of a style"
     )

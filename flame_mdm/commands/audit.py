@@ -26,8 +26,8 @@ class AuditSettings(DataSettings):
     OBJECTS: ClassVar = ("data", "extractor")
     extractor: str | None = option(
         None,
-        "path of the motion-CLIP or other extractor that the protocol requires; none = audit "
-        "the metrics of joints",
+        "path of the motion-CLIP or other extractor that the protocol requires; none = only "
+        "audit metrics that need no extractor",
         model_source,
     )
     protocol: str | None = option(

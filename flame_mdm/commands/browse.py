@@ -24,7 +24,7 @@ class BrowseSettings(BodySettings, DataSettings):
     """
 
     OBJECTS: ClassVar = ("data", "out")
-    out: str | None = option(None, "HTML file; default runs/browse/<store>.html")
+    out: str | None = option(None, "HTML file; default: runs/browse/<store>.html")
     source: str | None = option(
         None, "source folder or archive, if the data set is not prepared yet and requires a source"
     )

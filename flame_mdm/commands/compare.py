@@ -52,10 +52,9 @@ class CompareSettings(BodySettings):
     )
     prompts: str | None = option(
         None,
-        "file with one prompt per line, for which the last.ckpt of each run is sampled; "
-        "default: the captions "
-        "of the first folder of motion files or, without such a folder, the newest samples of "
-        "each run",
+        "file with one prompt per line, for which the last.ckpt of each run is sampled. Default: "
+        "the captions of the first folder of motion files; without such a folder, the newest "
+        "samples of each run are compared",
     )
     seconds: float | None = option(
         None,

@@ -46,7 +46,7 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
         ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; or .mp4 or .gif to watch"
     )
     format: str | None = option(
-        None, "if MOTION is a folder: extension of the files in the folder OUT"
+        None, "if MOTION is a folder: format of the files in the folder OUT, such as glb"
     )
     rest_pose: bool = option(
         False, "true = the first frame of a .bvh file is the rest pose, with the arms stretched out"
@@ -119,7 +119,7 @@ def _convert(
                 out, settings.rest_pose, settings.rig, character, body, settings.root_motion
             )
         )
-    except UserError as error:  # if the output is not at fault, the motion is
+    except UserError as error:  # an error that does not name the output is an error of the input
         if str(out) in str(error):
             raise
         raise UserError(f"{path}: {error}") from error

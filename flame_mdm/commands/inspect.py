@@ -47,7 +47,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
         "a motion file, a folder of motion files, or the name of a data set, which may be your "
         "own (data.name)"
     )
-    out: str | None = option(None, "HTML file; default runs/inspect/<name>.html")
+    out: str | None = option(None, "HTML file; default: runs/inspect/<name>.html")
     clips: int = option(
         24, "maximum number of motions in the player, which shows the worst motions", above_zero
     )

@@ -41,7 +41,7 @@ class JudgeSettings(BodySettings, FileSettings):
     text: str | None = option(
         None, "sentence to check the motions against; default: the text in each motion file"
     )
-    out: str | None = option(None, "HTML file; default runs/judge/<name>.html")
+    out: str | None = option(None, "HTML file; default: runs/judge/<name>.html")
     clips: int = option(
         24, "maximum number of motions in the player, which shows the worst motions", above_zero
     )

@@ -35,7 +35,7 @@ class TablesSettings:
 
     OBJECTS: ClassVar = ("table",)
     table: list[str] | None = option(
-        None, "names in experiments/tables, or paths of specs; default: all"
+        None, "tables to render: names in experiments/tables, or paths of specs; default: all"
     )
     evaluate: bool = option(True, "evaluate missing results; false = only render existing results")
     out: str = option("runs/tables", "folder of the tables")

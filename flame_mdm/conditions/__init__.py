@@ -55,17 +55,14 @@ class ConditionEncoder(nn.Module, ABC):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains the encoder on captions alone, before the first training step.
 
-        By default, it does nothing.
-
-        Args:
-            groups: one list of captions per clip.
-            seed: seed of all random draws.
+        By default, the method does nothing. Args: groups: one list of captions per clip. seed:
+            seed of all random draws.
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Fills the encoder's cache on disk for these captions. By default, it does nothing.
+        """Fills the encoder's cache on disk for these captions.
 
-        It is called in only one process.
+        By default, the method does nothing. Only one process calls it.
         """
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:

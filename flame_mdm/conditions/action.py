@@ -9,7 +9,9 @@ from flame_mdm.errors import UserError
 
 
 class ActionLabels(ConditionEncoder):
-    """One learned vector per class, initialized from N(0, 1). The null is the zero vector.
+    """One learned vector per class, initialized from N(0, 1).
+
+    The null condition is the zero vector.
 
     Source: Tevet et al. 2023 (MDM), section 3. There is one token, equal to the pooled vector,
     for denoisers that read tokens.

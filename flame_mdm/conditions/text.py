@@ -102,7 +102,7 @@ class PretrainedText(ConditionEncoder):
         self._pretrained = Pretrained(model, revision, package, sha256)
         self._cache: EncodedCaptions | None = None
         if not freeze:
-            with torch.device("cpu"):  # also if the whole model is built on the meta device
+            with torch.device("cpu"):  # even if the rest of the model is built on the meta device
                 self.network = self._pretrained.load_network().train()
         if pooling == "pooler":
             weight = torch.empty(features, features)
@@ -364,8 +364,8 @@ class Pretrained:
 class EncodedCaptions:
     """Outputs of a language model for N captions.
 
-    They are vectors (N, C) float32 and tokens (T, C) float16. Caption n has the tokens from
-    `offsets[n]` up to, but not including, `offsets[n + 1]`. Arrays read from a file are
+    The outputs are vectors (N, C) float32 and tokens (T, C) float16. Caption n has the tokens
+    from `offsets[n]` up to, but not including, `offsets[n + 1]`. Arrays read from a file are
     memory-mapped.
     """
 
@@ -402,7 +402,7 @@ class EncodedCaptions:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the outputs for some captions, float32, on a device.
 
-        They are vectors (N, C), tokens (N, S, C) and the mask of the tokens (N, S).
+        The outputs are vectors (N, C), tokens (N, S, C) and the mask of the tokens (N, S).
         """
         rows = np.array([self.rows[caption] for caption in captions])
         begin, lengths = self.offsets[rows], self.offsets[rows + 1] - self.offsets[rows]

@@ -24,7 +24,9 @@ No caption has it.
 
 
 class LearnedTokens(ConditionEncoder):
-    """Hashed words, learned positions and one transformer layer. The null is one learned vector.
+    """Hashed words, learned positions and one transformer layer.
+
+    The null condition is one learned vector.
 
     A word is the sum of two rows of the table, selected by its hash; see `vocabulary.hashed`. The
     vector of a word that the training captions do not contain would be random. Such a word is
@@ -158,7 +160,7 @@ class LearnedTokens(ConditionEncoder):
     def encode(self, words: Tensor, counts: Tensor) -> Condition:
         """Encodes `rows` (B, S, 2) of captions of lengths (B,) like `forward`.
 
-        It has no branches, so that it can be exported as a graph.
+        The function has no branches, so that it can be exported as a graph.
         """
         token_mask = length_mask(counts, words.shape[1])
         index = torch.arange(token_mask.numel(), device=words.device)

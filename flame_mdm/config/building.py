@@ -133,8 +133,8 @@ def moved(node: Any, folders: Mapping[str, str]) -> Any:
 def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **derived: Any) -> Any:
     """Instantiates the object described by a mapping with a `_target_`, including nested ones.
 
-    It supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text. Mappings and lists
-    are passed as plain copies, as with Hydra's `_convert_: all`.
+    The function supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as
+    plain text. Mappings and lists are passed as plain copies, as with Hydra's `_convert_: all`.
 
     Args:
         node: the mapping.

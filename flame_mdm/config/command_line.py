@@ -22,9 +22,10 @@ from flame_mdm.safe_io import FULL
 from flame_mdm.signals import stoppable
 
 Settings = TypeVar("Settings")
-"""Dataclass of a command. Its docstring is the usage; its fields made by `option` are the keys.
+"""Dataclass of a command.
 
-`OBJECTS` names the keys for leading words without a key. If the last of these keys is a list, it
+The docstring of the class is the usage, and its fields made by `option` are the keys. `OBJECTS`
+names the keys that leading words without a key belong to. If the last of these keys is a list, it
 takes all remaining words. `SWEEPS` is True if the command takes --multirun and launch=, as in
 `flame_mdm.config.jobs`. A field `composed` receives the arguments for Hydra: keys with a dot,
 such as `data.source.path`, and the keys and options in `COMPOSED`.
@@ -162,7 +163,7 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
             raise UserError(
                 f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
             )
-    # Surplus words remain unchanged. They are refused later, because they have no value.
+    # Surplus words remain unchanged, and are refused later because they have no value.
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
     return keyed + leading[len(objects) :] + rest
 
@@ -263,7 +264,7 @@ def explanation(error: Exception) -> str | None:
         return first_line(error)
     if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
         return f"out of memory ({first_line(error)}). Free memory, or reduce the size"
-    # Errors of files name the file, unless this framework raised them or a disk is full.
+    # An OSError names its file, unless this framework raised it or the disk is full.
     if isinstance(error, FileNotFoundError) or (
         isinstance(error, OSError) and (error.filename or error.errno in FULL)
     ):

@@ -33,7 +33,7 @@ LAUNCH = "launch"  # folder of `experiments/` with launchers, which start jobs o
 def groups() -> list[str]:
     """Returns the replaceable parts of a recipe.
 
-    They are folders of `experiments/` whose files are options, not recipes.
+    The parts are folders of `experiments/` whose files are options, not recipes.
     """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)

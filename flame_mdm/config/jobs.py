@@ -90,7 +90,7 @@ def _launch(jobs: Sequence[Callable[[], int]], words: Sequence[str]) -> None:
     launchers = [word.partition("=")[2] for word in words if word.startswith(f"{LAUNCH}=")]
     check_launcher(launchers)
     say(f"waiting for the jobs; their output is in {FOLDER}/.submitit")
-    check_tree(FOLDER)  # Hydra and the launchers open files in this folder in place
+    check_tree(FOLDER)  # Hydra and the launchers overwrite files in this folder in place
 
     def job(config: Any) -> None:
         if code := jobs[config["job"]]():

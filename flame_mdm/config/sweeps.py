@@ -115,7 +115,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     check_launcher(launcher)
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
-    # Hydra and the launchers open files in this folder in place
+    # Hydra and the launchers overwrite files in this folder in place
     check_tree(Path(config["run"]["dir"]))
     hydra_sweep(job, recipe.folder, recipe.stem, [*output, *overrides])
 

@@ -77,25 +77,25 @@ class MotionSource(ABC):
     license: str = ""
     """License of all motions, a key of `licenses.yaml` such as "MIT".
 
-    It is empty if the license is unknown, or if clips have their own licenses.
+    The text is empty if the license is unknown, or if clips have their own licenses.
     """
     # Whether the license allows checkpoints to contain captions.
     captions_may_be_shared: bool = False
     published_split: bool = False
     """Whether the papers' split is used despite its faults.
 
-    It tests on training clips or has no validation clips. The value is saved in the store and in
-    every result.
+    Such a split tests on training clips or has no validation clips. The value is saved in the
+    store and in every result.
     """
     version: int = 1
     """Version of the code that reads the motions.
 
-    It is part of the fingerprint. Stores of another version are not used.
+    The version is part of the fingerprint. Stores of another version are not used.
     """
     failures: Sequence[str] = ()
     """One line per motion that could not be read and is left out.
 
-    It is complete after `clips` has ended. Commands then exit with code 1, because the user
+    The list is complete after `clips` has ended. Commands then exit with code 1, because the user
     should correct the files.
     """
     # Processes that read and encode; 0 = one per core, 1 = only this process
@@ -130,7 +130,7 @@ class MotionSource(ABC):
     def counts(self) -> Mapping[str, float]:
         """Returns figures of the raw data under the names of `published.yaml`.
 
-        They are saved after `clips` has ended.
+        The figures are saved after `clips` has ended.
         """
         return {}
 

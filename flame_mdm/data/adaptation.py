@@ -37,7 +37,7 @@ KEPT = "prior/"  # prefix of the names of the known clips
 class Lesson(MotionSource):
     """Clips of the user's folder, with mirrored copies, and clips of what the model knows.
 
-    All clips of the folder are for training unless its table says otherwise. They are normalized
+    All clips of the folder are for training unless its table says otherwise. Clips are normalized
     with the statistics of the store. A caption in the folder becomes "CAPTION in NAME style".
 
     Args:

@@ -80,7 +80,7 @@ class Recording(NamedTuple):
     def parameters(self) -> np.ndarray:
         """Returns the parameters of FLAME, (F, 75) float32.
 
-        They are the translation and the axis-angle vectors of 24 joints.
+        A frame has the translation and the axis-angle vectors of 24 joints.
         """
         return np.concatenate([self.translation, self.poses[:, :72]], 1).astype(np.float32)
 
@@ -202,8 +202,8 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # An archive takes minutes. Therefore this process does not work on one before the workers
-        # start.
+        # An archive takes minutes. Therefore this process does not start on an archive before the
+        # workers do.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
         ):

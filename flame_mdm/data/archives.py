@@ -63,11 +63,12 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
     """Returns a path that is a folder, or a temporary folder with the `members` of an archive.
 
-    The temporary folder is removed together with `owner`. Its deepest folder that contains all
-    members is returned.
+    The temporary folder is removed together with `owner`. Of its subfolders, the deepest folder
+    that contains all members is returned.
 
     Raises:
-        UserError: As `members`, and if a member would be unpacked outside the folder.
+        UserError: For the same reasons as `members`, and if a member would be unpacked outside
+            the folder.
     """
     if not path.is_file():
         return path
@@ -127,8 +128,10 @@ def _tar_members(
                     )
                 _check_size(member.name, member.size)
                 yield member.name, archive.extractfile(member).read()
-            archive.members = []  # otherwise, a million empty members would take a gigabyte
-            archive.pax_headers = {}  # otherwise, each member would copy these shared values
+            # otherwise, a million empty members would take a gigabyte
+            archive.members = []
+            # otherwise, each member would copy these shared values
+            archive.pax_headers = {}
 
 
 def _check_size(name: str, size: int) -> None:
@@ -137,7 +140,10 @@ def _check_size(name: str, size: int) -> None:
 
 
 class _Member(tarfile.TarInfo):
-    """A tar member. It refuses large headers and sparse files before their content is read."""
+    """A tar member.
+
+    This class refuses large headers and sparse files before their content is read.
+    """
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:

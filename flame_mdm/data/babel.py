@@ -55,10 +55,10 @@ class Window(NamedTuple):
 class Babel(MotionSource):
     """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
 
-    They are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20 start)
-    to floor(20 end) - 1. If a label is longer than a clip, it gives one window every `STRIDE`
-    frames. If it is shorter, the clip continues past its end. The label is left out if the motion
-    ends before the clip.
+    Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
+    start) to floor(20 end) - 1. If a label is longer than a clip, it gives one window every
+    `STRIDE` frames. If it is shorter, the clip continues past its end. The label is left out if
+    the motion ends before the clip.
 
     Both splits train on BABEL's entire train part and test on 20 % of its val part. Our split
     draws 20 % of the motions, not of the clips, so no motion is in both val and test. FLAME's

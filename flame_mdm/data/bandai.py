@@ -47,7 +47,7 @@ _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's lef
 def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns orthonormal columns.
 
-    They are the direction of x, the part of y that is perpendicular to x, and their cross
+    The columns are the direction of x, the part of y that is perpendicular to x, and their cross
     product.
     """
     first = x / np.linalg.norm(x)
@@ -237,7 +237,7 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
 def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
     if missing := set(JOINTS.values()) - set(tree.joints):
         raise UserError(
-            f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing"
+            f"this is not the skeleton of the data set: it lacks {', '.join(sorted(missing))}"
         )
     return tree, {"map": _MAP, "unit": LAYOUTS["Bandai-Namco"].unit}
 
@@ -300,7 +300,7 @@ def captions(content: str, style: str, side: str) -> list[str]:
 
 
 def split_of(dataset: int, content: str, style: str, number: int, rule: str = "takes") -> Split:
-    """Returns the split of a take. It depends only on the take's name.
+    """Returns the split of a take. The split depends only on the take's name.
 
     Neighboring takes look alike, so blocks of five stay in one split. Data set 1 has only one
     take of most combinations, so a whole combination goes to one split. The normal takes of

@@ -1,4 +1,7 @@
-"""Rest poses of SMPL and SMPL+H. They are read from licensed model files that users download."""
+"""Rest poses of SMPL and SMPL+H.
+
+The poses are read from licensed model files that users download.
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,7 +62,8 @@ def _rest_joints(
         or numbers != list(parents[1:])
     ):
         raise ValueError(
-            f"J_regressor {regressor.shape}, v_template {vertices.shape}, or another tree of joints"
+            f"J_regressor has shape {regressor.shape} and v_template has shape {vertices.shape}; "
+            "these shapes or the tree of joints are not SMPL's"
         )
     rest = regressor @ vertices
     if not np.isfinite(rest).all():
@@ -95,8 +99,8 @@ class Body(NamedTuple):
 def load_body(folder: Path, gender: str) -> Body:
     """Loads the extended SMPL+H model of a gender.
 
-    For "male", the file is `male/model.npz` or `SMPLH_MALE.npz`. It is in the folder or in the
-    subfolder `smplh`.
+    For "male", the file is `male/model.npz` or `SMPLH_MALE.npz`. The file is in the folder or in
+    the subfolder `smplh`.
     """
     names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]

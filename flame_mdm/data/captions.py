@@ -58,9 +58,8 @@ def drawn_splits(
     """Returns the split of each motion: the split in the table or, without one, a drawn split.
 
     Splits are drawn by a hash of the source, so all motions of a source are in one split. If no
-    motion is drawn for training, the split with the most sources gives its source with the
-    highest hash to training. With `SPLITTABLE` or more motions, val and test are filled in the
-    same way.
+    motion is drawn for training, the source with the highest hash in the largest split is moved
+    to training. With `SPLITTABLE` or more motions, val and test are filled in the same way.
 
     Args:
         sources: source of each motion, by name.

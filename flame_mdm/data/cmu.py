@@ -80,7 +80,7 @@ GET_IT = (
 
 
 class Item(NamedTuple):
-    """Captions of an entire recording, or of its part from frame `start` to `end` at 20 fps.
+    """Captions of a recording, or of its part from frame `start` to frame `end` at 20 fps.
 
     `action` is the label of a part in `captions.csv`. `is_own` is true for such parts, and false
     for captions of HumanML3D and KIT-ML.
@@ -180,9 +180,9 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips of CMU recordings, captions by name, and splits.
+        """HumanML3D's clips of CMU recordings, the captions and the splits by name.
 
-        They are empty if the user gives captions.
+        All are empty if the user gives captions.
         """
         if self.table:
             return [], {}, {}
@@ -519,7 +519,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     if "lfemur" not in tree.joints:
         return tree, {}
     # A first frame without rotation is the T-pose. In Daz-friendly files, the next few frames
-    # blend it with the motion. They get the pose of the first frame after them.
+    # blend it with the motion. These frames get the pose of the first frame after them.
     if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
         frames = tree.frames[1:].copy()
         frames[:blended, 6:] = frames[blended, 6:]

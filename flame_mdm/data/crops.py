@@ -1,6 +1,6 @@
 """Rules that crop clips to training samples, and data sets of cropped clips.
 
-The rules are the rules of the authors' code.
+The rules follow the authors' code.
 """
 
 from abc import ABC, abstractmethod
@@ -79,7 +79,8 @@ class Units(Crop):
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
             raise UserError(
-                f"crop: needs 1 <= unit <= min_frames <= max_frames, in whole units, not {self}"
+                f"data.crop={self}: must have 1 <= unit <= min_frames <= max_frames, and "
+                "max_frames must be a multiple of unit"
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
@@ -129,7 +130,7 @@ class Fixed(Crop):
 class Clips(Dataset[Sample]):
     """The clips of a split that are long enough for the crop rule.
 
-    They are cropped at every draw, then normalized.
+    At every draw, a clip is cropped and then normalized.
     """
 
     def __init__(
@@ -171,7 +172,8 @@ class Clips(Dataset[Sample]):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns first frame, number of frames and caption index (B,) of clips in a batch.
 
-        They are functions of (seed, batch, index). In evaluation (batch -1), they never change.
+        These numbers are functions of (seed, batch, index). In evaluation (batch -1), they never
+        change.
         """
         rows = np.asarray(indices)
         if batch < 0:

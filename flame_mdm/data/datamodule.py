@@ -169,7 +169,7 @@ class MotionDataModule(LightningDataModule):
     def actions(self) -> Sequence[str]:
         """Names of the action labels.
 
-        They come from the store if it exists, so that training does not need the raw data.
+        The names come from the store if it exists, so that training does not need the raw data.
         """
         prepared = (self.folder / "store.json").exists()
         return self.open().info["actions"] if prepared else self.source.actions
@@ -280,7 +280,7 @@ class MotionDataModule(LightningDataModule):
     def train_dataloader(self) -> Loader:
         """Returns an endless loader.
 
-        It starts at the trainer's current step, for resumed runs.
+        The loader starts at the trainer's current step, for resumed runs.
         """
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0

@@ -112,7 +112,8 @@ class Folder(MotionSource):
             self.options["license"] = license
         # For each layout, how upright the body is in each motion read so far
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
-        self._notes: Counter[str] = Counter()  # lines about the motions read so far
+        # Lines about the motions read so far
+        self._notes: Counter[str] = Counter()
         # The representation of the raw motions to yield; see `suit`
         self._representation: Representation | None = None
 

@@ -63,7 +63,7 @@ class HumanAct12(MotionSource):
         return len(self._motions)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips in the order of the file. They have actions, but no captions."""
+        """Yields the clips in the order of the file. The clips have actions, but no captions."""
         self.check_fps(fps, FPS)
         clips, seen = Counter(action for _, action in self._motions), Counter[int]()
         blocks = {

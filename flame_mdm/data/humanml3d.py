@@ -214,14 +214,15 @@ class HumanML3D(T2MFolder):
             remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
-        """Writes mean and std of all motions of any length and split, mirrored ones included."""
+        """Writes the mean and std of all motions of any length and split, with mirrored copies."""
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
         if wrong := [
             name for name, (_, features) in shapes.items() if features != representation.features
         ]:
             raise UserError(
-                f"{self.path}: wrong number of features of {some(wrong)}; delete them and prepare again"
+                f"{self.path}: these files have a wrong number of features: {some(wrong)}. Delete "
+                "them and prepare again"
             )
         count = sum(frames for frames, _ in shapes.values())
         frames = Frames(lambda: (self._load(name).astype(np.float32) for name in shapes), count)
@@ -233,7 +234,10 @@ class HumanML3D(T2MFolder):
 def _from_amass(
     write: partial[None], bodies: dict[str, Body], rows: Sequence[IndexedClip], recording: Recording
 ) -> int:
-    """Writes the clips of a recording. As published, only "male" bodies are not female."""
+    """Writes the clips of a recording.
+
+    As in the published code, every body that is not "male" is treated as female.
+    """
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
     for row in rows:
@@ -276,8 +280,8 @@ class HumanML3DSMPL(MotionSource):
 
     There is one clip per caption, named NAME#0, NAME#1 ... As in FLAME's code, there are no
     mirrored copies, no length limits and no cuts. A caption of a part is used for the whole
-    motion. In five subsets, frames were trimmed from the start. Unlike FLAME's code, this class
-    takes them into account, so that motion and caption match.
+    motion. In five subsets, the first frames of a recording were dropped. Unlike FLAME's code,
+    this class takes this into account, so that motion and caption match.
 
     Args:
         path: folder of HumanML3D with texts, splits and `index.csv`; no motions are needed.

@@ -34,10 +34,10 @@ class KIT(T2MFolder):
 class KITTemos(MotionSource):
     """Joints of the MMM model at 12.5 frames per second, with TEMOS's splits and limits.
 
-    Every eighth of 100 frames per second is used. Source: Petrovich, Black, Varol, "TEMOS", ECCV
-    2022; FLAME follows its rules. Training and validation leave out motions of fewer than 10 or
-    more than 500 frames. The test split keeps all motions, but only their first caption. Ghosh et
-    al.'s test clips have the attribute `ghosh_test`.
+    The recordings have 100 frames per second, of which every eighth is used. Source: Petrovich,
+    Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. Training and validation leave out
+    motions of fewer than 10 or more than 500 frames. The test split keeps all motions, but only
+    their first caption. Ghosh et al.'s test clips have the attribute `ghosh_test`.
 
     `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
     contains TEMOS's lists of these numbers.

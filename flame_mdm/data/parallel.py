@@ -34,7 +34,7 @@ def in_order(
 ) -> Generator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks.
 
-    It reads only a few tasks ahead. If `tasks` comes from another `in_order`, both share one
+    Only a few tasks are read ahead. If `tasks` comes from another `in_order`, both share one
     pool.
 
     Args:
@@ -129,10 +129,11 @@ def _first(pending: deque[Future[Result]]) -> Result:
 def _start_worker() -> None:
     """Sets up a worker process.
 
-    It uses one thread and ignores Ctrl-C, which the parent handles. It exits when the parent
-    dies.
+    The process uses one thread, ignores Ctrl-C, which the parent handles, and exits when the
+    parent dies.
     """
-    # Read when a task imports torch. Importing it here would slow down tasks that do not need it.
+    # torch reads this variable when a task imports it. Importing torch here would slow down tasks
+    # that do not need it.
     os.environ["OMP_NUM_THREADS"] = "1"
 
     def follow() -> None:

@@ -1,6 +1,6 @@
 """Restricted reader of pickles.
 
-It reads arrays, numbers, text, lists, tuples and dictionaries with text keys.
+This module reads arrays, numbers, text, lists, tuples and dictionaries with text keys.
 
 A pickle can name any function and have it called. This reader calls no function. It keeps the
 arguments and the state of each object, and creates arrays from the bytes among them. NumPy's own
@@ -24,7 +24,7 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-# Number of bytes that each value counts as. Otherwise, a file of a few bytes could repeat a list
+# Each value counts as this number of bytes. Otherwise, a file of a few bytes could repeat a list
 # without end.
 VALUE = 512
 
@@ -63,14 +63,15 @@ class _Dictionary(dict[str, Any]):
 
     def __setitem__(self, key: Any, value: Any) -> None:
         if type(key) is not str:
-            raise pickle.UnpicklingError("a key of a dictionary is not text")
+            raise pickle.UnpicklingError("a dictionary has a key that is not text")
         super().__setitem__(key, value)
 
 
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    `opaque` contains beginnings of names. Objects of such globals become their state.
+    `opaque` contains beginnings of names. An object whose global has such a name is read as its
+    state.
     """
 
     stack: list[Any]
@@ -87,7 +88,7 @@ class _Unpickler(pickle._Unpickler):
         """Returns `size` bytes.
 
         Raises:
-            EOFError: If the file has fewer; no memory is taken in this case.
+            EOFError: If the file has fewer bytes; no memory is allocated in this case.
         """
         if size > self.size - self.file.tell():
             raise EOFError("it ends too early")

@@ -1,4 +1,4 @@
-"""A motion of a person who stands still. By default, streams start from it."""
+"""A motion of a person who stands still, from which streams start by default."""
 
 import numpy as np
 from torch import Tensor

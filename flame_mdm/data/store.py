@@ -141,7 +141,7 @@ class Store:
     def motion(self, clip: Entry) -> np.ndarray:
         """Returns the features (F, D) float32 of a clip, not normalized.
 
-        They are a view of the memory-mapped array.
+        The result is a view of the memory-mapped array.
         """
         return self.features[clip.start : clip.start + clip.length]
 
@@ -159,7 +159,7 @@ class Store:
     def licenses(self) -> list[dict[str, Any]]:
         """Returns license, clips, minutes and actions of the motions under each license.
 
-        It is empty if the data set states no licenses. Copies of a clip count once.
+        The list is empty if the data set states no licenses. Copies of a clip count once.
         """
         frames: dict[str, dict[int, int]] = {}
         actions: dict[str, set[str]] = {}
@@ -450,7 +450,8 @@ def _intact(path: Path) -> Iterator[Path]:
         yield path
     except (OSError, ValueError, KeyError) as error:
         raise UserError(
-            f"{path}: damaged: {first_line(error)}. Delete {path.parent} and prepare the data set again"
+            f"{path} is damaged: {first_line(error)}. Delete {path.parent} and prepare the data "
+            "set again"
         ) from error
 
 

@@ -48,7 +48,8 @@ ALWAYS = ("action", "while")
 UNSAID = {"speed": "normal", "amount": "quarter"}
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
-VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")  # with an adverb before it: "is slowly walking"
+# A verb, which may follow an adverb: "is slowly walking"
+VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")
 
 
 @cache
@@ -274,7 +275,7 @@ class Synthetic(MotionSource):
     ) -> Clip:
         """Returns the clip of a motion (F, 22, 3).
 
-        Its captions are drawn by `words`, and its split by its name.
+        `words` draws the captions of the clip, and its name determines its split.
         """
         split = hashed_split(name, val=5, test=10)
         incomplete = split == "train" and words.random() < PARTIAL
@@ -309,7 +310,7 @@ class Synthetic(MotionSource):
 def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
     """Returns fixed prompts and their attributes.
 
-    They are for samples on dashboards and for `evaluators.metrics.attributes`.
+    These prompts are for samples on dashboards and for `evaluators.metrics.attributes`.
 
     Args:
         count: number of prompts, counted from the first. Default: all.

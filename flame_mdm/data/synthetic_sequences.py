@@ -82,7 +82,8 @@ class SyntheticSequences(Synthetic):
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
     """Returns the body of a clip.
 
-    It shows the end of an earlier motion, a transition to the required posture, and the motion.
+    The body shows the end of an earlier motion, a transition to the required posture, and the
+    motion itself.
     """
     action = str(attributes["action"])
     start = STARTS.get(action, "standing")

@@ -30,7 +30,8 @@ MAX_TOKENS = 20
 class Description(NamedTuple):
     """One line of a text file.
 
-    It describes seconds `begin` to `end`; both are 0 for the entire motion.
+    The line describes the motion from `begin` to `end`, in seconds; both are 0 for the entire
+    motion.
     """
 
     caption: str
@@ -211,12 +212,13 @@ class T2MFolder(MotionSource):
         mean, std = (self._array(f"{name}.npy", 1).astype(np.float32) for name in ("Mean", "Std"))
         if mean.shape != std.shape or not np.isfinite(mean).all() or not (std > 0).all():
             raise UserError(
-                f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std"
+                f"{self.path}: Mean.npy {mean.shape} is not a mean, or Std.npy {std.shape} is not "
+                "a positive standard deviation"
             )
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the figures of `published.yaml`. They do not count mirrored copies."""
+        """Returns the figures of `published.yaml`. The figures do not count mirrored copies."""
         texts = [
             text for name, texts in self.texts.items() if not name.startswith("M") for text in texts
         ]

@@ -68,14 +68,14 @@ class UESTC(MotionSource):
     def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Names of the actions.
 
-        They are read from the data, as models need their number early.
+        The names are read from the data, because models need their number early.
         """
         return tuple(self._lines("action_classes.txt"))
 
     def count(self) -> int:
         """Returns the number of videos.
 
-        It includes the few videos that turn out to be too short when they are read.
+        The number includes the few videos that turn out to be too short when they are read.
         """
         return len(self.used)  # including the few that are left out when their poses are read
 
@@ -108,7 +108,7 @@ class UESTC(MotionSource):
 
     @cached_property
     def used(self) -> list[Video]:
-        """The videos that are used. Of side 2, these are only views 0 to 7."""
+        """The videos that are used. From side 2, only views 0 to 7 are used."""
         return [video for video in self.videos if video.side == 1 or video.view < 8]
 
     def _lines(self, name: str) -> list[str]:

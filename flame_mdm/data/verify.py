@@ -83,8 +83,8 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "duplicates_across_splits": sum(
             len({clip.split for clip in group}) > 1 for group in duplicates
         ),
-        # Mean and std of the store may be published values. They are compared with values
-        # computed from the training clips.
+        # Mean and std of the store may be published values. Therefore, they are compared with
+        # values computed from the training clips.
         "statistics": {
             "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
             "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
@@ -175,7 +175,8 @@ def _anomalies(
         if not finite.all():
             frame = int(np.argmin(finite))
             raise UserError(
-                f"{store.folder}: damaged: frame {frame} of clip {clip.id} is not finite; prepare it again"
+                f"{store.folder} is damaged: frame {frame} of clip {clip.id} is not finite. "
+                "Prepare the data set again"
             )
         joints = representation.decode(torch.from_numpy(motion))
         if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:

@@ -37,8 +37,8 @@ from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 from flame_mdm.visualize import player_page
 
-# Number of open pages that gradio remembers. It stores half a megabyte per page, which the demo
-# does not need.
+# Number of open pages that gradio remembers. For each page, gradio stores half a megabyte, which
+# the demo does not need.
 SESSIONS = 64
 # Maximum number of motion files written at the same time, and maximum number of requests that wait for a file
 WRITERS = 2
@@ -92,7 +92,7 @@ def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
 
 
 class Server(uvicorn.Server):
-    """A server that ends the streams to open pages before it waits for running requests."""
+    """A server that ends the streams to open pages when it stops, before it waits for requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]
@@ -184,7 +184,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
             options = {key: value for key, value in pairs if key in ("motion", "rig")}
             number = options.get("motion", "0")
             if not number.isdecimal() or len(number) > 3:
-                raise UserError(f"motion={one_line(number[:20])}: not a number of a motion")
+                raise UserError(f"motion={one_line(number[:20])}: not the number of a motion")
             request = parse_query([pair for pair in pairs if pair[0] not in options])
             async with writers.turns:
                 await web.body()  # a disconnection is only reported after the body

@@ -25,7 +25,7 @@ def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Readin
     replaces the text in the form.
 
     Args:
-        abilities: the actions and attributes that the model knows. They are the options of the
+        abilities: the actions and attributes that the model knows. These are the options of the
             chips.
         parts: words and seconds of the parts of the text.
         readings: the meaning of each part.

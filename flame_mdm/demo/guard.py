@@ -19,8 +19,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flame_mdm.demo.request import MAX_TEXT, MAX_WAYPOINTS, PLAIN
 
-MAX_BODY = 64 * 1024  # maximum number of bytes in the body of a request, counted as they arrive
-BODY_TIME = 10.0  # maximum number of seconds until the body has arrived
+# Maximum number of bytes in the body of a request, counted as they arrive
+MAX_BODY = 64 * 1024
+# Maximum number of seconds until the body has arrived
+BODY_TIME = 10.0
 # maximum number of characters in the path of an address; names of files have at most 255
 MAX_PATH = 200
 READ = re.compile(
@@ -105,9 +107,9 @@ class Guard:
     """ASGI middleware that checks a request before the application gets it.
 
     It checks host, origin, path, size and content. `hosts` are the names of this server, in
-    addition to localhost and numeric addresses. A request with another name may come from a name
-    that somebody else pointed at this computer (DNS rebinding). `calls` maps the numbers of the
-    page's callable functions to their path, and to a check of the arguments. `is_open` tells
+    addition to localhost and numeric addresses. A request with another host name may come from a
+    page whose name somebody pointed at this computer (DNS rebinding). `calls` maps the numbers of
+    the page's callable functions to their path, and to a check of the arguments. `is_open` tells
     whether a session has called a function, so that its results can be read.
     """
 
@@ -165,7 +167,7 @@ class Guard:
     async def _until_closing(self, receive: Receive) -> Message:
         """Returns the next message.
 
-        Once the server stops, it is a disconnection, so that open streams end.
+        Once the server stops, this is a message of disconnection, so that open streams end.
         """
         tasks = [asyncio.ensure_future(receive()), asyncio.ensure_future(self.closing.wait())]
         try:

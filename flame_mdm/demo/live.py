@@ -19,15 +19,19 @@ from flame_mdm.sampling.streams import Stream, read_text, stream
 from flame_mdm.visualize.player import packed_motion
 
 MAX_STREAMS = 16
-IDLE = 120.0  # seconds without a request after which a stream ends
-LONGEST = 3600.0  # maximum duration of a stream in seconds
+# Seconds without a request after which a stream ends
+IDLE = 120.0
+# Maximum duration of a stream in seconds
+LONGEST = 3600.0
 # Maximum number of blocks that a stream may compute at once, and per second on average
 BURST, RATE = 8.0, 2.0
-KEPT = 60.0  # duration in seconds of the part of a stream that can be downloaded
-BEFORE = 10  # number of frames before a block on which the rotations of its first frames depend
+# Duration in seconds of the part of a stream that can be downloaded
+KEPT = 60.0
+# Number of frames before a block on which the rotations of its first frames depend
+BEFORE = 10
 ENDINGS = (".bvh", ".glb")
 STAND, WALK = "a person stands", "a person walks forward"
-"""First text of a stream, and its text on the way to a waypoint."""
+"""The text with which a stream begins, and the text while the person walks to a waypoint."""
 
 
 @dataclass
@@ -81,7 +85,7 @@ class LiveStreams:
         Args:
             name: name of the stream; "" = begin a new stream, whose name is in the result.
             text: description of the motion.
-            begin: number of the first frame. Frames that the stream has after it are dropped.
+            begin: number of the first frame. Frames of the stream after this frame are dropped.
             path: waypoints that are ahead in frame `begin`, x and z in meters. `reached` in the
                 result lists the numbers of the frames in which the first waypoints are reached.
 
@@ -121,7 +125,9 @@ class LiveStreams:
             UserError: If the stream has ended, or files do not have this ending.
         """
         if ending not in ENDINGS:
-            raise UserError(f"{ending[:20]}: not a format of a stream. Use {', '.join(ENDINGS)}")
+            raise UserError(
+                f"{ending[:20]}: a stream cannot be saved in this format. Use {', '.join(ENDINGS)}"
+            )
         with self._working:
             live = self._running(name)
             joints, text = live.joints, live.text

@@ -27,9 +27,12 @@ MAX_SAMPLES = 4
 MAX_STEPS = 1000
 MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
-MAX_FIELDS = 50  # maximum number of fields of a query string
-MAX_WAYPOINTS, FAR = 16, 20.0  # limits of a path: number of waypoints, and meters along x and z
-PLUS = " + "  # separator between the names of a model and its adapter
+# Maximum number of fields of a query string
+MAX_FIELDS = 50
+# Limits of a path: number of waypoints, and meters along x and z
+MAX_WAYPOINTS, FAR = 16, 20.0
+# Separator between the names of a model and its adapter
+PLUS = " + "
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
 """Text without control characters and without characters that change the direction of writing."""
 

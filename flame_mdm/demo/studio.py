@@ -27,7 +27,8 @@ from flame_mdm.sampling.resolution import resolve
 # Number of requests whose motions stay in memory, so that a download or an edit does not need the
 # model again
 KEPT = 64
-TIME_LIMIT = 300.0  # maximum number of seconds for which a request may occupy the model
+# Maximum number of seconds for which a request may occupy the model
+TIME_LIMIT = 300.0
 # Formats of downloads, and their names on the page
 FORMATS = {
     ".bvh": "BVH",

@@ -47,7 +47,7 @@ class Denoiser(nn.Module, ABC):
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         """Returns the prediction (B, F, out_features).
 
-        It is a pure function, except for dropout in training.
+        The network is a pure function, except for dropout in training.
 
         Args:
             x_t: (B, F, D) noisy motion.

@@ -11,7 +11,7 @@ from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
 class MDMGRU(Denoiser):
     """GRU over the frames. Time + condition is concatenated to each frame.
 
-    It runs forward in time, so padding at the end does not affect real frames.
+    The network runs forward in time, so padding at the end does not affect real frames.
 
     Args:
         in_features: D.

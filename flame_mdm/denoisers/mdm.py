@@ -168,7 +168,8 @@ class MDMDecoder(Denoiser):
         self.condition_frames = condition_frames
         if memory == "concat" and not token_memory:
             raise UserError(
-                "denoiser.memory=concat: a token of the time needs other tokens beside it. Set token_memory=true"
+                "denoiser.memory=concat: the token of the time is added to the condition tokens, "
+                "which are not in the memory. Set token_memory=true"
             )
         if type(context_frames) is not int or context_frames < 0:
             raise UserError(

@@ -34,7 +34,7 @@ class TargetEncoder(nn.Module, ABC):
         """Embeds targets (B, 8, 4) as (B, features)."""
 
     def forward(self, cond: Condition) -> Tensor:
-        """Embeds the target of a condition. Samples without target get 0."""
+        """Embeds the target of a condition. The embedding of a sample without a target is 0."""
         if cond.target is None:
             return cond.pooled.new_zeros(len(cond.pooled), 1)
         embedding = self.embed(cond.target)

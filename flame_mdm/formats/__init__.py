@@ -88,7 +88,7 @@ def _is_motion(file: Path, folder: Path) -> bool:
 def _has_joints(file: Path) -> bool:
     """Returns whether a JSON file has an array of joints.
 
-    It is also true for a file that cannot be read: its reader reports the fault.
+    Also returns True for a file that cannot be read: its reader reports the fault.
     """
     tail = b""
     try:

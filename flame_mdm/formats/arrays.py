@@ -96,7 +96,7 @@ def is_real(values: np.ndarray) -> bool:
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
     """Returns the motion of AMASS arrays, resampled to `fps` if given.
 
-    It is the translation (F, 3) and quaternions (F, 24, 4), float64.
+    The motion consists of the translation (F, 3) and quaternions (F, 24, 4), float64.
     """
     poses = data["poses"]
     frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)

@@ -30,8 +30,8 @@ _POSITIONS, _ROTATIONS = CHANNELS[:3], CHANNELS[:2:-1]
 class Bone(NamedTuple):
     """A bone.
 
-    It is the vector (3,) from its start to its end, the axes C as a rotation, and the degrees of
-    freedom in the order of the file.
+    The fields are the vector (3,) from the start of the bone to its end, the axes C as a
+    rotation, and the degrees of freedom in the order of the file.
     """
 
     vector: np.ndarray
@@ -85,7 +85,8 @@ def read(path: Path, fps: float | None) -> Bvh:
 def skeleton_of(path: Path) -> Path:
     """Returns the ASF file of an AMC file, in the same folder.
 
-    It has the name of the AMC file or of its subject (02.asf), or is the only ASF file.
+    The ASF file has the name of the AMC file or of its subject (02.asf), or is the only one in
+    the folder.
 
     Raises:
         UserError: If there is no such file.

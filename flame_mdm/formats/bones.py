@@ -30,7 +30,7 @@ ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 """Possible directions of the trunk in a rest pose.
 
-Some programs export it with another axis up.
+Some programs export rest poses with another axis up.
 """
 
 
@@ -43,8 +43,8 @@ def bone_poses(
 ) -> BoneRotations:
     """Returns the rotations of SMPL's joints in a file.
 
-    They cannot be used if the rest pose is not known. They can also not be used if they do not
-    move the joints to their positions, as in files that move each joint by position channels.
+    The rotations cannot be used if the rest pose is not known, or if they do not move the joints
+    to their positions, as in files that move each joint by position channels.
 
     Args:
         tree: the file.

@@ -71,7 +71,7 @@ class Bvh:
     def translations(self) -> np.ndarray:
         """Returns the position (F, J, 3) of each joint in its parent's frame.
 
-        It comes from the position channels or the offset.
+        The position comes from the position channels or the offset.
         """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):

@@ -63,7 +63,7 @@ def read(path: str | Path) -> Character | BvhCharacter:
 def _read_bvh(path: Path) -> BvhCharacter:
     """Reads the skeleton of a BVH file.
 
-    Its rest pose is the pose without rotations or, if that is not usable, the first frame.
+    The rest pose is the pose without rotations or, if that is not usable, the first frame.
     """
     file = bvh.read(path)
     joints = identify(
@@ -76,7 +76,8 @@ def _read_bvh(path: Path) -> BvhCharacter:
     if not any(_moves(names) for names in _above(file, joints["pelvis"]).values()):
         name = file.joints[joints["pelvis"]]
         raise UserError(
-            f"{path}: {name} and the joints above it have no position channels. Give them to the root"
+            f"{path}: {name} and the joints above it have no position channels. Add position "
+            "channels to the root"
         )
 
     still = np.tile(np.eye(3), (1, len(file.joints), 1, 1))

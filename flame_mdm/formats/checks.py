@@ -65,8 +65,8 @@ def uprightness(joints: np.ndarray) -> float:
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     """Returns a line if the body lies in most frames, with the axis that would make it stand.
 
-    Returns "" otherwise. `joints` (F, 22, 3) are y up. They were turned by `axes` (3, 3) from the
-    axes of the file. In the file, `up` was the axis that points up.
+    Returns "" otherwise. `joints` (F, 22, 3) are y up. The joints were turned by `axes` (3, 3)
+    from the axes of the file. In the file, `up` was the axis that points up.
     """
     if uprightness(joints) >= LYING:
         return ""

@@ -1,7 +1,7 @@
 """Cleanup of generated motion.
 
-It smooths joints, makes bone lengths constant, keeps feet in place, and moves hands out of the
-body.
+Cleanup smooths joints, makes bone lengths constant, keeps feet in place, and moves hands out of
+the body.
 """
 
 from collections.abc import Sequence
@@ -239,7 +239,8 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
     arm = _arm(skeleton, side)
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
-    aside = unit(motion[:, arm[0]] - motion[:, other])  # a hand near the axis goes to its own side
+    # A hand near the axis goes to its own side
+    aside = unit(motion[:, arm[0]] - motion[:, other])
     # Each pass moves the wrist out of the deepest point. The shift rises and fades within `CLEAR`
     # seconds, so the hand avoids the body and does not jump out of it.
     for _ in range(4):

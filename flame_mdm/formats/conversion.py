@@ -23,7 +23,7 @@ It is its own inverse.
 """
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
-"""SMPL joint at the same point of the body, by KIT-ML joint; only joints with different names."""
+"""SMPL joint at the same point of the body, for KIT-ML joints with other names."""
 LEGS = tuple(
     SMPL22.joints.index(f"{side}_{name}")
     for side in ("left", "right")
@@ -39,7 +39,8 @@ class RawMotion:
         values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in
             `representations.smpl.read_pose`.
         note: a line for the user if a body with other proportions was used, with the error; ""
-            otherwise. It says whether the rotations come from the file or were fitted to joints.
+            otherwise. The line says whether the rotations come from the file or were fitted to
+            joints.
         error: mean distance in meters between the joints of this body and of the motion.
     """
 
@@ -127,7 +128,7 @@ def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
     """Puts a motion on the body of an adult. The path is scaled by the length of the legs.
 
     Args:
-        body: the motion, with its own bones.
+        body: the motion on the bones of its own body.
         joints: (F, 22, 3), its joints in meters.
 
     Returns:

@@ -9,8 +9,8 @@ from scipy.ndimage import binary_opening
 
 from flame_mdm.formats.motion import Motion
 
-# Height in meters above the floor, y = 0, below which a toe joint touches it. It is also used for
-# foot skating.
+# Height in meters above the floor, y = 0, below which a toe joint touches it. Foot skating uses
+# the same height.
 LOW = 0.05
 # A body in the air whose root is slower than this, in m/s, floats and does not jump. A jump is
 # also slower at its top, but only for 0.04 s.
@@ -49,7 +49,7 @@ LIMITS = {
     ),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
-"""By fault: its limit, the unit of the limit, and a description.
+"""For each fault: its limit, the unit of the limit, and a description.
 
 docs/motion-faults.md reports the share of real clips with each fault.
 """
@@ -197,9 +197,9 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures how deep an arm is in the body, which consists of capsules.
+    """Measures how deep an arm is in the body.
 
-    Trunk and thighs are capsules whose sizes follow from the bones.
+    The body consists of capsules for the trunk and the thighs, whose sizes follow from the bones.
 
     Args:
         joints: (F, J, 3) in meters.
@@ -237,7 +237,7 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns vectors (F, P, 3) from a segment to points (F, P, 3).
 
-    They start at the nearest point of the segment, whose ends are (F, 3).
+    Each vector starts at the nearest point of the segment, whose ends are (F, 3).
     """
     axis, points = (end - start)[:, None], points - start[:, None]
     share = (points * axis).sum(-1, keepdims=True) / np.maximum(

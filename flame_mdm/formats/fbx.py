@@ -58,7 +58,7 @@ ARRAYS = {
 }
 DEFLATED = 128  # arrays of this many bytes or more are compressed
 
-# Constants at the end of each file. They are equal in all files without a password.
+# Constants at the end of each file. All files without a password have the same constants.
 FOOTER_ID = bytes.fromhex("fabcab09d0c8d466b176fb831cf7267e")
 FOOTER_END = bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
 

@@ -345,7 +345,10 @@ def _is_object(record: fbx.Record) -> bool:
 
 
 def _name(record: fbx.Record) -> str:
-    """Returns the name of an object. It is stored together with the class of the object."""
+    """Returns the name of an object.
+
+    The file stores the name together with the class of the object.
+    """
     name = record.properties[1]
     return str(name).partition("\x00")[0] or record.name
 

@@ -76,8 +76,8 @@ class Clip:
 class Cycle:
     """A cycle of a gait in a motion.
 
-    It is its first frame, the frame with the same pose one cycle later, and the difference of
-    both poses.
+    The fields are the first frame, the frame with the same pose one cycle later, and the
+    difference between both poses.
     """
 
     first: int

@@ -231,7 +231,9 @@ def read(path: Path) -> Glb:
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False, include_input=False)[0]
             reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise UserError(f"{path}: damaged, or not glTF 2.0 in one file: {reason}") from error
+        raise UserError(
+            f"{path} is damaged, or is not a single glTF 2.0 file (.glb): {reason}"
+        ) from error
     names = tuple(parts.nodes[number].name or f"node {number}" for number in order)
     for name in ("buffers", "bufferViews", "accessors"):
         document.setdefault(name, [])

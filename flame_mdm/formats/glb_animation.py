@@ -166,7 +166,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
         location = ".".join(map(str, first["loc"]))
         raise UserError(f"{path}: an animation is damaged: {location}: {first['msg']}") from error
     except (ValueError, OverflowError) as error:
-        raise UserError(f"{path}: damaged: {error}") from error
+        raise UserError(f"{path} is damaged: {error}") from error
 
 
 def animations(path: Path) -> list[str]:
@@ -281,8 +281,8 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
 def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     """Returns the frame rate.
 
-    It is the rate that the writer stored in `asset.extras.fps`, or follows from the distance of
-    keys.
+    The frame rate is the rate that the writer stored in `asset.extras.fps`, or follows from the
+    distance of keys.
     """
     # glTF has keys, but no frame rate. In a sampled animation, the median distance of keys gives
     # the frame rate. Times have single precision, so the rate is rounded to a nearly equal whole

@@ -217,9 +217,9 @@ def planted(
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
     """Returns how much (F,) the hip of a leg is too high for a foot moved by `shift` (F, 3)."""
-    # The hip may be anywhere in a sphere around the ankle. Its radius is the straight leg, or the
-    # leg in the motion if it is longer. `highest` is the height of the sphere above the hip's
-    # position on the floor.
+    # The hip may be anywhere in a sphere around the ankle. Its radius is the length of the
+    # straight leg, or the distance from hip to ankle in the motion if that is longer. `highest`
+    # is the height of the sphere above the hip's position on the floor.
     hip, knee, ankle = (world[:, joint] for joint in leg[:3])
     length = np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1)
     reach = np.maximum(REACH * length, np.linalg.norm(ankle - hip, axis=1))
@@ -233,12 +233,12 @@ def _shift(
 ) -> np.ndarray:
     """Returns the movement (F, 3) of a toe (F, 3) over the floor.
 
-    It changes smoothly from each contact to the next.
+    The movement changes smoothly from each contact to the next.
     """
     # Within a contact, the shift brings the toe to its mean position, or to the position in a
     # fixed pose. Between contacts, one shift changes into the next. If a contact begins or ends
-    # fewer than `near` frames from a fixed pose, there is no time to move the toe. It stays where
-    # it is in that frame.
+    # fewer than `near` frames from a fixed pose, there is no time to move the toe. The toe then
+    # stays where it is in that pose.
     last = len(toe) - 1
     floor = np.array([1.0, 0.0, 1.0])
     frames, shifts = [], []
@@ -300,7 +300,10 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 
 
 def planted_loop(motion: GroundedMotion) -> GroundedMotion:
-    """Returns a loop with planted toes. It is still a loop: the last pose is the first one."""
+    """Returns a loop with planted toes.
+
+    The result is still a loop: its last pose is its first one.
+    """
     # Contacts are cut at the ends of a single cycle. Therefore several cycles in a row are
     # planted. The middle one is kept, because its neighbors are cycles, too.
     count = len(motion) - 1

@@ -21,7 +21,7 @@ from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
 from flame_mdm.safe_io import read_yaml, regular_file
 
-# By axis that points up: rows of the rotation that maps the axis to +y
+# For each axis that may point up, the rows of the rotation that maps it to +y
 UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
@@ -107,7 +107,7 @@ class Layout(BaseModel):
     def bone(self, joint: str) -> str:
         """Returns the joint of files that turns like a joint of SMPL.
 
-        It is the bone of the joint, or the joint with the largest weight in its position.
+        The result is the bone of the joint, or the joint with the largest weight in its position.
         """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
@@ -257,7 +257,7 @@ def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Seque
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns layout and joint names of an array (F, J, 3).
 
-    They come from `fields`, or from the number of joints.
+    Both come from `fields`, or from the number of joints.
     """
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"joints have shape {joints.shape}, not (frames, joints, 3)")
@@ -454,7 +454,8 @@ def check_feet(joints: np.ndarray) -> None:
             )
     # The toes of a foot in the air may point backwards, for example in a run. Therefore only the
     # lower foot of each frame counts. The toes of one foot of a kneeling person point backwards,
-    # too. Therefore both feet must point backwards in a fraction of the frames.
+    # too. Therefore, left and right count as exchanged only if both feet point backwards in
+    # enough frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [
         ((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")

@@ -232,8 +232,8 @@ class Motion(PosedFigure):
     def show(self) -> Any:
         """Returns a player.
 
-        In a Jupyter notebook, it is a display; otherwise, it is the path of a page for any
-        browser.
+        In a Jupyter notebook, the player is displayed; otherwise, the path of a page for any
+        browser is returned.
         """
         from flame_mdm.visualize import player_page
 
@@ -252,7 +252,7 @@ class Motion(PosedFigure):
 def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Returns axis-angle vectors (F, 66) of 22 joints and the translation (F, 3).
 
-    They are in AMASS's coordinates: meters, z up.
+    Both are in AMASS's coordinates: meters, z up.
     """
     world = poses.rotations.clone()
     world[:, 0] = AMASS_AXES @ world[:, 0]
@@ -363,8 +363,8 @@ def _write_rigged(
 def _write_character(motion: Motion, path: Path, character: Character | BvhCharacter) -> str:
     """Writes a character's motion.
 
-    A .glb or .bvh file keeps the skeleton of the character's file. It can also be an .fbx or USD
-    file.
+    A .glb or .bvh file keeps the skeleton of the character's file. The motion of a .glb character
+    can also be written as an .fbx or USD file.
     """
     name = motion.text or motion.id or "motion"
     ending = path.suffix.lower()
@@ -413,7 +413,8 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     return summary + (reason and f"; without a body: {reason}")
 
 
-# In millimeters. Above this error, the line about a file names the joint.
+# In millimeters. The message about a written file names the joint with the largest error if it
+# exceeds this.
 LARGE_ERROR = 10
 
 

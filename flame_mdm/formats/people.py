@@ -3,7 +3,7 @@
 Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
 Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp., Apache-2.0.
 Its shapes and weights come from MakeHuman and MPFB2, CC0. Anny can also download topologies of
-SMPL and SMPL-X, which are not free for commercial use. They are never built here.
+SMPL and SMPL-X, which are not free for commercial use. This project never builds them.
 """
 
 import os
@@ -33,7 +33,8 @@ from flame_mdm.visualize.body import (
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's numbers and their defaults, from 0 to 1.
 
-They mean male to female, baby to old (2/3: a young adult), small to tall, light to heavy.
+From 0 to 1, they mean male to female, baby to old (2/3: a young adult), small to tall, and light
+to heavy.
 """
 PARTS = {
     "spine1": "spine04 spine03",
@@ -50,7 +51,7 @@ PARTS = {
     "ankle": "foot",
     "foot": "toe",
 }
-"""By joint of SMPL: prefixes of the names of Anny's bones that follow it.
+"""For each joint of SMPL, prefixes of the names of Anny's bones that follow it.
 
 Others follow the pelvis.
 """
@@ -61,7 +62,7 @@ HEADS = {
     "foot": "toe2-1",
     "shoulder": "upperarm01",
 } | {**{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}}
-"""By joint of SMPL: the bone of Anny that begins there."""
+"""For each joint of SMPL, the bone of Anny that begins there."""
 CLOTHES = {
     "neck": SKIN,
     "head": SKIN,

@@ -40,7 +40,8 @@ dominates.
 FOOT = 0.3
 # Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
 SMOOTH = 0.1
-# Number of squarings. They give the power 4,096, in which only the largest eigenvector remains.
+# Number of squarings. The result is the power 4,096, in which only the largest eigenvector
+# remains.
 SQUARINGS = 12
 
 
@@ -99,9 +100,9 @@ class BoneRotations:
 def solve(joints: Tensor, fps: float) -> Poses:
     """Computes a body and its rotations, which reproduce joint positions in every frame.
 
-    Bones get their mean length over the clip. Pelvis and chest have three bones each. They are
-    rotated for the best fit of all three bones (Kabsch 1976). Every other joint aims its bone at
-    the next joint.
+    Bones get their mean length over the clip. Pelvis and chest have three bones each, and get the
+    rotation that fits all three best (Kabsch 1976). Every other joint aims its bone at the next
+    joint.
 
     Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
     twisted so that knees and elbows bend like hinges. The spine twists evenly from pelvis to
@@ -133,8 +134,8 @@ def solve(joints: Tensor, fps: float) -> Poses:
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
     """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve`, without checks.
 
-    They have the precision of the joints. The function has no data-dependent branches and solves
-    similar joints in one batch, so that its ONNX graph is small.
+    Both results have the precision of the joints. The function has no data-dependent branches and
+    solves similar joints in one batch, so that its ONNX graph is small.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
@@ -190,8 +191,9 @@ def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
 
-    They are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute orientation using
-    unit quaternions"), computed by repeated squaring. Bones without length give the identity.
+    The quaternions are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute
+    orientation using unit quaternions"), computed by repeated squaring. Bones without length give
+    the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
     # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. ONNX has

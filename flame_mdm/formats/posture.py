@@ -13,8 +13,8 @@ STANDING = 0.02  # maximum height in meters of a flat foot above its lowest posi
 TOES = (0.02, 0.09, np.radians(60))
 """Limits for the bend of toes.
 
-They are the height of the toe joint below which toes stay flat, the height above which they
-follow the foot, and the maximum bend.
+Toes stay flat while the toe joint is below the first height, and follow the foot above the second
+height. The third number is the maximum bend.
 """
 
 
@@ -68,7 +68,7 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Returns axes as rows (3, 3).
 
-    They are the direction, then `u` made orthogonal to it, then the third axis.
+    The rows are the direction, then `u` made orthogonal to it, then the third axis.
     """
     along = direction / np.linalg.norm(direction)
     across = u - (u @ along) * along

@@ -51,7 +51,7 @@ ROTATED = {
     "motion272": 272,
 }
 BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAMERA_AXES}
-"""By axis that points up in a file of SMPL's rotations: the rotation to y up.
+"""For each axis that may point up in a file of SMPL's rotations, the rotation to y up.
 
 As in AMASS, the default is z.
 """
@@ -62,7 +62,9 @@ A body is there at translation 0, for any rotation.
 """
 
 Standard = Callable[[Bvh], tuple[Bvh, Mapping[str, Any]]]
-"""A change of the tree of a published data set. It returns the tree and fields of `Layout`.
+"""A change of the tree of a published data set.
+
+The function returns the tree and fields of `Layout`.
 
 Without fields, the file determines the layout.
 """
@@ -73,8 +75,8 @@ class Doubts:
     """Findings that look wrong in a motion, but may be intended.
 
     Attributes:
-        upright: mean vertical component of the direction of the trunk, -1 to 1. It is NaN (not
-            measured) for files of this project and for KIT-ML's skeleton.
+        upright: mean vertical component of the direction of the trunk, -1 to 1. The value is NaN
+            (not measured) for files of this project and for KIT-ML's skeleton.
         lying: a line if the body lies, "" otherwise.
         jump: a line if the body jumps or a leg flips, "" otherwise.
     """
@@ -94,7 +96,7 @@ class Recording:
     """A motion that was read from a file, with findings of the reader.
 
     Attributes:
-        motion: the motion. Its notes are lines for the user.
+        motion: the motion. The notes of the motion are lines for the user.
         layout: skeleton, unit and frame rate of the file, as `prepare` lists them.
         doubts: findings that look wrong. Their lines are among the notes of the motion.
         smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes; None
@@ -120,8 +122,9 @@ def read(
 ) -> Motion:
     """Reads a motion file.
 
-    It can be an `.npz` file of this project, of AMASS or with joints and fps, a `.bvh` file, an
-    animation in an `.fbx`, `.glb`, `.vrm` or `.vrma` file, or an `.amc`, `.json` or `.npy` file.
+    The file can be an `.npz` file of this project, of AMASS or with joints and fps, a `.bvh`
+    file, an animation in an `.fbx`, `.glb`, `.vrm` or `.vrma` file, or an `.amc`, `.json` or
+    `.npy` file.
 
     Args:
         path: the file. The nearest `skeleton.yaml` in its folder or above describes it, except
@@ -142,7 +145,7 @@ def read(
     Raises:
         FileNotFoundError: If there is no such file.
         UserError: If the file is damaged or of another kind, has no rate, or is not of a person's
-            size. Also if an argument has no effect on it.
+            size. Also if an argument has no effect on the file.
 
     Example:
         >>> walk = read("walk.bvh", resample_to=20)
@@ -392,7 +395,7 @@ def _of_ours(
 ) -> Recording:
     """Returns the recording of a file that this project wrote.
 
-    It is in meters, y up, with rotations and features.
+    The motion is in meters, y up, with rotations and features.
     """
     for key, value in said.items():
         raise UserError(
@@ -422,7 +425,7 @@ def _of_ours(
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
     """Returns the frame rate of arrays.
 
-    It comes from the command, the file, or skeleton.yaml, in this order.
+    The rate comes from the command, the file, or skeleton.yaml, in this order.
     """
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
@@ -527,7 +530,8 @@ def _poses(data: dict[str, Any]) -> Poses | None:
             raise UserError(
                 f"{len(data['poses'])} frames of poses, but {len(data['joints'])} frames of joints"
             )
-        translation, turns = smpl_motion(data)  # it does not contain the template's pelvis
+        # This translation does not include the pelvis of SMPL's template
+        translation, turns = smpl_motion(data)
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))
     if "features" not in data or representation not in ROTATED:

@@ -6,7 +6,7 @@ from pathlib import Path
 from flame_mdm.safe_io import read_yaml
 
 AT_60: frozenset[str] = frozenset(read_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"])
-"""Subjects and single recordings of CMU at 60 frames per second."""
+"""Subjects and single recordings that CMU recorded at 60 frames per second."""
 # Skeletons of CMU's recordings and their conversions
 CMU_SKELETONS = (
     "CMU",

@@ -1,6 +1,6 @@
 """Frame rates, lengths and resampling of motions.
 
-They are limited, because a file of a few bytes can declare any value.
+Rates and lengths are limited, because a file of a few bytes can declare any value.
 """
 
 import math

@@ -132,9 +132,9 @@ class Rig:
 def recognized(
     names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]
 ) -> dict[str, list[int]]:
-    """Returns the numbers of the joints for each joint of SMPL.
+    """Returns, for each joint of SMPL, the numbers of the joints that may correspond to it.
 
-    The most similar skeleton determines them.
+    The correspondence comes from the most similar known skeleton.
 
     Args:
         names: names of the joints by number.

@@ -55,7 +55,7 @@ class Process(nn.Module, ABC):
     def out_features(self, features: int) -> int:
         """Returns the number of output channels of the denoiser for `features` D.
 
-        It is D, or 2D with a learned variance.
+        The number is D, or 2D with a learned variance.
         """
 
     @abstractmethod
@@ -66,7 +66,7 @@ class Process(nn.Module, ABC):
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """Returns the noisy motion x_t (B, F, D) at times t (B,).
 
-        It is computed from the clean motion `x` and `noise` (B, F, D).
+        The noisy motion is computed from the clean motion `x` and `noise` (B, F, D).
         """
 
     @abstractmethod

@@ -41,7 +41,7 @@ class GaussianDiffusion(Process):
             the padding.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
         timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
-        skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the
+        skip: requires prediction epsilon. The noise is sqrt(1 - ab) x_t + sqrt(ab) times the
             output (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a
             velocity, trained with the error of the noise. The network need not pass its input
             through, and computing the clean estimate needs no division by the signal.
@@ -142,7 +142,7 @@ class GaussianDiffusion(Process):
     ) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`.
 
-        It is a number, (B, 1, 1), or (B, F, D) if it is learned.
+        A fixed log-variance is a number or (B, 1, 1); a learned one is (B, F, D).
         """
         # The logarithm of a learned variance is interpolated between its two bounds.
         small = schedule.factor("posterior_log_variance", i, x_t)

@@ -16,8 +16,8 @@ class FlowMatching(Process):
     """Straight path from noise at t = 0 to motion at t = 1, the process of MFM.
 
     Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser predicts the velocity of the path or
-    the clean motion. It gets the time 1000 t. With s = `sigma_min`, x_t = t x + (1 - (1 - s) t)
-    noise, and the velocity is x - (1 - s) noise.
+    the clean motion. The denoiser gets the time 1000 t. With s = `sigma_min`, x_t = t x + (1 - (1
+    - s) t) noise, and the velocity is x - (1 - s) noise.
 
     Args:
         sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
@@ -126,12 +126,13 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. It takes N >= 1 equal steps; "dopri5" chooses its own steps.
+        """See `Process.sample`. A flow takes N >= 1 equal steps; "dopri5" chooses its own steps.
 
         Only "consistency" adds noise. An edit of mode "trajectory" acts before each step at a
         time <= `until`. The straight path from the noise of the kept part to the known motion
-        then replaces the kept part (MFM, algorithm 1). Afterward, the model moves it freely. Mode
-        "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly.
+        then replaces the kept part (MFM, algorithm 1). After this time, the model changes the
+        kept part freely. Mode "x0" overwrites the clean estimate of every call, which reproduces
+        the kept part exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):

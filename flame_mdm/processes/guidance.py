@@ -19,9 +19,9 @@ If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noi
 training. In one trial, arms became longer by a third.
 """
 CLOSE, MOST_STEPS = 0.005, 8
-"""The search for a motion that reaches positions ends below this error, in meters.
+"""Limits of the search for a motion that reaches positions.
 
-The second number is the maximum number of steps of the search.
+It ends when the error is below `CLOSE` meters, or after `MOST_STEPS` steps.
 """
 RELAXATION = 1e-3
 """Variance of the error that may remain, relative to the variance of the position.
@@ -40,8 +40,8 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
         denoise: the denoiser; its condition must have a null.
         scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise`
             itself is returned.
-        features: D. Channels from D on contain a learned variance. They are not guided, but come
-            from the conditional half.
+        features: D. Channels from D on contain a learned variance. These channels are not guided,
+            but come from the conditional half.
 
     Returns:
         A function with the arguments and the result of `denoise`.
@@ -157,8 +157,8 @@ def reach(
         smoothness: standard deviation of the Gaussian process, in frames.
 
     Returns:
-        Normalized motions (B, F, D). Their error is at most `CLOSE` meters, unless `MOST_STEPS`
-        steps are not enough.
+        Normalized motions (B, F, D). The error of the positions is at most `CLOSE` meters, unless
+        `MOST_STEPS` steps are not enough.
     """
     # The prior's covariance K between frames is a Gaussian kernel. With the Jacobian A of the
     # constraints and their error e, the smallest change is K A^T (A K A^T)^-1 e. Below, `smooth`

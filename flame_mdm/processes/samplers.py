@@ -37,12 +37,12 @@ class Sampler:
     #: Takes one step. In a diffusion: (x_t, `Descent`, step i) -> x_{t-1}. In a flow: (x, `Flow`,
     #: time, next time) -> x at the next time.
     step: Callable[..., Tensor]
-    #: Fields of `SamplerOptions` that it uses, besides guidance_scale, sampler and
+    #: Fields of `SamplerOptions` that the sampler uses, besides guidance_scale, sampler and
     #: num_inference_steps.
     options: tuple[str, ...] = ()
-    #: Edits that it does not support: modes of `Edit`, or "resample".
+    #: Edits that the sampler does not support: modes of `Edit`, or "resample".
     unsupported: tuple[str, ...] = ()
-    #: Whether it chooses its own steps. One call then goes from noise to motion.
+    #: Whether the sampler chooses its own steps. One call then goes from noise to motion.
     adaptive: bool = False
 
 

@@ -35,8 +35,8 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns the noise variances (T,) float64 of Ho et al. 2020, section 4.
 
-    They are 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T, so that the final
-    noise is the same, as in guided-diffusion. They are clipped at 0.999.
+    The variances rise from 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T, so
+    that the final noise is the same, as in guided-diffusion. All variances are clipped at 0.999.
 
     Example:
         >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]
@@ -71,9 +71,9 @@ def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
 class Schedule:
     """Coefficients of a Gaussian diffusion, by step i = 0 (least noise) to N - 1.
 
-    Tables are float64 on the CPU and rounded once, when they are used. They are not buffers:
-    casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020, eq. 4
-    and 7.
+    Tables are float64 on the CPU and rounded once, when they are used. The tables are not
+    buffers: casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al.
+    2020, eq. 4 and 7.
 
     Args:
         betas: (N,) float64, variances of the noise that each step adds.
@@ -120,7 +120,7 @@ class Schedule:
     def at(self, name: str, i: Tensor, x: Tensor) -> Tensor:
         """Returns a coefficient (B, 1, 1) at steps i (B,), on the device of x.
 
-        It has the precision of x, but at least float32.
+        The coefficient has the precision of x, but at least float32.
         """
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
         if key not in self._moved:

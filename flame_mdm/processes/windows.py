@@ -19,7 +19,7 @@ from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 class Windows:
     """W windows of at most L frames that cover B motions."""
 
-    #: Conditions and masks (W, L) of the windows. Its `x` has no features.
+    #: Conditions and masks (W, L) of the windows. The `x` of this batch has no features.
     batch: MotionBatch
     #: (W,) int64, the index of each window's motion.
     rows: Tensor

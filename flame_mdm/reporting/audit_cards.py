@@ -39,8 +39,10 @@ class Seen:
     grade: float | None
     # values are outside the 95 % interval of real motions at this and all stronger grades
     outside: float | None
-    rewarded: bool  # whether the strongest grade is rated better than real motions
-    monotone: bool  # whether every stronger grade differs at least as much, within its interval
+    # Whether the strongest grade is rated better than real motions
+    rewarded: bool
+    # Whether every stronger grade differs at least as much, within its interval
+    monotone: bool
 
 
 def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> Seen | None:

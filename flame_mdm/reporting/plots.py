@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
-ROW = 16  # height of a line of text
+# Height of a line of text
+ROW = 16
 # Maximum number of segments per curve. The lowest and the highest point of each segment are
 # drawn.
 MOST = 300

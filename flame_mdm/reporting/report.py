@@ -101,8 +101,8 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     """Groups curves into charts, by heading.
 
-    The curves of a heading are grouped by the rest of their name (`loss`); the families with this
-    name (`train`, `val`) share a chart.
+    Below a heading, curves whose names differ only in their family (`train/loss`, `val/loss`)
+    share a chart.
     """
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {

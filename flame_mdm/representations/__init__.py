@@ -17,7 +17,7 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set. They can be read in parts, any number of times."""
+    """The frames (N, D) of a data set. The frames can be read in parts, any number of times."""
 
     # Returns arrays (F, D) of any length, in the same order each time
     arrays: Callable[[], Iterable[np.ndarray]]
@@ -75,7 +75,8 @@ class Representation(nn.Module, ABC):
     mean: Tensor
     #: (D,) standard deviation of the features.
     std: Tensor
-    #: Name of a representation that begins with these features, so that its features can be cut.
+    #: Name of a longer representation that begins with these features, so that its features can
+    #: be cut to these.
     part_of: str = ""
     #: Whether the root moves by steps between frames. Any window of frames is then a motion.
     relative: bool = True
@@ -185,8 +186,8 @@ SMALLEST_STD = 1e-4
 def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tuple[Tensor, Tensor]:
     """Returns the mean (D,) of each feature, and the std averaged over each group of features.
 
-    `features` are frames (N, D). A group is constant if its std is below `SMALLEST_STD`. It gets
-    std 1, so that rounding errors are not amplified.
+    `features` are frames (N, D). A group is constant if its std is below `SMALLEST_STD`. The std
+    of a constant group is set to 1, so that rounding errors are not amplified.
     """
     mean, squares = moments(features)
     std = (squares / len(features)).sqrt()

@@ -16,7 +16,7 @@ from flame_mdm.representations.skeleton import SKELETONS
 LEGACY_SMOOTHING_FRAMES, SMOOTHING_SECONDS = 20, 1.0
 """Standard deviation of the Gaussian that removes arm swing from the heading.
 
-It is 20 frames at 20 fps, as published.
+The published value is 20 frames at 20 fps.
 """
 
 
@@ -48,10 +48,10 @@ class HumanML(Representation):
     also at the shoulders. `decode` is the published decoding. If a bone is exactly opposite to
     its rest direction, the published code gives NaN; here, the rotation is a half turn.
 
-    The variant "clean" has none of these. Headings are unwrapped before smoothing. They are
-    padded point-symmetrically at both ends, which preserves the first and the last heading and
-    steady turns. Rotations are computed after the body is turned to +z, and are relative to the
-    parent in the skeleton.
+    The variant "clean" has none of these. Headings are unwrapped before smoothing. Before
+    smoothing, headings are padded point-symmetrically at both ends, which preserves steady turns
+    and the first and last heading. Rotations are computed after the body is turned to +z, and are
+    relative to the parent in the skeleton.
 
     Input and output joints are in meters. Features are in units of 1 / `units_per_metre` meters
     (KIT: 1/640).
@@ -227,8 +227,8 @@ class HumanML(Representation):
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns x and z (N, 2) of the direction that hips and shoulders face.
 
-        It is the cross product of the vertical and the direction to the right. It is shorter if
-        the body lies on its side. `hips` is the weight of the hips.
+        The direction is the cross product of the vertical and the direction to the right, and is
+        shorter if the body lies on its side. `hips` is the weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[
             :, list(self.skeleton.facing)

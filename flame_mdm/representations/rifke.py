@@ -15,7 +15,7 @@ KNEES_AND_ELBOWS = [
 ]
 """Joints that the published code uses as hips and shoulders.
 
-It applies their indices after removing the root.
+The code applies the indices of hips and shoulders after it has removed the root.
 """
 
 
@@ -87,7 +87,7 @@ class Rifke(Representation):
     def floor(self, joints: Tensor) -> Tensor:
         """Returns the floor height of joints (T, 21, 3) in KIT's unit.
 
-        It is a soft minimum over time of the height of the lowest foot.
+        The floor is a soft minimum over time of the height of the lowest foot.
         """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()

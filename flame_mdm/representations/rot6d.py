@@ -15,9 +15,9 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 class Rot6D(Representation):
     """25 x 6 features of Petrovich et al. 2021 (ACTOR), not normalized.
 
-    They are 24 rotations as 6D rows, then (x, y, z, 0, 0, 0). (x, y, z) is the root's translation
-    relative to the first frame, in camera coordinates: meters, y down, z away from the camera.
-    `smpl.read_pose` describes raw motions.
+    The features are 24 rotations as 6D rows, then (x, y, z, 0, 0, 0). (x, y, z) is the root's
+    translation relative to the first frame, in camera coordinates: meters, y down, z away from
+    the camera. `smpl.read_pose` describes raw motions.
 
     Args:
         fps: frames per second.

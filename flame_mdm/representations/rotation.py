@@ -104,7 +104,8 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 def is_degenerate(rot6d: Tensor) -> Tensor:
     """Returns (...,) bool: whether a pair of vectors (..., 6) defines no rotation.
 
-    One vector is 0, or both are parallel. `rot6d_to_matrix` completes such pairs.
+    This is the case if one vector is 0, or if both are parallel. `rot6d_to_matrix` completes such
+    pairs.
     """
     return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
 
@@ -112,7 +113,8 @@ def is_degenerate(rot6d: Tensor) -> Tensor:
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
     """Returns two orthogonal vectors from (..., 6).
 
-    They are the first vector, normalized, and the part of the second one perpendicular to it.
+    The results are the first vector, normalized, and the part of the second vector that is
+    perpendicular to it.
     """
     first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
     return first, second - (first * second).sum(-1, keepdim=True) * first
@@ -224,7 +226,7 @@ def _scaled(vectors: Tensor) -> Tensor:
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the shortest rotation from the directions of `a` (..., 3) to those of `b` (..., 3).
+    """Returns the shortest rotation from the directions of `a` (..., 3) to the directions of `b`.
 
     The quaternions (..., 4) have w >= 0. For opposite directions, the result is a half turn about
     a perpendicular axis. If a vector is 0, the result is the identity.

@@ -28,7 +28,7 @@ class Skeleton:
     joints: tuple[str, ...]
     # Parent of each joint, -1 for the root
     parents: tuple[int, ...]
-    # Paths of HumanML3D's inverse kinematics
+    # Kinematic chains of HumanML3D's inverse kinematics
     chains: tuple[tuple[int, ...], ...]
     # (J, 3), rest direction of the bone that ends in each joint, of unit length; 0 for the root.
     # From HumanML3D's `paramUtil.py`.

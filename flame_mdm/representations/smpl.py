@@ -27,7 +27,7 @@ rounded and symmetric.
 
 
 AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
-"""Number of joints by numbers per frame of their axis-angle vectors.
+"""Number of joints by the size of a frame of axis-angle vectors.
 
 The kinds are the body alone, SMPL, SMPL+H and SMPL-X.
 """
@@ -57,8 +57,8 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """147 features of Kim et al. 2023 (FLAME), not normalized.
 
-    They are the translation (3), then 24 rotations as 6D rows, in world coordinates as in AMASS:
-    meters, z up, neither centered nor rotated. `read_pose` describes raw motions.
+    The features are the translation (3), then 24 rotations as 6D rows, in world coordinates as in
+    AMASS: meters, z up, neither centered nor rotated. `read_pose` describes raw motions.
 
     Args:
         fps: frames per second.

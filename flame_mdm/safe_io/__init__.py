@@ -1,9 +1,9 @@
 """Atomic writes, hashes, locks, and safe reading of files from other people.
 
-A file that may come from other people is read or checked with this module first. It must be a
-regular file of limited size, and the sizes that it declares must match its bytes. Functions that
-read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular
-file or its content is refused.
+A file that may come from other people is read or checked with this module first. The file must be
+a regular file of limited size, and the sizes that it declares must match its bytes. Functions
+that read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a
+regular file or its content is refused.
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ Recipes, skeletons, protocols and table specs are far smaller.
 YAML_NODES = 100_000
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
-"""Total size that the arrays of a compressed file may always have.
+"""The arrays of a compressed file may always have this total size.
 
-Larger arrays may have up to `INFLATION` times the size of the file. Motion data is compressed by
+Above it, they may have at most `INFLATION` times the size of the file. Motion data is compressed
+by
 a factor of less than 10.
 """
 INFLATION = 20
@@ -227,7 +228,8 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
                     say(f"{path}: this file system has no locks ({error.strerror}); {advice}")
             try:
                 if not os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    continue  # another process holds a new lock file
+                    # Another process holds a new lock file
+                    continue
             except FileNotFoundError:  # the previous process has removed the file
                 continue
             with suppress(OSError):  # a full disk
@@ -428,7 +430,7 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
     """Returns the number of elements of an .npy file.
 
-    Its header must match its `size` in bytes.
+    The header of the file must match its `size` in bytes.
     """
     from numpy.lib import format as npy
 
@@ -494,7 +496,7 @@ class _DirectoryReader:
 
     def read(self, size: int = -1) -> bytes:
         if self.limit is not None and size > self.limit:
-            check_members(size)  # an entry has more than one byte
+            check_members(size)  # the directory has as many entries as bytes at most
         return self.file.read(size)
 
 

@@ -71,7 +71,7 @@ def check_tree(folder: Path) -> None:
 def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
-    Writing in place also changes the file under its other names, so links are not followed.
+    Writing in place would also change the file that a link leads to, so links are not followed.
     Raises `UserError` if the path is a link, not a regular file, or a file with a second name
     (hard link).
     """

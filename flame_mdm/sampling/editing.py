@@ -282,7 +282,7 @@ def method_options(
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options of `Edit` and of the sampler.
 
-    They belong to the requested method or, by default, to the method of the process.
+    The options belong to the requested method or, by default, to the method of the process.
     """
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes

@@ -1,7 +1,7 @@
 # pyright: standard
 """Requests for motions and edits.
 
-They are checked without torch, so wrong input fails quickly.
+Requests are checked without torch, so wrong input fails quickly.
 """
 
 from __future__ import annotations
@@ -81,9 +81,11 @@ class EditRequest:
     )
     method: str | None = option(
         None,
-        "mdm overwrites the clean estimate with the kept part (exact); flame replaces the kept part after each step, "
-        "as in the paper (exact); flame_code replaces it before each call of the denoiser, as in FLAME's code; mfm "
-        "overwrites the early part of the flow's path. Default: mdm for diffusion, mfm for flow matching",
+        "how the kept part is imposed: mdm overwrites the clean estimate with the kept part "
+        "(exact); flame replaces the kept part after each step, as in the paper (exact); "
+        "flame_code replaces it before each call of the denoiser, as in FLAME's code; mfm "
+        "overwrites the early part of the flow's path. Default: mdm for diffusion, mfm for flow "
+        "matching",
     )
     until: float | None = option(
         None, "for mfm: last flow time at which the path is overwritten; default: 0.2"
@@ -93,8 +95,8 @@ class EditRequest:
     )
     strength: float | None = option(
         None,
-        "varies the motion: noise is added to it, and this fraction of the sampling steps is taken, above 0 and up to "
-        "1. With a smaller fraction, the result is closer to the motion",
+        "varies the motion: noise is added to it, and this fraction of the sampling steps, above "
+        "0 and up to 1, is taken. A smaller fraction gives a result closer to the motion",
     )
 
     def __post_init__(self) -> None:
@@ -154,12 +156,12 @@ class EditRequest:
 class SamplingRequest:
     """Motions to sample: keywords of `flame_mdm.generate`.
 
-    They are sampled for texts or actions. If neither is given, they are unconditioned.
+    Motions are sampled for texts or actions. If neither is given, they are unconditioned.
 
     A text or action may have several parts with their seconds, "walks forward @3 | turns left |
-    sits down @2". They are generated together as one motion, in overlapping windows; see
+    sits down @2". The parts are generated together as one motion, in overlapping windows; see
     docs/sequences.md. A single part with seconds, "walks forward @10", is also generated in
-    windows. It may be longer than the motions in training.
+    windows. Such a part may be longer than the motions in training.
 
     `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
 
@@ -175,7 +177,9 @@ class SamplingRequest:
         None,
         'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)',
     )
-    actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
+    actions: str | Sequence[str] | None = option(
+        None, "an action label, for models trained on labels"
+    )
     seconds: float | Sequence[float] | None = option(
         None,
         "length of the motion in seconds, or a list with one length per text. In a sequence, the "
@@ -188,8 +192,8 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "number of motions generated for each motion that is kept. Keeps the best motion "
-        "without faults, or the best of all if all have faults",
+        "number of motions generated for each motion that is kept; the best motion without "
+        "faults is kept, or the best of all if all have faults",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(
@@ -198,9 +202,7 @@ class SamplingRequest:
     split: bool = option(
         True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
     )
-    loop: bool = option(
-        False, "true = the last frame leads to the first one, for motions that are repeated"
-    )
+    loop: bool = option(False, "true = generate a loop: the last frame leads to the first one")
     targets: str | Path | Mapping[str, Any] | None = option(
         None, "JSON file with waypoints, joint positions and poses to reach; see docs/targets.md"
     )
@@ -221,7 +223,7 @@ class SamplingRequest:
     def of(
         cls, function: str, keywords: Mapping[str, Any], *, editing: bool = False
     ) -> SamplingRequest:
-        """Returns the request of the keywords of a function, `generate` or `edit`.
+        """Builds a request from the keywords of `generate` or `edit`.
 
         Raises:
             UserError: If a keyword is not a field of this class, of `SamplerOptions` or, with
@@ -330,7 +332,7 @@ class SamplingRequest:
         """Checks a request to edit a motion, or to vary all of it.
 
         Raises:
-            UserError: If the request asks for more than that.
+            UserError: If the request has options for anything else.
         """
         if self.after is not None or (not varies and (self.is_sequence or self.has_targets)):
             advice = (
@@ -419,7 +421,8 @@ def read_parts(text: str) -> list[Part]:
             seconds = math.nan
         if seconds is not None and not 0 < seconds < math.inf:
             raise UserError(
-                f"'{part.strip()}': the seconds of a part are a number above 0, as in 'walks forward @3'"
+                f"'{part.strip()}': the duration of a part must be a number of seconds above 0, "
+                "as in 'walks forward @3'"
             )
         if not words.strip():
             raise UserError(

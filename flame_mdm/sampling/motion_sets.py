@@ -166,7 +166,7 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
 
     Raises:
         UserError: If the model has another skeleton or cannot do what is requested, or if no
-            person stands.
+            candidate shows a standing person.
     """
     if model.representation.skeleton.joints != SMPL22.joints:
         raise UserError(
@@ -362,7 +362,8 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
 def closure(clip: RiggedClip) -> tuple[float, float]:
     """Returns the differences between the first and the last pose of a clip in place.
 
-    They are a distance in meters, and an angle of local rotations in degrees.
+    The first difference is a distance in meters, the second one an angle of local rotations in
+    degrees.
     """
     positions, _ = clip.world()
     distance = float(np.linalg.norm(positions[-1] - positions[0], axis=-1).max())

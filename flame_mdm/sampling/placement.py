@@ -32,8 +32,8 @@ class Placement:
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
         """Returns the placement that moves poses `local` (B, J, 3) to `world` (B, J, 3).
 
-        It has the least squared error. Heights are not changed. For equal poses, the error is 0
-        (Kabsch 1976, for a rotation about one axis).
+        The placement has the least squared error. Heights are not changed. For equal poses, the
+        error is 0 (Kabsch 1976, for a rotation about one axis).
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])

@@ -218,7 +218,7 @@ def _read(
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
     """Returns warnings about prompts.
 
-    They are about prompts that are read differently, and about unknown or unread words.
+    The lines are about prompts that are read differently, and about unknown or unread words.
     """
     lines = []
     for prompt in prompts:

@@ -19,7 +19,7 @@ MAX_SECONDS = 600
 def overlap(model: MotionGenerator) -> int:
     """Returns the number of frames that neighboring windows share.
 
-    It is even, and 0 if the model continues frames.
+    The number is even, and 0 if the model continues frames.
     """
     if model.denoiser.context_frames:
         return 0

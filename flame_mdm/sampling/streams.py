@@ -151,8 +151,8 @@ class Stream(Iterator[Motion]):
         who stands does not move. After the last waypoint, the path no longer bends.
 
         Args:
-            waypoints: x and z in meters in the world, in order. They replace all earlier way
-                points. Empty = no waypoints.
+            waypoints: x and z in meters in the world, in order. They replace all earlier
+                waypoints. Empty = no waypoints.
 
         Raises:
             UserError: If a waypoint is not two finite numbers, or the representation is not
@@ -179,7 +179,10 @@ class Stream(Iterator[Motion]):
             UserError: If the time is not in these blocks, or the stream is cleaned up.
         """
         if self._cleanup is not None:
-            raise UserError("cleanup=true: a block depends on the block after it. Omit cleanup")
+            raise UserError(
+                "cleanup=true: a cleaned block depends on the block after it, so frames cannot "
+                "be dropped. Omit cleanup"
+            )
         self._streams.go_back(round(at * self._streams.model.representation.fps))
 
     def __next__(self) -> Motion:
@@ -248,7 +251,7 @@ class PastBlock(NamedTuple):
 
 
 class Schedule:
-    """The conditions of a stream over its frames."""
+    """The condition of each frame of a stream."""
 
     def __init__(self, condition: str):
         self.changes = [(0, condition)]
@@ -281,7 +284,9 @@ class Schedule:
 
 
 class Streams(Iterator[list[Motion]]):
-    """Several streams that are sampled in one batch. Each is the same as alone, up to rounding.
+    """Several streams that are sampled in one batch.
+
+    Each stream is the same as if it was sampled alone, up to rounding.
 
     Args:
         model: a model that continues frames.
@@ -300,8 +305,9 @@ class Streams(Iterator[list[Motion]]):
         texts: the text as it was typed, by condition; used to name the blocks. A condition
             without an entry is used as its own name.
         frames: number of frames of each stream so far.
-        targets: positions that a single stream reaches. The guidance of sampling leads to them
-            and, if the model was trained with targets, also its own condition. None = no targets.
+        targets: positions that a single stream reaches. Guidance leads the motion to them. If the
+            model was trained with targets, they are also part of its condition. None = no
+            targets.
         waypoints: waypoints along which a single stream without targets is led.
     """
 
@@ -340,12 +346,12 @@ class Streams(Iterator[list[Motion]]):
         self.texts = {condition: condition for condition in conditions}
         self.targets: Targets | None = None
         self.waypoints = Route()
-        self._root = [0.0, 0.0]  # x and z in the world of the first stream's last frame
+        self._root = [0.0, 0.0]  # position (x, z) in the world of the first stream's last frame
         self._encoded: tuple[list[str], Condition] | None = None
         self._past: deque[PastBlock] = deque(maxlen=HELD)
 
     def __next__(self) -> list[Motion]:
-        """Returns the next block of each stream. It ends where the next condition begins."""
+        """Returns the next block of each stream. A block ends where the next condition begins."""
         conditions = self._conditions()
         kept = [self._until_change(row) for row in range(len(self.frames))]
         x, joints = self._advance(kept)
@@ -363,7 +369,7 @@ class Streams(Iterator[list[Motion]]):
         if waypoints.points and not isinstance(representation, HumanML):
             raise UserError(
                 f"representation {representation.name} has no column for the turn of the root, "
-                "which leads to waypoints. Use humanml3d"
+                "which waypoints need. Use humanml3d"
             )
         self.waypoints = waypoints
 
@@ -418,7 +424,7 @@ class Streams(Iterator[list[Motion]]):
         return self.block if change is None else min(self.block, change)
 
     def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Samples the next block. Each stream keeps the first `kept` frames of it.
+        """Samples the next block. Each stream keeps the first `kept` frames of the block.
 
         Returns normalized features (B, P, D), and joints (B, P, J, 3) in the world, float64.
         """
@@ -483,7 +489,10 @@ class Streams(Iterator[list[Motion]]):
 
     @torch.no_grad()
     def _encode(self, conditions: list[str]) -> Condition:
-        """Returns the encoded conditions. They are computed again only if they have changed."""
+        """Returns the encoded conditions.
+
+        The encoded texts are computed again only if the texts have changed.
+        """
         if self._encoded is None or self._encoded[0] != conditions:
             model, device = self.model, self.model.device
             x = torch.zeros(len(conditions), 1, model.representation.features, device=device)

@@ -133,8 +133,8 @@ class Targets:
         """Returns the targets in a window of `frames` frames from `begin` on.
 
         Frames are counted from the beginning of the window. If the root has a target after the
-        window, it must go a part of the way in the window. Its speed is constant, starting from
-        the last target of the root in the window or, without one, from `here`.
+            window, the root covers part of the way within the window: it moves at a constant
+            speed from its last target in the window or, without such a target, from `here`.
 
         Args:
             begin: first frame of the window.

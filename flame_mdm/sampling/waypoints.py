@@ -21,10 +21,11 @@ Point = tuple[float, float]
 """x and z in meters in the world."""
 
 # The page that samples in the browser has the same numbers and loop (tools/web/waypoints.js).
-NEAR = 0.3  # distance in meters from the root at which a waypoint is reached
+# Distance in meters from the root at which a waypoint is reached
+NEAR = 0.3
 # Largest bend in radians per second. With faster bends, feet on the floor would visibly slide.
 FASTEST = 1.3
-# Least radius of a bend in meters. It keeps a person who stands from turning.
+# Least radius of a bend in meters. This radius keeps a standing person from turning.
 TIGHTEST = 0.7
 # Size of the circle within which waypoints are too near, relative to the narrowest circle that
 # the person can walk. A bend begins slowly, so that with 1 a runner would circle a waypoint.

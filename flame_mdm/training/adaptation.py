@@ -38,8 +38,10 @@ from flame_mdm.task import GeneratorTask
 from flame_mdm.training.start import train
 from flame_mdm.visualize import player_page
 
-SAMPLED = 300  # number of motions that are sampled from a model if its training data is missing
-COMPARED = 32  # number of clips with which the page compares models
+# Number of motions that are sampled from a model if its training data is missing
+SAMPLED = 300
+# Number of clips with which the page compares models
+COMPARED = 32
 # Parts that the recipe takes from the base.
 OF_BASE = (
     "task",
@@ -89,8 +91,8 @@ def adapt(
     the guide.
 
     Args:
-        base: the model to adapt. It is a run directory, a .ckpt or .safetensors file, the name of
-            a model in this package, or "user/name[@revision]" on the Hugging Face hub.
+        base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a
+            model in this package, or "user/name[@revision]" on the Hugging Face hub.
         source: folder of motions with captions.
         name: name of the style, one word of letters and digits.
         out: run directory. Default: runs/adapt/NAME.
@@ -255,7 +257,7 @@ def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str
 
 
 class _Samples(MotionSource):
-    """`SAMPLED` motions of a model for some captions, a tenth of them for validation."""
+    """A data set of `SAMPLED` motions that a model generates; a tenth is for validation."""
 
     name, workers = "prior", 1
 

@@ -42,8 +42,10 @@ from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
 
-REAL = 64  # number of training clips with which the metrics of samples are compared
-UNCONDITIONED = 4  # number of motions without a prompt
+# Number of training clips with which the metrics of samples are compared
+REAL = 64
+# Number of motions without a prompt
+UNCONDITIONED = 4
 # In meters. Even if a model has learned little, its samples for different prompts differ by more.
 SAME = 0.01
 Values = Mapping[str, float]  # values by metric, or by metric/part
@@ -364,7 +366,7 @@ class SampleMotions(Callback):
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Writes samples if they are due and there will be no validation to write them."""
+        """Writes samples if they are due and the data has no validation clips."""
         if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a data set without validation clips
             self._write_if_due(trainer, pl_module)
 

@@ -111,7 +111,7 @@ def newest(folder: Path) -> Resumed | None:
             step = content.get("global_step")
             if type(step) is not int or step < 0:
                 raise UserError(
-                    f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps"
+                    f"{path} is damaged: its global_step is {str(step)[:40]}, not a number of steps"
                 )
             check_weights(dict(_tensors(content, "")), path)
             _check_version(content.get("pytorch-lightning_version"), path)

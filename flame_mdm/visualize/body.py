@@ -64,8 +64,9 @@ class Figure:
     contacts: np.ndarray | None = field(default=None, kw_only=True)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns a body that moves like the joints, and "";
-        or None, and the reason why a skeleton is drawn.
+        """Returns a body that moves like the joints and "", or None and the reason.
+
+        The reason says why a skeleton is drawn instead.
 
         `body` is the mesh; None = the mannequin. Without rotations, joints show no body.
         """
@@ -169,16 +170,17 @@ class FittedBody:
     fit: np.ndarray
     # (22, 3), joints of the stored pose with the bone lengths of the clip, pelvis at 0
     joints: np.ndarray
-    points: np.ndarray  # (V, 3), points of the mesh in this pose
+    # (V, 3), points of the mesh in this pose
+    points: np.ndarray
     # (22, 3, 3), rotation of each part of the mesh at rest: soles are flat, the head is upright
     neutral: np.ndarray
-    turns: np.ndarray  # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
-    starts: np.ndarray  # (F, B, 3), start of each bone: the joints of the motion, lifted
-    lift: (
-        # height in meters by which the body's joints are above the motion's joints: the thickness
-        # of the sole
-        float
-    )
+    # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
+    turns: np.ndarray
+    # (F, B, 3), start of each bone: the joints of the motion, lifted
+    starts: np.ndarray
+    # Height in meters by which the body's joints are above the motion's joints: the thickness of
+    # the sole
+    lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""

@@ -25,7 +25,8 @@ LINE = (205, 211, 219)
 TEXT = (28, 36, 48)
 FAINT = (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
-NEAR = 0.3  # objects nearer to the camera than this, in meters, are not drawn
+# Objects nearer to the camera than this, in meters, are not drawn
+NEAR = 0.3
 # Angles of the camera, which is in front of the body, to its left and above it
 YAW, PITCH = 0.6, 0.24
 TOWARD = np.array(

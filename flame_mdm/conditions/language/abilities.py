@@ -123,9 +123,9 @@ class Abilities:
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:
-        """Returns captions of three known actions that are nearest in meaning to a sentence.
+        """Returns captions of the three known actions nearest in meaning to a sentence.
 
-        Without a nearest action, these are the first ones.
+        If no meaning is known, these are the first three known actions.
         """
         names = [action for action in understood.nearest if action in self.actions]
         ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])

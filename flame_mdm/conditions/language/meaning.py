@@ -81,9 +81,9 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 
 @cache
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns the names of the actions, and the single words that name actions.
+    """Returns the names of the actions, and the single words that name them.
 
-    For each word, there is the index of its action in the names, and the word's vector.
+    Each word comes with the index of its action and with its vector.
     """
     table, weak = word_table(), words_of("weak")
     names = list(actions())

@@ -91,8 +91,10 @@ class _Sentence:
     def steps(self) -> list[Step]:
         """Returns the actions in their order."""
         steps: list[Step] = []
-        during: list[Step] = []  # "While walking," comes before the clause that it belongs to
-        later: list[Step] = []  # "Before sitting down," comes before what happens first
+        # "While walking," comes before the clause that it belongs to
+        during: list[Step] = []
+        # "Before sitting down," comes before what happens first
+        later: list[Step] = []
         for clause in self.clauses:
             added = self._actions(clause, steps)
             if not added:

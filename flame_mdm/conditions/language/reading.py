@@ -22,7 +22,7 @@ class Reading:
 
     Attributes:
         understanding: what the sentence asks for.
-        steps: actions that the model samples instead, in their order; it knows all of them.
+        steps: the actions to sample, in order; the model knows all of them.
         captions: one caption per step, for the model.
         texts: the words of the sentence for each step.
         changes: differences between the sentence and what is sampled, one line each.

@@ -28,7 +28,7 @@ class Phrase:
 
     @property
     def size(self) -> int:
-        """Number of words without gaps."""
+        """The number of words, without gaps."""
         return len(self.words) - self.words.count(GAP)
 
 

@@ -66,8 +66,8 @@ def is_foreign(tokens: Sequence[Token]) -> bool:
 
     A sentence is foreign if most of its letters are not Latin. It is also foreign if fewer than
     half of its words are English and, in addition, one of its words has an accent or is typical
-    of another language. `phrases.yaml` lists typical words. English words among them do not
-    count.
+    of another language. `phrases.yaml` lists typical words. Words that are also English do not
+    count as typical of another language.
     """
     words = [token.word for token in tokens if token.is_word]
     letters = [char for word in words for char in word if char.isalpha()]

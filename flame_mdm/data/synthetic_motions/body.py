@@ -88,7 +88,8 @@ class Body:
         self.arms += np.array(
             [rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)]
         )[:, None]
-        self.shoulders = np.zeros((2, len(t)))  # additional rise of the shoulders, beyond the arm's
+        # Additional rise of the shoulders, beyond the arm's
+        self.shoulders = np.zeros((2, len(t)))
         # Whether a foot that is too far away is pulled toward its hip, instead of a longer shin
         self.keeps_legs = False
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
@@ -272,7 +273,7 @@ def follow_feet(body: Body) -> None:
 def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
     """Returns the height (F,) in meters of a body in free fall.
 
-    It lands `seconds` after `start`.
+    The body lands `seconds` after `start`.
     """
     s = np.clip((t - start) / seconds, 0, 1)
     return 9.81 / 8 * seconds**2 * 4 * s * (1 - s)

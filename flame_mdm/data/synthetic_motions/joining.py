@@ -6,9 +6,9 @@ import numpy as np
 
 from flame_mdm.data.synthetic_motions.body import Body, ease, rotation
 
-# Curves of a body that end with the values of the second motion, and the axis of their frames
+# Curves of a body that change to the values of the second motion, and the axis of their frames
 ANGLES = {"pelvis": -1, "spine": -1, "head": -1, "arms": -1, "shoulders": -1, "foot_pitch": -1}
-# Curves that continue at their place in the world
+# Curves of the second motion that are moved to where the first motion ends in the world
 PLACES = {"position": 0, "heading": -1, "ankles": 1, "foot_yaw": -1}
 FRAMES = ANGLES | PLACES
 PLANTED = 0.05  # distance in meters; a foot that has to move farther takes a step

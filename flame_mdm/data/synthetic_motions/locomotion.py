@@ -57,7 +57,8 @@ def walk_along(
     # in the middle of the foot's next stance, shifted sideways by the width of the gait. The feet
     # are therefore under the body on average.
     t, start = body.t, rng.uniform(0.08, 0.18)
-    seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # time until the last foot is down
+    # Time until the last foot is down
+    seconds = t[-1] - rng.uniform(0.06, 0.16) - start
     # A run ends with steps of a walk, in which the feet never leave the ground together.
     landing = min(gait.swing, 0.82)
     count = max(1, round(seconds / gait.step - landing))
@@ -95,8 +96,8 @@ def walk_along(
         goal = np.array(
             [px + across * cos + along * sin, pz - across * sin + along * cos, yaw + yaw0[side]]
         )
-        # In the air, the foot eases from print to print. Its highest point is early in the swing,
-        # because it has just been lifted. Smaller steps are lower.
+        # In the air, the foot eases from footprint to footprint. Its highest point is early in
+        # the swing, because it has just been lifted. Smaller steps are lower.
         s = np.clip((t - lift_off) / swing, 0, 1)
         share = ease(s, 0.08, 0.96)
         distance = np.hypot(*(goal - prints[side])[:2])

@@ -79,11 +79,12 @@ def _published(path: Path, changed: int) -> Config:
 def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
     columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
     values = [column["value"] for column in part["columns"].values()]
-    conditions: list[dict[str, str]] = []  # conditions of all rows; each entry has a footnote
+    # Distinct conditions of the rows; each of them has a footnote
+    conditions: list[dict[str, str]] = []
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
-    # Columns of each footnote, where rows have several footnotes
+    # Columns to which each footnote applies, for rows with several footnotes
     measured_under: dict[str, dict[str, None]] = {}
     shows_multimodality = any(value.startswith("multimodality") for value in values)
     for row, needed in evaluations(part):
@@ -146,7 +147,7 @@ def _condition_notes(
 ) -> list[tuple[str, str]]:
     """Returns the footnotes on conditions.
 
-    A footnote with up to three differences from the first footnote lists only the differences.
+    A footnote that differs from the first footnote in up to three items lists only these items.
 
     Args:
         conditions: the conditions, in the order of their letters.

@@ -33,7 +33,8 @@ KINDS = {
 }
 # states of rows whose values must not be mistaken for results
 NO_RESULTS = ("NOT VALID", "QUICK")
-CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")  # paths of audit cards in footnotes
+# Paths of audit cards in footnotes
+CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")
 # Rows that agree in these facts share a line in the list of sources.
 SHARED = (
     "checkpoint sha256",
@@ -61,10 +62,14 @@ class Line:
     label: str
     kind: str  # a key of `KINDS`
     cells: list[Cell | None]
-    marks: str = ""  # footnote marks; only rows with the same marks are compared
-    state: str = ""  # "" if the row is complete and valid, or a reason such as "no checkpoint"
-    options: dict[str, float] = field(default_factory=dict)  # options for the x-axis of figures
-    facts: dict[str, str] = field(default_factory=dict)  # provenance of the values
+    # Footnote marks; only rows with the same marks are compared
+    marks: str = ""
+    # "" if the row is complete and valid, or a reason such as "no checkpoint"
+    state: str = ""
+    # Options for the x-axis of figures
+    options: dict[str, float] = field(default_factory=dict)
+    # Provenance of the values
+    facts: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -72,7 +77,7 @@ class Part:
     """One table within the table of a paper."""
 
     name: str
-    columns: dict[str, str]  # by label: which values are better, a key of `ARROWS`
+    columns: dict[str, str]  # for each column label, which values are better: a key of `ARROWS`
     lines: list[Line]
     # Mark and text of each footnote; the mark may be empty
     notes: list[tuple[str, str]] = field(default_factory=list)
@@ -197,8 +202,10 @@ def _sources(table: Table) -> list[str]:
                 n: texts[:1] if len(set(texts)) == 1 else [t or "–" for t in texts]
                 for n, texts in values.items()
             }
-            facts = ", ".join(
-                f"{name} {' / '.join(texts)}" for name, texts in joined.items() if any(values[name])
+            facts = "; ".join(
+                f"{name} = {' / '.join(texts)}"
+                for name, texts in joined.items()
+                if any(values[name])
             )
             prefix = f"{part.name}: " if len(table.parts) > 1 else ""
             rows.append(

@@ -20,7 +20,7 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
 LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
-# Labels of further values for columns, which are not metrics, and for the x-axes of figures
+# Labels of values that are not metrics, for columns and for the x-axes of figures
 ABOUT = LABELS["values"]
 SWEPT = (
     "sampler",
@@ -34,7 +34,10 @@ SWEPT = (
 )
 """Options of a row that may be lists; each value of a list gives one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
-"""Limits of a table: rows (with lists of options expanded), columns and plots. Tables of papers have about 20 rows."""
+"""Maximum numbers of rows (after expanding lists of options), columns and plots of a table.
+
+Tables of papers have about 20 rows.
+"""
 
 
 class Options(ClosedSchema):

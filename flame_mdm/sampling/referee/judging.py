@@ -35,8 +35,8 @@ class Verdict:
         claim: the claim.
         answer: "yes", "no" or "cannot tell".
         reading: the measurement.
-        band: two scores. The answer is "no" up to the first one, and "yes" from the second one
-            on.
+        band: two scores. The answer is "no" up to the first score, "yes" from the second score
+            on, and "cannot tell" in between.
     """
 
     claim: Claim
@@ -207,8 +207,8 @@ def decide(body: Body, claim: Claim) -> Verdict:
 def _order(body: Body, claim: Claim) -> Reading:
     """Measures how much later the second part of an order begins than the first one, in seconds.
 
-    Of several times of a part, those with the largest difference count. An order is undecided if
-    a part is not true, or if the reverse order happens, too.
+    If a part happens several times, the times with the largest difference count. An order is
+    undecided if a part is not true, or if the reverse order happens, too.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]

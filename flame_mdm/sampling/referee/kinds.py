@@ -33,7 +33,7 @@ GROUPS = (
     "end",
 )
 ORDER = "order"
-DURATION = (-0.7, -0.4)  # band of the score of a duration, in doublings of the claimed seconds
+DURATION = (-0.7, -0.4)  # a duration is off by at least 0.7 doublings: false; by at most 0.4: true
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Kind:
         measure: function of a body and the claim.
         no, yes: scores that were set by hand. A claim is false up to `no`, and true from `yes`
             on. In between, it is undecided.
-        is_timed: whether the spans of the reading say when it happens. An order can then be read
-            from them.
+        is_timed: whether the spans of the reading say when the claimed event happens. An order
+            can then be read from them.
     """
 
     group: str
@@ -143,8 +143,8 @@ def group_of(claim: Claim) -> str:
 def threshold_key(claim: Claim) -> str:
     """Returns the name of the thresholds of a claim.
 
-    It consists of the kind and the stated speed. Without a speed, it says whether the claim states
-    a side or a direction.
+    The name consists of the kind and the stated speed. Without a speed, it says whether the claim
+    states a side or a direction.
     """
     if claim.parts:
         return ORDER
@@ -162,7 +162,7 @@ def thresholds() -> dict[str, Any]:
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns two scores: up to the first one, a claim is false; from the second one on, true.
+    """Returns two scores: a claim is false up to the first, and true from the second on.
 
     Claims about a start or an end have the band of the kind at any time.
     """

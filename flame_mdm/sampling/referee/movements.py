@@ -29,12 +29,13 @@ from flame_mdm.sampling.referee.readings import (
     spans_of,
 )
 
-SECTOR = np.cos(np.radians(50))  # maximum angle between the travel and a direction
+# Cosine of the maximum angle between the direction of travel and a claimed direction
+SECTOR = np.cos(np.radians(50))
 SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backward": (0.0, -1.0)}
 
 
 def travel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled in a direction as seen by the body; by default, in any."""
+    """Measures the distance traveled in a direction as seen by the body; default: any direction."""
     speed = body.speed
     if claim.direction:
         toward = body.velocity @ np.array(SEEN[claim.direction])
@@ -299,7 +300,10 @@ def strike(body: Body, claim: Claim) -> Reading:
 
 
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
-    """Returns a reading of how much more a limb moves than the other one, in doublings."""
+    """Returns a reading of how much more a limb moves than the other limb.
+
+    The score is the binary logarithm of the ratio.
+    """
     total = activity.mean(0)
     chosen = SIDES.index(claim.side)
     ratio = float(np.log2((total[chosen] + 0.02) / (total[1 - chosen] + 0.02)))

@@ -41,7 +41,10 @@ class Reading:
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
-    """Returns first and last second of each run of true frames (F,), at least `shortest` long."""
+    """Returns the first and last second of each run of true frames (F,).
+
+    Runs shorter than `shortest` are left out.
+    """
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0])).reshape(-1, 2)
     return tuple(
         (start / RATE, end / RATE)

@@ -154,10 +154,9 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
     The positions of the two feet are (F, 2, 3), their contacts (F, 2) bool.
 
     Returns:
-        Three numbers of frames. There are three kinds of such frames. In the first kind, the feet
-        on the ground move unlike the body. In the second, a foot in the air moves much less than
-        the body; these frames count half in the score. In the third, both feet swing to and fro
-        in the air.
+        Three numbers of frames, one per kind. In the first kind, the feet on the ground move
+        unlike the body. In the second, a foot in the air moves much less than the body; these
+        frames count half in the score. In the third, both feet swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)

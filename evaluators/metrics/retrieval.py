@@ -146,8 +146,8 @@ class MultiPositiveRPrecision(CaptionMetric):
     - `proper`: R-precision as in information retrieval. A text with R correct motions adds the
       fraction of them among its R nearest motions.
     - `single_topK`: only the text's own motion is correct. Except for ties, the values equal the
-    values of `MotionsForText`. - `chance_topK`: values expected from a random order, for
-    comparison: similar captions raise
+      values of `MotionsForText`.
+    - `chance_topK`: values expected from a random order, for comparison: similar captions raise
       all values.
     - `positives`: the mean number R of correct motions.
 

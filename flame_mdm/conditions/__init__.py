@@ -55,8 +55,11 @@ class ConditionEncoder(nn.Module, ABC):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains the encoder on captions alone, before the first training step.
 
-        By default, the method does nothing. Args: groups: one list of captions per clip. seed:
-            seed of all random draws.
+        By default, the method does nothing.
+
+        Args:
+            groups: one list of captions per clip.
+            seed: seed of all random draws.
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:

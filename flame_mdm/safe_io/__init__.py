@@ -48,8 +48,7 @@ ARRAYS_LIMIT = 128 * MEBIBYTE
 """The arrays of a compressed file may always have this total size.
 
 Above it, they may have at most `INFLATION` times the size of the file. Motion data is compressed
-by
-a factor of less than 10.
+by a factor of less than 10.
 """
 INFLATION = 20
 # Beginning of a pointer file, which replaces a file in Git LFS

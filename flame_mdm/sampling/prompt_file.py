@@ -1,5 +1,5 @@
 # pyright: standard
-"""Files of prompts. Files of prompts are read without torch, so wrong files fail quickly."""
+"""Files of prompts, which are read without torch, so that wrong files fail quickly."""
 
 from __future__ import annotations
 

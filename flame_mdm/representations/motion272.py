@@ -19,10 +19,10 @@ class Motion272(Representation):
 
     | name | width | content |
     |---|---|---|
-    | root_velocity | 2 | x and z of the root's displacement from the previous frame, in body coordinates of that frame |
+    | root_velocity | 2 | x and z of the root's displacement from the previous frame, in that frame's body coordinates |
     | turn | 6 | rotation about y from the previous frame's body coordinates to this frame's, 6D rows |
     | positions | 66 | joints in body coordinates: the root is at x = z = 0, the lowest joint of the motion at y = 0 |
-    | velocities | 66 | differences of `positions` from the previous frame, without the displacement and turn of the root |
+    | velocities | 66 | differences of `positions` from the previous frame, without the root's displacement and turn |
     | rotations | 132 | SMPL's rotations as 6D rows, of the root in body coordinates |
 
     In the first row, `turn` is the identity, and velocities are 0. The heading is the heading of

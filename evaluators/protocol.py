@@ -280,8 +280,9 @@ class Protocol(ClosedSchema):
         return rows
 
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
-        """Returns the motions of one replication of multimodality:
-        several motions for each of the first prompts.
+        """Returns the motions for one replication of multimodality.
+
+        There are several motions for each of the first prompts.
         """
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]

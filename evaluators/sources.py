@@ -234,7 +234,7 @@ class SampleFolder:
         return sha256_of_samples(self.files)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of one file for the rows; raises `UserError` if the file names other clips."""
+        """Returns the motions of the rows from one file; raises `UserError` if the file names other clips."""
         path = self.files[replication]
         content = read_samples(path)
         ids = content["ids"].tolist()
@@ -245,7 +245,9 @@ class SampleFolder:
                 f"{path}: names {len(unknown)} clips that are not in the split, such as {unknown[0]}"
             )
         if len(index) < len(ids):
-            raise UserError(f"{path}: repeats ids. Give each clip of the split at most once")
+            raise UserError(
+                f"{path}: an id occurs several times. Give each clip of the split at most once"
+            )
         if "joints" in content:
             joints = [
                 torch.from_numpy(np.ascontiguousarray(x, np.float32))

@@ -109,7 +109,7 @@ def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable
 def attach(model: MotionGenerator, about: About) -> None:
     """Freezes a model and adds changes, which start at 0.
 
-    Raises `UserError` if its denoiser has no transformer.
+    Raises `UserError` if the denoiser of the model has no transformer.
     """
     model.requires_grad_(False)
     layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]

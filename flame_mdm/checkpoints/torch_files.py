@@ -12,7 +12,7 @@ from flame_mdm.safe_io import ZIP_ERRORS, naming, opened_zip, regular_file
 
 LARGEST_KEY = 2**60
 """Integer keys must be smaller than this: any number of larger integers may share one hash."""
-# number of pickles at the beginning of a file of PyTorch before 1.6, which is not an archive
+# files of PyTorch before 1.6, which are not archives, begin with this number of pickles
 LEGACY_PICKLES = 5
 # Names of the codec with which PyTorch writes bytes. Other codecs may take quadratic time.
 CODECS = ("latin1", "latin-1")

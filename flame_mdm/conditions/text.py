@@ -287,8 +287,8 @@ class Pretrained:
         """Loads a new copy of the network, float32.
 
         Raises:
-            FileNotFoundError: If it cannot be found or downloaded.
-            UserError: If it differs from the published model.
+            FileNotFoundError: If the model cannot be found or downloaded.
+            UserError: If the file differs from the published model.
         """
         from transformers import (
             AutoConfig,

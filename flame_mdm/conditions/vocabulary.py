@@ -60,7 +60,9 @@ def words(text: str) -> list[str]:
 
 
 def hashed(word: str, buckets: int) -> tuple[int, int]:
-    """Returns two rows of a table of `buckets` word vectors. A word's vector is their sum.
+    """Returns two rows of a table of `buckets` word vectors.
+
+    The vector of a word is the sum of both rows.
 
     The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Words
     are confused only if both parts are equal. The hash (CRC-32) is the same on every machine.

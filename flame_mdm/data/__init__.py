@@ -66,7 +66,7 @@ class MotionSource(ABC):
     options: Mapping[str, Any] = {}
     """Arguments of the constructor that define the data, as JSON values.
 
-    Paths and numbers of workers do not belong to them. The arguments are saved in the store, and
+    Paths and numbers of workers are not among them. The arguments are saved in the store, and
     commands compare them with the recipe.
     """
     # Names of the action labels, in the order of their numbers

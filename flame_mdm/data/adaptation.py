@@ -92,8 +92,8 @@ class Lesson(MotionSource):
         """Yields the user's clips, with their style in the captions, then the clips of the store.
 
         Raises:
-            UserError: If one of the user's motions cannot be read. There are only a few, so none
-                is left out.
+            UserError: If one of the user's motions cannot be read. The folder has only a few
+                motions, so none is left out.
         """
         for clip in self.folder.clips(fps):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])

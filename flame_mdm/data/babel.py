@@ -44,7 +44,10 @@ class Label(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A clip: consecutive frames of a motion. `id` contains FLAME's number in the part."""
+    """A clip: consecutive frames of a motion.
+
+    `id` contains the number that FLAME gives the clip within its part.
+    """
 
     id: str
     split: Split

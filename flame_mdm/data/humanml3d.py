@@ -156,7 +156,7 @@ class HumanML3D(T2MFolder):
     def _beside(self, *names: str) -> Path:
         """Returns the first of these names that exists in the folder or next to it.
 
-        If none exists, it returns the first name in the folder.
+        If none of them exists, returns the path of the first name in the folder.
         """
         candidates = [folder / name for name in names for folder in (self.path, self.path.parent)]
         return next((candidate for candidate in candidates if candidate.exists()), candidates[0])

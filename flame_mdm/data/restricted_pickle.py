@@ -6,9 +6,9 @@ A pickle can name any function and have it called. This reader calls no function
 arguments and the state of each object, and creates arrays from the bytes among them. NumPy's own
 functions are not used for this, because a wrong byte in a dtype crashes them.
 
-Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this
-reader is based on the unpickler in Python. No read may request more bytes than are left in the
-file. Content that a pickle repeats is counted at each repetition.
+Python's C unpickler allocates any amount of memory that a file declares, even a file of ten
+bytes. Therefore this reader is based on the unpickler in Python. No read may request more bytes
+than are left in the file. Content that a pickle repeats is counted at each repetition.
 """
 
 import pickle

@@ -27,7 +27,7 @@ LONGEST = 3600.0
 BURST, RATE = 8.0, 2.0
 # Duration in seconds of the part of a stream that can be downloaded
 KEPT = 60.0
-# Number of frames before a block on which the rotations of its first frames depend
+# The rotations of the first frames of a block depend on this number of frames before it
 BEFORE = 10
 ENDINGS = (".bvh", ".glb")
 STAND, WALK = "a person stands", "a person walks forward"

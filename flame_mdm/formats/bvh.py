@@ -44,7 +44,7 @@ class Bvh:
     parents: tuple[int, ...]
     # (J, 3) float64, rest position of each joint in its parent's frame
     offsets: np.ndarray
-    # Names of each joint's channels in the order of its columns, from `CHANNELS`
+    # For each joint, the names of its channels (see `CHANNELS`), in the order of the columns
     channels: tuple[tuple[str, ...], ...]
     # (F, C) float64, the channels of all joints in joint order; angles in degrees
     frames: np.ndarray

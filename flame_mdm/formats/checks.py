@@ -18,8 +18,8 @@ AVERAGED = 0.05
 KICK = 30.0
 UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is reported as too small
 
-# Seconds between a rest pose in front of a motion and the motion. Some conversions blend these
-# frames.
+# Maximum number of seconds between a rest pose in front of a motion and the motion. Some
+# conversions blend these frames.
 BLEND = 0.04
 # Number of subsequent frames with which the first steps are compared
 CALM = 8

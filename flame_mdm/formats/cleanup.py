@@ -175,8 +175,8 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
     """Bends limbs whose foot or hand has become lower because bones got their median lengths.
 
-    Between two very different poses of a sequence, for example from a crawl to a walk, poses are
-    means of both, with short bones. With full lengths, they would reach through the floor.
+    Between two very different poses of a sequence, for example from a crawl to a walk, the poses
+    are means of both and have short bones. With full lengths, they would reach through the floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):

@@ -133,7 +133,7 @@ def slerp(begin: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
 
     `share` (F, 1) is from 0 to 1.
     """
-    # q and -q are the same rotation. The one on the side of `begin` is on the shorter arc. For
+    # q and -q are the same rotation. The one that is closer to `begin` is on the shorter arc. For
     # nearly equal rotations, sin(angle) is 0, and linear interpolation is exact enough.
     cosine = (begin * end).sum(1, keepdims=True)
     end = np.where(cosine < 0, -end, end)

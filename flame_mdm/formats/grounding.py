@@ -27,8 +27,8 @@ SLOW = 0.25
 SHORT = 0.1
 # Seconds in which the body is lowered for a leg that is too short
 LOWERING = 0.2
-# Number of repetitions of a loop that are planted together. The middle one has neighbors on both
-# sides.
+# Number of repetitions of a loop in which toes are planted together. The middle one has neighbors
+# on both sides.
 COPIES = 3
 FEET = tuple(
     tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot"))
@@ -277,7 +277,7 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
     Its last frame is the first frame of the next repetition.
     """
     # Each repetition begins at the place and in the direction in which the previous one ended.
-    # Its path is turned and moved there.
+    # The path of each repetition is turned and moved there.
     step = turned(np.r_[motion.path[-1] - motion.path[0], 0][[0, 2, 1]], -motion.heading[0])
     turn = motion.heading[-1] - motion.heading[0]
     count = len(motion) - 1

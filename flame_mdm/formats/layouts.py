@@ -382,7 +382,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
 def leg_length(joints: np.ndarray) -> float:
     """Returns the mean length in meters of the left leg, hip to knee to ankle.
 
-    `joints` are (F, 22, 3) of SMPL.
+    `joints` (F, 22, 3) are SMPL's joints.
     """
     return _bone(joints, "left_hip", "left_knee") + _bone(joints, "left_knee", "left_ankle")
 

@@ -99,7 +99,7 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
 
 
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
-    """Groups curves into charts, by heading.
+    """Groups the curves of each heading into charts.
 
     Below a heading, curves whose names differ only in their family (`train/loss`, `val/loss`)
     share a chart.

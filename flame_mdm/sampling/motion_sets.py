@@ -44,7 +44,7 @@ from flame_mdm.visualize.body import Mesh
 SETS = Path(__file__).parent / "sets"
 # Suffix of the names of files without a path
 IN_PLACE = "_InPlace"
-# Seconds between two clips while their rotations are computed
+# Seconds that are inserted between clips while the rotations of all clips are computed
 SEPARATION = 1.0
 NAME = r"^[A-Za-z0-9_-]{1,60}$"
 WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {

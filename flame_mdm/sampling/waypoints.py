@@ -174,5 +174,5 @@ class Route:
                 self.reached.append(frame)
 
     def go_back(self, frame: int) -> None:
-        """Makes the waypoints that were reached from a frame on lie ahead again."""
+        """Marks the waypoints that were reached from a frame on as not yet reached."""
         self.reached = [number for number in self.reached if number < frame]

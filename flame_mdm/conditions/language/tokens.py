@@ -36,7 +36,7 @@ class Token:
 
     @property
     def is_word(self) -> bool:
-        """Whether it is a word, and not a punctuation mark."""
+        """Whether the token is a word, and not a punctuation mark."""
         return self.typed[0].isalnum()
 
     def has_form(self, *bases: str) -> bool:

@@ -41,7 +41,7 @@ class Gait:
     sink: float = 0.03
     # Amplitude of the pelvis; it is highest when both feet are in the air
     bounce: float = 0.0
-    # Distance by which the feet land farther back than they stand
+    # Distance by which footprints are shifted backward, relative to the pelvis
     behind: float = 0.0
 
 

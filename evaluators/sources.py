@@ -234,7 +234,10 @@ class SampleFolder:
         return sha256_of_samples(self.files)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of the rows from one file; raises `UserError` if the file names other clips."""
+        """Returns the motions of the rows from one file.
+
+        Raises `UserError` if the file names other clips.
+        """
         path = self.files[replication]
         content = read_samples(path)
         ids = content["ids"].tolist()

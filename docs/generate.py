@@ -33,12 +33,12 @@ def recipes_page() -> str:
     page = f"""# Recipes
 
 {HEAD}
-Each row of the papers' tables that FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
-arXiv:2209.14916) or Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895) fill has a recipe: `make train
-EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate. "As in
-mdm" means the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch contains
-motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation
-clips.
+FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023, arXiv:2209.14916) and Motion Flow
+Matching (Hu et al., 2023, arXiv:2312.08895) have a recipe for each of their rows in the tables of the papers, such as
+`make train EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate.
+"As in mdm" means the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch
+contains motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on
+validation clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
@@ -101,9 +101,10 @@ def hyperparameters_page() -> str:
     page = f"""# Hyperparameters
 
 {HEAD}
-Values of the recipes. Bold: the paper gives the same value. If the two differ, both are shown. The other values are not
-in the papers; most come from the authors' code. "–": the recipe has no such value. Where a paper names only the kind
-of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our choice.
+The tables show the values of the recipes. A value is bold if the paper gives the same value. If the paper gives another
+value, both are shown. The other values are not in the papers; most come from the authors' code. "–" means that the
+recipe has no such value. If a paper names only the kind of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the
+checkpoint is our choice.
 """
     for title, published in TABLES.items():
         columns = {name: hyperparameters(name) for name in published}

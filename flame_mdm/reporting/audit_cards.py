@@ -25,9 +25,10 @@ and the measured motions at their strongest grade.
 ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
-    "Each cell has the smallest strength at which the metric differs from real motions in a paired comparison, there "
-    "and at all larger strengths. a → b: its value leaves the 95 % interval of real motions only at strength b. "
-    "–: never. ~: the difference does not always grow with the strength."
+    "Each cell shows the smallest strength from which the metric differs from real motions in "
+    "a paired comparison, at this and all larger strengths. a → b: the value itself leaves "
+    "the 95 % interval of real motions only at strength b. –: there is no such strength. ~: "
+    "the difference does not always grow with the strength."
 )
 
 

@@ -167,7 +167,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 
 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
-    """Returns the metrics that an audit can compute, because it has all their inputs, by name."""
+    """Returns by name the metrics whose inputs the audit has, so that it can compute them."""
     metrics = make_metrics(evaluator.metrics)
     return {
         name: metric

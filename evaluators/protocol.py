@@ -96,8 +96,8 @@ class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
     The caption and crop of a clip, and the noise of the generated motion, are functions of (seed,
-    replication, id). Motions are generated at the length of the real clip. For the values of real
-    motions, they are compared with a second draw of real motions.
+    replication, id). Motions are generated at the length of the real clip. Real motions are
+    measured in the same way, in comparison with a second draw of real motions.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)

@@ -210,7 +210,7 @@ class Edit:
     guide: Guide | None = None
 
     def impose(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D) in which known features replace the kept ones.
+        """Returns the clean estimate (B, F, D) with the kept features replaced by the known ones.
 
         This is mode "x0".
         """

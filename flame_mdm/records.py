@@ -33,7 +33,7 @@ class Value(Schema):
     def half(self) -> float | None:
         """Half width of the 95 % interval over replications; None if unknown.
 
-        For a single replication, it is the interval over the motions.
+        For a single replication, the interval is over the motions.
         """
         if (self.replications or 0) > 1:
             return self.ci

@@ -98,7 +98,7 @@ class StopRequest:
 
 
 def kill_children() -> None:
-    """Kills all child processes. Python would wait forever for suspended ones."""
+    """Kills all child processes. Python would wait forever for suspended workers."""
     # torch's handler would raise an error for each worker that ends.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     for process in active_children():

@@ -273,7 +273,7 @@ def test_captions_of_ones_own(folder, capsys):
         ),
         (
             "02_01,3,1,a,b,",
-            "captions.csv, line 2: begin '3', end '1': this is not a part of a recording, in seconds",
+            "captions.csv, line 2: begin '3', end '1': give the beginning and end of a part, in seconds",
         ),
         ("02_01,x,1,a,b,", "begin 'x', end '1': not numbers of seconds"),
         ("02_01,nan,1,a,b,", "begin 'nan', end '1': not numbers of seconds"),
@@ -294,7 +294,7 @@ def test_faults_in_captions_of_ones_own_are_named(row: str, message: str, folder
 
 def test_wrong_folders_get_one_line(folder, subtests):
     for path, captions, message in [
-        ("none", "clone", "no recording such as 02_01.bvh or 02_01.amc in it; clone https"),
+        ("none", "clone", "contains no recording such as 02_01.bvh or 02_01.amc; clone https"),
         ("motions", "none", "none: not found; it is the folder of the captions"),
         ("motions", "motions", "index.csv"),
     ]:

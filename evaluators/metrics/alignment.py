@@ -80,9 +80,9 @@ class RPrecision(SampleMetric):
             distance: (N, M) distances from queries to candidates.
             correct: (N,) index of the correct candidate of each query.
         """
-        # A random pool has pool - 1 of the other candidates. The number of closer candidates in
-        # it has a hypergeometric distribution, so the probability is exact without drawing pools.
-        # Half of the candidates at an equal distance count as closer.
+        # A random pool has pool - 1 of the other candidates. The number of closer candidates in a
+        # pool has a hypergeometric distribution, so the probability is exact without drawing
+        # pools. Half of the candidates at an equal distance count as closer.
         others = distance.shape[1] - 1
         if others + 1 < self.pool:
             raise UserError(f"a pool needs {self.pool} candidates, but there are only {others + 1}")

@@ -149,9 +149,9 @@ class KernelMotionDistance(TwoSets):
 def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
     """Returns the fraction of `points` (M, E) in the manifold of `samples` (N, E).
 
-    A point is in the manifold if, for some sample, it is at most as far from the sample as the
-    sample's third-nearest neighbor. Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is not a
-    neighbor of itself.
+    A point is in the manifold if its distance from some sample is at most the distance between
+    that sample and its third-nearest neighbor. Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is
+    not a neighbor of itself.
 
     Example:
         >>> samples = torch.tensor([[0.0], [1.0], [2.0], [3.0]])

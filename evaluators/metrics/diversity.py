@@ -197,7 +197,7 @@ class JointVariance(SampleMetric):
     y and z, and averaged over joints, frames and texts. The denominator of the variance is n - 1.
     The value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of
     joints for the 10 generated motions"; according to eq. 18, this is a variance over the frames
-    of one motion. There is no code for it.
+    of one motion. No code was published.
 
     Args:
         samples: number of motions per text.

@@ -294,8 +294,8 @@ class KimodoConstraints(MotionMean):
     - `fullbody_keyframe`: distance of all joints, in frames that keep all joints.
     - `end_effector`: distance of the kept joints in the other frames.
 
-    In Kimodo's code, the user draws the trajectory of the root. Here, it is the trajectory of the
-    real motion.
+    In Kimodo's code, the user draws the trajectory of the root. Here, the trajectory of the real
+    motion is used.
 
     Example:
         >>> metric, real = KimodoConstraints(), torch.zeros(1, 5, 22, 3)

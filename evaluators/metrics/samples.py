@@ -150,7 +150,7 @@ class SampleMetric(Declared, Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
-        """Returns the value of all samples. Without samples, it is None, or None by name."""
+        """Returns the value of all samples. Without samples, the value is None, or None by name."""
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 

@@ -64,7 +64,8 @@ def load(
             in this package, such as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path
             comes first.
         device: device of the weights, such as "cuda".
-        which: the checkpoint of a run directory, "last" or "best". For files, it has no effect.
+        which: the checkpoint of a run directory, "last" or "best". For files, this argument has
+            no effect.
         adapter: one or several files that `flame_mdm.adapt` wrote for this model. By default,
             there is no adapter.
         strength: strength of all adapters, or one number per adapter. 0 = the model without the

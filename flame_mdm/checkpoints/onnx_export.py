@@ -199,8 +199,7 @@ class Probe:
         """Records the coefficients p and q of a call, from two tiny inputs."""
         if len(self.records) == self.calls:
             raise UserError("it chooses its own steps")
-        # The clean estimate is p x + q y. With an output y = 0, it shows p; with x = 0, it shows
-        # q.
+        # The clean estimate is p x + q y. An output y = 0 reveals p; an input x = 0 reveals q.
         row = []
         for self.output, x in ((0.0, x_t * 0 + TINY), (TINY, x_t * 0)):
             row.append(float(clean(x)[0, 0, 0]) / TINY)
@@ -361,7 +360,8 @@ class ContinuingCall(Call):
         """Returns the guided output (B, F, features) of the denoiser.
 
         Args:
-            x_t: see `Call.forward`, also for `t`, `lengths`, `condition` and `counts`.
+            x_t: see `Call.forward`, which also describes `t`, `lengths`, `condition` and
+                `counts`.
             prefix: (B, C, D), normalized features of the frames before the motion.
         """
         return self._output(x_t, t, lengths, condition, counts, prefix)

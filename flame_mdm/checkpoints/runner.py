@@ -129,8 +129,9 @@ TYPES: dict[str, type | tuple[type, ...]] = {
 
 
 def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
-    """Returns the dotted names of values that a JSON schema refuses;
-    items have the name of their list.
+    """Returns the dotted names of the values that a JSON schema refuses.
+
+    An item of a list is reported by the name of the list.
 
     The schema has types, bounds for numbers and for the number of items, patterns for whole
     texts, and required keys. Objects may have keys that are not in the schema.

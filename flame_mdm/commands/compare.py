@@ -131,9 +131,9 @@ def _motions(
 ) -> list[dict[Prompt, Motion]]:
     """Returns the motions of each run and folder, by prompt.
 
-    The last checkpoint of each run is sampled for the requested prompts. Without prompts, it is
-    sampled for the captions and lengths of the motions in the first folder. Without a folder, the
-    newest samples of each run are shown.
+    The last checkpoint of each run is sampled for the requested prompts. Without prompts, the
+    checkpoint is sampled for the captions and lengths of the motions in the first folder. Without
+    a folder, the newest samples of each run are shown.
     """
     from_files = {
         entry.label: read_motions(entry.folder) for entry in compared if entry.run is None

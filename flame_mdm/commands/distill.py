@@ -20,7 +20,7 @@ from flame_mdm.safe_io.paths import check_tree
 RECIPE = "student.yaml"
 """Name of the student's recipe in its run directory.
 
-Training starts from it, also in the jobs of a launcher.
+Training starts from this file, also in the jobs of a launcher.
 """
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 

@@ -79,8 +79,8 @@ def _with_actions(
 ) -> ReadPrompt:
     """Returns a text as a model of single actions reads it.
 
-    Unless it is split, a text keeps its parts. If one of them names several actions, the model reads its words as they
-    are.
+    Unless it is split, a text keeps its parts. If a part names several actions, the model reads
+    the words of the part as they are.
     """
     readings: list[Reading]
     if splits:

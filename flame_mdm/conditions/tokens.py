@@ -30,7 +30,7 @@ class LearnedTokens(ConditionEncoder):
 
     A word is the sum of two rows of the table, selected by its hash; see `vocabulary.hashed`. The
     vector of a word that the training captions do not contain would be random. Such a word is
-    replaced by another form of it in the captions (walked, walks), or dropped.
+    replaced by another of its forms that the captions contain (walked, walks), or dropped.
 
     Samples with the same caption share its dropout, because a caption is encoded once. Linear
     layers skip the padding.

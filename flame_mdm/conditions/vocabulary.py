@@ -137,7 +137,7 @@ def check_known(text: str, facts: Mapping[str, Any]) -> None:
     """Checks that a model knows at least one content word of a text.
 
     Raises:
-        UserError: If it knows none of them.
+        UserError: If the model knows no content word of the text.
     """
     if facts.get("vocabulary") and unknown_words(text, facts) == _content(text):
         instead = _suggested(text, facts) or " Use words of its training captions"
@@ -188,7 +188,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
     """Returns the known word that an unknown word probably stands for; None if there is none.
 
-    The unknown word is a typo of it or has a similar meaning.
+    The unknown word is a typo of the known word, or has a similar meaning.
     """
     if not is_known(word):
         similar = [other for other in vocabulary if other[:1] == word[0]]

@@ -223,7 +223,7 @@ def required(path: Path, get_it: str) -> Path:
 
 
 def some(names: Iterable[str]) -> str:
-    """Returns the first five of the sorted names, and the number of the others."""
+    """Returns the first five of the sorted names, and the number of the remaining names."""
     first = sorted(names)
     return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
 

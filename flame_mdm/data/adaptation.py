@@ -26,7 +26,7 @@ DRIFT = 0.05
 """Maximum rise of the floor, in meters, from the first to the last second of a clip."""
 FLOAT = 0.1
 """Maximum median height of the body above the floor, in meters."""
-# Maximum number of known clips per split. They are evenly spaced in the model's data.
+# Maximum number of known clips per split. These clips are evenly spaced in the model's data.
 PRIOR = {
     "train": 2000,
     "val": 64,
@@ -85,7 +85,7 @@ class Lesson(MotionSource):
         self.folder.suit(representation)
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the mean and std (D,) of the store. The model was trained with them."""
+        """Returns the mean and std (D,) of the store. The model was trained with these values."""
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:

@@ -207,7 +207,7 @@ class Bandai(MotionSource):
                 )
         if not files:
             raise FileNotFoundError(
-                f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}"
+                f"{self.path}: contains no file dataset-1_*.bvh or dataset-2_*.bvh; {GET_IT}"
             )
         return [
             _take(file, self.split)
@@ -304,7 +304,7 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
 
     Neighboring takes look alike, so blocks of five stay in one split. Data set 1 has only one
     take of most combinations, so a whole combination goes to one split. The normal takes of
-    walk-turn-left and -right overlap in time across names. All of them are used for training.
+    walk-turn-left and -right overlap in time across names. All these takes are used for training.
 
     With the rule "compositional", the combinations `HELD_OUT` are the test split. Other takes
     that the rule "takes" would test on are used for training.

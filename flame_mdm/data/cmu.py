@@ -160,7 +160,7 @@ class CMU(MotionSource):
                 files[match[1]].append(path)
         if not files:
             raise FileNotFoundError(
-                f"{self.path}: no recording such as 02_01.bvh or 02_01.amc in it; {GET_IT}"
+                f"{self.path}: contains no recording such as 02_01.bvh or 02_01.amc; {GET_IT}"
             )
         kept = self.not_excluded(files, self.path)
         good = {
@@ -206,7 +206,7 @@ class CMU(MotionSource):
     def kit(self) -> list[tuple[str, str, str, float]]:
         """KIT-ML's captions of CMU recordings: id, recording, text and seconds.
 
-        The list is empty if there is no file of them.
+        The list is empty if there is no such file.
         """
         if self.table:
             return []
@@ -416,7 +416,7 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
         last = round(float(end) * FPS) if end else None
     if first < 0 or (last is not None and last <= first):
         raise UserError(
-            f"begin {begin!r}, end {end!r}: this is not a part of a recording, in seconds"
+            f"begin {begin!r}, end {end!r}: give the beginning and end of a part, in seconds"
         )
     name = f"{trial}@{begin or 0}-{end or 'end'}" if begin or end else trial
     split = known_split(cells["split"]) if cells.get("split") else None
@@ -492,7 +492,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     # The MotionBuilder-friendly conversion lacks a bone of the trunk and of each hand. Each of
-    # them is restored: it gets a part of the neighboring bone with which it was merged.
+    # these bones is restored from a part of the neighboring bone with which it was merged.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():

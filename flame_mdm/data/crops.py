@@ -57,7 +57,7 @@ class Crop(ABC):
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
         """Returns the indices of the frames selected from a clip of `frames` frames.
 
-        Without a generator, they are fixed.
+        Without a generator, the indices are fixed.
         """
         first, length = self.draw(frames, generator.integers if generator else None)
         return np.minimum(np.arange(length) + first, frames - 1)
@@ -110,7 +110,7 @@ class Fixed(Crop):
     """ACTOR's action data sets: always `frames` frames.
 
     Short clips repeat their last frame; long clips give a window. As in ACTOR's code, the window
-    never starts at the last possible frame. Without a generator, it is the first window.
+    never starts at the last possible frame. Without a generator, the first window is used.
     """
 
     frames: int = 60

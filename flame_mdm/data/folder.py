@@ -68,7 +68,7 @@ class Folder(MotionSource):
         path: the folder. Motions may be in subfolders.
         motion: "joints" for representations of joint positions; "smpl" for representations of
             SMPL's rotations. AMASS files contain rotations, and the bones of BVH files determine
-            them. For other files, they are fitted to the joints.
+            them. For other files, rotations are fitted to the joints.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
         balance: requested number of training clips per action, mirrored copies included. If an

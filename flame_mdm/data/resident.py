@@ -49,7 +49,7 @@ def free_memory(device: torch.device) -> int:
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
     """Returns the frames of a store on a device, (N + 1, D). The last row is zeros, for padding.
 
-    Frames are normalized here. If the representation adapts cuts, they are normalized later
+    Frames are normalized here. If the representation adapts cuts, frames are normalized later
     instead.
     """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)

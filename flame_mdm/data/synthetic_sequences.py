@@ -20,8 +20,8 @@ RESTING = 0.25
 FROM_THE_FLOOR = 0.15
 # Maximum duration, in seconds, of the overlap of both motions
 OVERLAP = 0.45
-# Motions that have no natural end. Clips show up to 6 seconds of them and leave out their end, so
-# that a stream keeps moving until its text changes.
+# Motions that have no natural end. Clips show up to 6 seconds of such a motion and leave out its
+# end, so that a stream keeps moving until its text changes.
 ENDLESS = (
     *("walk", "run", "sneak", "crouch walk", "limp", "march", "march in place", "run in place"),
     *("carry", "push", "pull", "strafe", "skip", "dance", "waltz", "crawl", "idle", "stand"),

@@ -54,8 +54,8 @@ class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl` in front view, as raw SMPL motions.
 
     As published, training clips of fewer than 45 frames are left out, and all test clips are
-    kept. The published split trains on all 51 training subjects. Our split uses 5 of them for
-    validation.
+    kept. The published split trains on all 51 training subjects. Our split uses 5 of these
+    subjects for validation.
     """
 
     name = "uestc"

@@ -95,7 +95,8 @@ class Connection(H11Protocol):
     def pause_writing(self) -> None:
         """Starts the timer that closes the connection if the client does not read."""
         super().pause_writing()
-        # The client does not read: closing would wait for it, too.
+        # The timer aborts the connection, because closing it would wait for the client, which
+        # does not read.
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:

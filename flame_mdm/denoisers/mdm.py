@@ -102,7 +102,7 @@ class MDMDecoder(Denoiser):
     """Transformer decoder over the frames; used by MDM and DiP.
 
     The memory of its cross-attention is time + condition. With `context_frames`, clean frames
-    precede the noisy ones, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1). Only their
+    precede the noisy frames, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1). Only their
     positions mark them as clean, and their outputs are dropped.
 
     Args:

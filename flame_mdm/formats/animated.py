@@ -1,7 +1,7 @@
 """Animated node hierarchies of FBX and GLB files: the positions of all nodes in each frame.
 
-Only positions are used, and the rotations of the motion are computed from them. Therefore the
-rest pose need not be a T-pose, and the local axes, which differ between programs, do not matter.
+Only positions are used, from which the rotations of the motion are computed. Therefore the rest
+pose need not be a T-pose, and the local axes, which differ between programs, do not matter.
 """
 
 from collections.abc import Sequence

@@ -44,7 +44,7 @@ class PosedFigure(Figure):
     def posed(self) -> Poses:
         """Returns the rotations.
 
-        If they are not known, they are computed from the joint positions of SMPL's skeleton.
+        Unknown rotations are computed from the joint positions of SMPL's skeleton.
         """
         if self.poses is not None:
             return self.poses
@@ -70,7 +70,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     The joints of the body are the joints of the motion, raised by the thickness of the sole.
 
     Args:
-        motion: the clip. If its rotations are missing, they are computed and completed.
+        motion: the clip. Missing rotations are computed and completed.
         body: the mesh; None = the mannequin.
 
     Raises:

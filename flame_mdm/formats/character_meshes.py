@@ -105,7 +105,7 @@ def _part(
     else:
         corners = np.arange(len(points))
     if len(corners) % 3 or (len(corners) and corners.max() >= len(points)):
-        raise ValueError(f"{name} has triangles without corners")
+        raise ValueError(f"{name} has triangles whose corners are missing")
     triangles = corners.reshape(-1, 3)
     normals = _normals(file, attributes, points, triangles)
     uvs = np.zeros((0, 2))

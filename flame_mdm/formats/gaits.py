@@ -114,7 +114,7 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     so that the loops of a set begin with the same foot.
     """
     # A cycle is in the longest part with a steady speed in the requested direction. All pairs of
-    # frames at the distance of a plausible cycle are compared, by the distances of joints and
+    # frames that are a plausible cycle apart are compared, by the differences of joints and
     # velocities.
     along, aside = progress(motion, degrees)
     even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")

@@ -222,7 +222,7 @@ def _variants() -> dict[str, Layout]:
 def _spelled() -> dict[str, dict[str, str]]:
     """Returns spellings of the names of the joints that each of `_variants` uses.
 
-    For each layout, it is a mapping from spelling to name.
+    The result for a layout is a mapping from spelling to name.
     """
     return {name: spelled(layout.pairs()) for name, layout in _variants().items()}
 
@@ -322,7 +322,7 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 def _one(name: str, candidates: Sequence[str]) -> str:
     """Returns the joint of a file that a name means.
 
-    If there are several, it is the joint with exactly this name.
+    If several joints are possible, the joint with exactly this name is returned.
     """
     if len(set(candidates)) == 1 or name in candidates:
         return name if name in candidates else candidates[0]

@@ -252,7 +252,7 @@ def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) ->
     """Returns weights (V, 28) with helper bones.
 
     The upper part of a limb follows a helper bone, which turns less about the limb. In the
-    forearm, it is the lower part: it follows a bone that takes part in the twist of the wrist.
+    forearm, the lower part follows a helper bone, which takes part in the twist of the wrist.
     `joints` (22, 3) are the joints of the mesh.
     """
     columns = []

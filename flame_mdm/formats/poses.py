@@ -54,7 +54,8 @@ class Poses:
 
     # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
     offsets: Tensor
-    # (F, 22, 3, 3) float64, relative to the parents. They apply to the bones that leave a joint.
+    # (F, 22, 3, 3) float64, relative to the parents. A rotation applies to the bones that leave
+    # its joint.
     rotations: Tensor
     root: Tensor  # (F, 3) float64, position of the pelvis
 

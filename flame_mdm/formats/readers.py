@@ -480,7 +480,7 @@ def _label(path: Path, layout: Layout, rate: float) -> str:
 def _resampled(motion: Motion, fps: float | None) -> Motion:
     """Returns a motion at another frame rate, with only its joints.
 
-    If it has this rate already, it is returned unchanged.
+    A motion that already has this rate is returned unchanged.
     """
     if fps is None or math.isclose(motion.fps, fps):
         return motion

@@ -81,8 +81,8 @@ def frame_pairs(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
-    # Frames are counted from the first one, so that rounding errors do not accumulate. If the
-    # last new frame is slightly past the last old frame, it takes the value of the latter.
+    # Frames are counted from the first one, so that rounding errors do not accumulate. A new
+    # frame that is slightly past the last old frame takes the value of the last old frame.
     times = np.arange(count) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
     return before, np.minimum(before + 1, frames - 1), times - before

@@ -15,7 +15,7 @@ from flame_mdm.sampler_options import SamplerOptions
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """The function (x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> losses by name.
 
-Losses (B,) are weighted, per sample, of the clean estimate x0_hat.
+The losses (B,) of the clean estimate x0_hat are weighted; there is one per sample.
 """
 
 
@@ -77,7 +77,8 @@ class Process(nn.Module, ABC):
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """Returns the clean estimate (B, F, D).
 
-        For the output target(x, noise, t) and the noisy motion corrupt(x, noise, t), it is x.
+        If the output is target(x, noise, t) and the noisy motion is corrupt(x, noise, t), the
+        clean estimate is x.
         """
 
     def table_time(self, t: Tensor) -> Tensor:

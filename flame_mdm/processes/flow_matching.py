@@ -25,7 +25,7 @@ class FlowMatching(Process):
             The velocity is computed from the clean motion. A network narrower than the motion
             cannot represent the noise in the velocity.
         time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a
-            normal variable. The latter favors the middle (Esser et al. 2024, eq. 19).
+            normal variable, which favors the middle (Esser et al. 2024, eq. 19).
         quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's
             code.
         odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in

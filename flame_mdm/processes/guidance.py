@@ -94,7 +94,7 @@ class Positions:
     values: Tensor
 
     def of(self, joints: Tensor) -> Tensor:
-        """Returns these coordinates (..., M) of a motion (..., F, J, 3)."""
+        """Returns the values (..., M) that a motion (..., F, J, 3) has at these coordinates."""
         return joints[..., self.frames, self.joints, self.axes]
 
 

@@ -1,7 +1,7 @@
 """Samplers: functions that take one step from noise toward motion, with their capabilities.
 
-Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they get the
-clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field.
+Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, the samplers
+get the clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field.
 Coefficients and times are Python numbers, so no step waits for the device.
 """
 

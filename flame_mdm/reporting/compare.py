@@ -56,8 +56,8 @@ class ComparedRun:
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
     """Returns two or more runs and folders of motion files.
 
-    The label of a run consists of recipe and run name; the label of a folder is its name. If two
-    labels are the same, they are replaced with paths.
+    The label of a run consists of recipe and run name; the label of a folder is its name. Labels
+    that are the same are replaced with paths.
     """
     if len(set(folders)) < 2:
         raise UserError(

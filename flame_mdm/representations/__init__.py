@@ -121,7 +121,7 @@ class Representation(nn.Module, ABC):
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean and std (D,) for normalization, computed from all training frames (N, D).
 
-        Without `slices`, they are 0 and 1.
+        Without `slices`, mean and std are 0 and 1.
         """
         if self.slices:
             return grouped_statistics(features, self.slices.values())

@@ -41,10 +41,10 @@ class HumanML(Representation):
     root is at x = z = 0 and the body faces +z.
 
     The variant "legacy" equals the published data with all its peculiarities. Its heading
-    subtracts the hips from the shoulders instead of adding them. In the first frame, it is 0,
-    although the smoothed heading is not. `turn` is half the turn to the right, and changes sign
-    where the heading crosses 180 degrees. The root velocity is in the body coordinates of the
-    next frame. Rotations are rotations of bones in the world relative to the inverse heading,
+    subtracts the hips from the shoulders instead of adding them. In the first frame, the heading
+    is 0, although the smoothed heading is not. `turn` is half the turn to the right, and changes
+    sign where the heading crosses 180 degrees. The root velocity is in the body coordinates of
+    the next frame. Rotations are rotations of bones in the world relative to the inverse heading,
     also at the shoulders. `decode` is the published decoding. If a bone is exactly opposite to
     its rest direction, the published code gives NaN; here, the rotation is a half turn.
 
@@ -58,7 +58,7 @@ class HumanML(Representation):
 
     Args:
         skeleton: key in `SKELETONS`.
-        variant: "clean" for the intended features, "legacy" for the published ones.
+        variant: "clean" for the intended features, "legacy" for the published features.
         fps: frames per second.
         bone_lengths: J lengths in the features' unit. Each is the length of the bone that ends in
             a joint. All motions are retargeted to these lengths. None keeps the lengths of each

@@ -157,7 +157,7 @@ def _completed(rot6d: Tensor) -> Tensor:
 
 
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
-    """Returns Euler angles (..., 3) of matrices (..., 3, 3). The middle one is in [-pi/2, pi/2].
+    """Returns Euler angles (..., 3) of matrices (..., 3, 3). The middle angle is in [-pi/2, pi/2].
 
     In gimbal lock, the third angle is 0.
 

@@ -156,7 +156,7 @@ class EditRequest:
 class SamplingRequest:
     """Motions to sample: keywords of `flame_mdm.generate`.
 
-    Motions are sampled for texts or actions. If neither is given, they are unconditioned.
+    Motions are sampled for texts or actions. If neither is given, motions are unconditioned.
 
     A text or action may have several parts with their seconds, "walks forward @3 | turns left |
     sits down @2". The parts are generated together as one motion, in overlapping windows; see

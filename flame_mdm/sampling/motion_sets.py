@@ -154,9 +154,9 @@ class MadeSet:
 def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **options: Any) -> MadeSet:
     """Generates the motions of a set and cuts them into clips, with a progress bar.
 
-    Of the candidates for each motion, the one with the best clips is kept: similar poses at the
-    cuts, feet that stay in place and do not jerk, and few faults. A motion that the model cannot
-    do is left out.
+    For each motion, the candidate with the best clips is kept: with similar poses at the cuts,
+    feet that stay in place and do not jerk, and few faults. A motion that the model cannot do is
+    left out.
 
     Args:
         model: a model of SMPL's 22 joints that samples texts in windows.

@@ -76,10 +76,10 @@ def write_motions(
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder.
 
-    Either all of them are written, or none. Files of an earlier request that are not written
-    again are removed. Only the first eight motions are drawn. The stages of a sampling run are
-    drawn in `trajectory.png`. `facts` are added to each `.npz`. Links must not lead out of
-    `within`; see `flame_mdm.safe_io.atomic_folder`.
+    Either all files are written, or none. Files of an earlier request that are not written again
+    are removed. Only the first eight motions are drawn. The stages of a sampling run are drawn in
+    `trajectory.png`. `facts` are added to each `.npz`. Links must not lead out of `within`; see
+    `flame_mdm.safe_io.atomic_folder`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""

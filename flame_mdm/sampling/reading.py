@@ -99,7 +99,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
 def with_features(representation: Representation, motion: Motion) -> Motion:
     """Returns the motion with features of this representation.
 
-    If the motion has none, they are computed from its joints.
+    Missing features are computed from the joints of the motion.
     """
     name = f"{motion.id}: " if motion.id else ""
     if motion.representation == representation.name and math.isclose(

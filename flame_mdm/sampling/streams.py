@@ -61,7 +61,8 @@ def stream(
             model predicts at once. Shorter blocks react sooner to a new text, but cost more per
             second of motion.
         cleanup: smooth the motions, keep bone lengths constant, and keep feet from sliding. A
-            block is returned after the next block was computed, because it must fit that block.
+            block is returned after the next block was computed, because the two must fit
+            together.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:
             the model's.
 

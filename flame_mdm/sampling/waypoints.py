@@ -28,7 +28,8 @@ FASTEST = 1.3
 # Least radius of a bend in meters. This radius keeps a standing person from turning.
 TIGHTEST = 0.7
 # Size of the circle within which waypoints are too near, relative to the narrowest circle that
-# the person can walk. A bend begins slowly, so that with 1 a runner would circle a waypoint.
+# the person can walk. With 1, a runner would circle around a waypoint, because a bend begins
+# slowly.
 ROOM = 1.2
 PATIENCE = 0.4  # time constant in seconds with which deviations disappear
 SMOOTHING = (

@@ -62,7 +62,7 @@ class AdaptationTask(GeneratorTask):
     def dropped(self, batch: MotionBatch) -> Tensor:
         """Draws the dropped captions, but never drops captions of the user's clips.
 
-        With the null condition on these clips, guidance would lead away from them.
+        If these clips had the null condition, guidance would lead away from their motions.
         """
         is_kept = torch.tensor([name.startswith(KEPT) for name in batch.ids])
         return super().dropped(batch) & sent(is_kept, self.device)
@@ -86,9 +86,9 @@ def adapt(
 ) -> Path:
     """Teaches a text-conditioned model the motions in a folder; resumes an interrupted run.
 
-    The model is trained on the user's clips and on clips of its own data, so that it does not
-    forget its data. Prompts request the new motions with "in NAME style". `docs/own-motion.md` is
-    the guide.
+    The model is trained on the user's clips and on clips of its original training data, so that
+    it does not forget what it has learned. Prompts request the new motions with "in NAME style".
+    `docs/own-motion.md` is the guide.
 
     Args:
         base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a

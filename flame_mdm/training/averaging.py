@@ -47,7 +47,7 @@ class MovingAverage(WeightAveraging):
     def averaged(self) -> Any:
         """Returns the copy of the task with the averages.
 
-        During validation, it has the weights instead.
+        During validation, this copy has the trained weights instead.
         """
         assert self._average_model is not None
         return self._average_model.module

@@ -32,7 +32,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On a CPU: bfloat16 if the CPU has instructions for its products; `CheapDropout`; and
     `attention`, without dropout of the attention weights. Compilation made no difference there.
 
-    If the recipe has another precision than 32-true, it is kept.
+    A precision of the recipe other than 32-true is kept.
     """
     trainer, supported = config["trainer"], False
     device = trainer["accelerator"]

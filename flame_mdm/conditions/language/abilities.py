@@ -77,8 +77,8 @@ class Abilities:
     def supports(self, action: str, name: str, value: Value) -> bool:
         """Returns whether the model knows an action with this value of an attribute.
 
-        A caption must state both the action and the value. If the model has no captions, all
-        words for them must be in its vocabulary.
+        A caption must state both the action and the value. If the model has no captions, the
+        vocabulary must have all words for the action and the value.
         """
         key = (action, name, value)
         if key not in self._supported:

@@ -124,7 +124,8 @@ def joined(clauses: Sequence[Clause]) -> list[Clause]:
     """Merges clauses so that each has an action.
 
     A clause without an action is joined to the clause before, or to the next clause if it is the
-    first one. A clause such as "then faster" is not merged, because it repeats the action before.
+    first one. A clause such as "then faster" is not merged, because it repeats the previous
+    action.
     """
     merged: list[Clause] = []
     waiting: list[int] = []

@@ -173,7 +173,7 @@ class Reader:
     def _known_action(self, mention: Mention) -> tuple[str | None, dict[str, Value]]:
         """Returns a known action and the attributes that it needs.
 
-        If the model does not know the action itself, it is one that shows nearly the same.
+        If the model does not know the action itself, the returned action shows nearly the same.
         Returns None if there is no such action.
         """
         if mention.action in self.abilities.actions:
@@ -280,7 +280,8 @@ def _shown(text: str) -> str:
 def _caption(step: Step, words: str, special: Set[str]) -> str:
     """Returns the caption of a step.
 
-    It is the sentence's own words if the model knows one of them that no table explains.
+    If the model knows a word of the sentence that no table explains, the caption has the words of
+    the sentence.
     """
     return words if special & set(words.lower().split()) else caption(step)
 

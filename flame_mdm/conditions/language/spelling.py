@@ -56,8 +56,8 @@ def distance(first: str, second: str, most: int) -> int:
 def corrections(word: str) -> tuple[str, ...]:
     """Returns the words of the tables that a misspelled word may mean; () if none is near.
 
-    All of them have the same number of edits. A word of up to four letters may have one wrong
-    letter; a longer word may have two. Numbers are not corrected.
+    All returned words have the same number of edits. A word of up to four letters may have one
+    wrong letter; a longer word may have two. Numbers are not corrected.
     """
     if len(word) <= NEVER_CORRECTED or any(char.isdecimal() for char in word):
         return ()

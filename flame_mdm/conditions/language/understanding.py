@@ -12,8 +12,7 @@ class Mention:
 
     Attributes:
         action: its name in `actions.yaml`.
-        attributes: the attributes that the sentence states, of side, count, direction, speed and
-            amount.
+        attributes: side, count, direction, speed and amount, as far as the sentence states them.
         text: the words of the sentence for the action.
         start, end: position of its verb in the sentence.
         typed: the word that was read as this action because of its meaning; "" if the sentence

@@ -1,4 +1,7 @@
-"""Joins two motions. The second begins with the position and pose of the end of the first."""
+"""Joins two motions.
+
+The second motion begins at the position and in the pose in which the first motion ends.
+"""
 
 import copy
 

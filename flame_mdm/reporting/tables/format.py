@@ -275,8 +275,8 @@ def _inert(text: str) -> str:
 def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG; None if it has no points.
 
-    Curves have the names of rows; reported values are dashed. If the best value of a column is
-    the value of real motions, it is a dotted line.
+    Curves have the names of rows; reported values are dashed. In a column whose best value is the
+    value of real motions, this value is a dotted line.
     """
     panels = []
     for column in figure.y:

@@ -45,7 +45,7 @@ class Kind:
             a side, a direction or a speed is in that group instead.
         measure: function of a body and the claim.
         no, yes: scores that were set by hand. A claim is false up to `no`, and true from `yes`
-            on. In between, it is undecided.
+            on. In between, a claim is undecided.
         is_timed: whether the spans of the reading say when the claimed event happens. An order
             can then be read from them.
     """

@@ -238,7 +238,7 @@ def count_push_ups(body: Body, claim: Claim) -> Reading:
 
 
 def count_kicks(body: Body, claim: Claim) -> Reading:
-    """Counts how often an ankle is far above the other one."""
+    """Counts how often one ankle is far above the other."""
     height = np.abs(body.joints[:, ANKLES[0], 1] - body.joints[:, ANKLES[1], 1])
     if claim.side in SIDES:
         side = SIDES.index(claim.side)
@@ -276,7 +276,7 @@ def count_raises(body: Body, claim: Claim) -> Reading:
 
 
 def count_spins(body: Body, claim: Claim) -> Reading:
-    """Counts full turns in the largest turn in any direction."""
+    """Counts the full turns in the largest turn, to whichever side it is."""
     reading = turn(body, claim)
     turns = reading.number / 360
     claimed = claim.amount or 1
@@ -284,7 +284,7 @@ def count_spins(body: Body, claim: Claim) -> Reading:
 
 
 def kick(body: Body, claim: Claim) -> Reading:
-    """Measures the speed of an ankle relative to the pelvis, while the foot is the higher one."""
+    """Measures the speed of an ankle relative to the pelvis while its foot is the higher one."""
     higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
     speed = np.where(higher > 0.12, body.foot_speed, 0.0)
     readings = [existence(speed[:, side], "m/s", f"{SIDES[side]} foot", 0.06) for side in (0, 1)]

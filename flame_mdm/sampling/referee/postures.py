@@ -126,7 +126,7 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 
 
 def return_pose(body: Body, claim: Claim) -> Reading:
-    """Measures how far a joint is at the end from its position at the start, as seen by the body.
+    """Measures how far a joint moves from start to end, as seen by the body.
 
     The joint with the largest distance counts.
     """
@@ -140,7 +140,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the final distance from the start, relative to the largest distance from it."""
+    """Measures the final distance from the start, relative to the largest one."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])
@@ -219,7 +219,7 @@ def arms_crossed(body: Body, claim: Claim) -> Reading:
 
 
 def raise_foot(body: Body, claim: Claim) -> Reading:
-    """Measures how much higher an ankle is than the other one."""
+    """Measures how much higher one ankle is than the other."""
     higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
     readings = [
         existence(higher[:, side], "m above the other", f"{SIDES[side]} ankle", 0.1)

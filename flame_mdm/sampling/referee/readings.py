@@ -78,8 +78,9 @@ def existence(
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
     """Returns the reading of a limb, from the readings of the left and the right limb.
 
-    For "both", the lower reading counts. For "", the higher one counts. A left or right limb is
-    unclear if the other limb shows the same, that is, if their difference is less than `margin`.
+    For "both", the lower reading counts. For "", the higher reading counts. A left or right limb
+    is unclear if the other limb shows the same, that is, if their difference is less than
+    `margin`.
     """
     left, right = readings
     if side == "both":
@@ -126,8 +127,8 @@ def counted(
     """Returns a reading of the number of repetitions, which are peaks of a signal.
 
     Peaks are counted with a lower and a higher depth. The score is 0 if both counts are the
-    claimed count, and -0.5 if the claimed count is between them. Otherwise, it is minus the
-    distance between the claimed count and the nearest count, at most -1.
+    claimed count, and -0.5 if the claimed count is between them. Otherwise, the score is minus
+    the distance between the claimed count and the nearest count, at most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))

@@ -152,9 +152,10 @@ class Evaluator:
 
     @torch.no_grad()
     def reference(self) -> Rows | None:
-        """Returns the features of the real motions that the extractor brings with it.
+        """Returns the features of the extractor's own real motions.
 
-        Returns None if it brings none; sets are then compared with the data set.
+        Returns None for an extractor without such motions; sets are then compared with the data
+        set.
         """
         features = self.extractor and self.extractor.reference()
         if features is None:

@@ -255,7 +255,7 @@ BAD = {
     ),
     "yaml map": (
         lambda f: skeleton(f, map={"pelvis": "Hips"}),
-        r"skeleton\.yaml: map: no joint given for head",
+        r"skeleton\.yaml: the map has no joint for head",
     ),
     "map": (
         lambda f: skeleton(f, fps=30, map=HEADLESS),

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
 
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
-# Factor of the learned vectors of words. Rows of the word table are drawn from N(0, 1), so
-# vectors must change more than weights.
+# Learned vectors of words are multiplied by this factor. Rows of the word table are drawn from
+# N(0, 1), so vectors must change more than weights.
 FARTHER = 10.0
 Paths = str | Path | Sequence[str | Path]  # one file or several files
 

@@ -216,7 +216,7 @@ def write_model_file(
 ) -> Path:
     """Writes a model file atomically and returns its path.
 
-    The file is a .safetensors file, or `FILE` in a folder.
+    `out` is the .safetensors file, or a folder in which `FILE` is written.
     """
     from safetensors.torch import save
 

@@ -375,7 +375,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
             f"{path}: {where}: {first['msg']}. Use {keys} (docs/own-data.md)"
         ) from error
     if missing := sorted(set(SMPL22.joints) - set(fields.get("map", SMPL22.joints))):
-        raise UserError(f"{path}: map: no joint given for {', '.join(missing)}")
+        raise UserError(f"{path}: the map has no joint for {', '.join(missing)}")
     return fields
 
 

@@ -164,7 +164,8 @@ class Process(nn.Module, ABC):
 
         Args:
             denoise: the denoiser, with or without guidance; `options.guidance_scale` is ignored.
-            noise: returns draw 0, 1, 2, ... of the noise, (B, F, D). Sampling starts from draw 0.
+            noise: function that returns the draw with a number 0, 1, 2, ..., (B, F, D). Sampling
+                starts from draw 0.
             mask: (B, F) bool, True = real frame.
             cond: conditions of the batch.
             options: the sampler, its number of steps and its options.

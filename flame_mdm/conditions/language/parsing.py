@@ -91,9 +91,9 @@ class _Sentence:
     def steps(self) -> list[Step]:
         """Returns the actions in their order."""
         steps: list[Step] = []
-        # "While walking," comes before the clause that it belongs to
+        # Actions of "While walking,", which are added to the clause that follows
         during: list[Step] = []
-        # "Before sitting down," comes before what happens first
+        # Actions of "Before sitting down,", which happen after the clause that follows
         later: list[Step] = []
         for clause in self.clauses:
             added = self._actions(clause, steps)

@@ -479,7 +479,7 @@ def body_of_55_joints(root):
         (lambda r: shutil.rmtree(r / "amass"), r"amass: not found; register at https://amass"),
         (
             body_of_55_joints,
-            r"male/model\.npz: not a SMPL\+H model of 52 joints: J_regressor \(55, 80\)",
+            r"male/model\.npz: not a SMPL\+H model of 52 joints: J_regressor has shape \(55, 80\)",
         ),
         (lambda r: (r / "HumanML3D/index.csv").unlink(), r"index\.csv: not found"),
         (

@@ -62,8 +62,8 @@ def _rest_joints(
         or numbers != list(parents[1:])
     ):
         raise ValueError(
-            f"J_regressor has shape {regressor.shape} and v_template has shape {vertices.shape}; "
-            "these shapes or the tree of joints are not SMPL's"
+            f"J_regressor has shape {regressor.shape}, v_template has shape {vertices.shape}, or the "
+            "tree of joints differs"
         )
     rest = regressor @ vertices
     if not np.isfinite(rest).all():

@@ -681,7 +681,7 @@ def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
     assert main(["import", *words, "run_code=true"]) == 0
     for content in (b"not a checkpoint", (bad / "model.pt").read_bytes()[:-500]):
         (bad / "model.pt").write_bytes(content)
-        refused("import", *words, says="model.pt is damaged, or is not a ")
+        refused("import", *words, says="model.pt: damaged, or not a ")
 
 
 def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, subtests):

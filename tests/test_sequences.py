@@ -137,7 +137,7 @@ def test_a_loop_has_no_seam(model):
 def test_bad_requests_give_one_clear_line(model):
     cases: list[tuple[Any, dict[str, Any], str]] = [
         ("walks | | sits", {}, "part 2 is empty"),
-        ("walks @fast", {}, "seconds of a part are a number"),
+        ("walks @fast", {}, "duration of a part must be a number"),
         ("walks @0.2 | sits", {}, "'walks': a part of 0.2 seconds is too short"),
         ("walks @9999", {}, "too long"),
         (

@@ -334,8 +334,8 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
     assert ("", f"{labels}: NOT VALID: real motions have fid 3, expected 0.002 +- 0.02") in notes
     assert sum("NOT VALID" in note for _, note in notes) == 1
     (line,) = [line for line in rendered(table, "md").splitlines() if line.startswith("- Steps: ")]
-    assert "steps 5 / 5 / 10 / 10" in line
-    assert line.count("recipe synthetic/mdm") == 1
+    assert "steps = 5 / 5 / 10 / 10" in line
+    assert line.count("recipe = synthetic/mdm") == 1
 
 
 def test_a_row_that_is_not_valid_is_reported_by_the_exit_code(folder, capsys):

@@ -169,7 +169,8 @@ class SampleSettings(OutputSettings, WritingSettings):
         else:
             if self.path is not None:
                 raise UserError(
-                    f"path={self.path}: prompts cannot be given with a path. Give text and seconds"
+                    f"path={self.path}: a path cannot be combined with a file of prompts. Give "
+                    "text and seconds"
                 )
             request = self.request(
                 samples=samples,

@@ -196,7 +196,7 @@ class MotionSource(ABC):
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields all clips at `fps` frames per second, always in the same order.
 
-        It raises the same errors as `count`.
+        The method raises the same errors as `count`.
         """
 
     def check_fps(self, fps: float, published: float) -> None:

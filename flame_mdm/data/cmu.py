@@ -467,9 +467,9 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording of `frames` frames.
 
-    Durations have priority: KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. CMU's
-    list comes next. The `header` of the file is last, because conversions state 120 for nearly
-    all recordings.
+    Durations have priority: KIT-ML's `seconds` come first, then HumanML3D's `last` frame at 20
+    fps. CMU's list comes next. The `header` of the file is last, because conversions state 120
+    for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:

@@ -368,7 +368,10 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
     for key in ("action", "split", "source", "license"):
         if value := cells.get(key):
             if getattr(note, key) not in (None, value):
-                raise UserError(f"{name} has two values of {key}: {getattr(note, key)} and {value}")
+                raise UserError(
+                    f"{name} has two values of {key}: {getattr(note, key)} and {value}. Keep one "
+                    "of them"
+                )
             setattr(note, key, value)
 
 

@@ -286,8 +286,8 @@ class HumanML3DSMPL(MotionSource):
     Args:
         path: folder of HumanML3D with texts, splits and `index.csv`; no motions are needed.
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
-        humanact12: FLAME's `humanact12_processed.pkl`. Without it, the clips of HumanAct12 are
-            left out.
+        humanact12: FLAME's `humanact12_processed.pkl`. Without this file, the clips of HumanAct12
+            are left out.
         published_split: train on the validation clips as well (FLAME's "final"). No clips are
             then left for validation.
     """

@@ -26,7 +26,7 @@ CHUNK = 1 << 16  # number of frames that are copied at once, so that copying tak
 def free_memory(device: torch.device) -> int:
     """Returns the free memory of a device in bytes.
 
-    For other devices than GPUs, this is what the system or the container can provide.
+    For devices other than GPUs, this is the memory that the system or the container can provide.
     """
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]

@@ -20,8 +20,8 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy, read_text
 
-# Frames per second of the tags `from` and `to`. The published code uses 20 for KIT-ML, too,
-# although its motions have 12.5.
+# Frames per second with which the tags `from` and `to` are converted to frames. The published
+# code uses 20 for KIT-ML, too, although its motions have 12.5.
 TAG_FPS = 20
 MAX_LENGTH = 200  # motions and cuts with this number of frames or more are left out
 MAX_TOKENS = 20

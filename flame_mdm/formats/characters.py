@@ -247,7 +247,8 @@ def _listed(
 ) -> dict[str, list[int]]:
     if not isinstance(chosen, dict):
         raise UserError(
-            f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`"
+            f"{listed}: this is not a list of names. Write one name per line, such as `left_knee: "
+            "Calf L`"
         )
     candidates = {}
     for joint, name in chosen.items():

@@ -85,8 +85,8 @@ def cleanup(
         fps: frames per second.
         skeleton: skeleton of the joints.
         contacts: (F, N), probabilities that each of `skeleton.feet` stands on the floor until the
-            next frame. Models predict them for some representations. None = they are estimated
-            from height and speed of the toes.
+            next frame. For some representations, models predict these probabilities. None = they
+            are estimated from height and speed of the toes.
 
     Returns:
         Joints (F, J, 3) float32.

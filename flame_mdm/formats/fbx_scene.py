@@ -61,7 +61,7 @@ TIME_MODES = {
 CONSTANT, CUBIC = 0x2, 0x8
 # Bit of a constant segment that has the value of the key after it
 NEXT_VALUE = 0x100
-# A frame takes the value of a key up to this many seconds later
+# A frame takes the value of a key that is up to this many seconds later
 UNSTEPPED = 1e-6
 
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -231,7 +231,7 @@ class _Scene:
         self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:
-                raise ValueError("a connection has no ends")
+                raise ValueError("a connection does not name its two objects")
             kind, child, parent, *names = record.properties
             self.below[parent].append((child, str(names[0]) if kind == "OP" and names else ""))
             if child in self.models and parent in self.models and kind == "OO":

@@ -221,7 +221,7 @@ class _Writer:
         return number
 
     def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
-        """Adds the matrices (4, 4) of objects in the bind pose of the meshes, by id."""
+        """Adds the matrix (4, 4) of each object, by id, in the bind pose of the meshes."""
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))

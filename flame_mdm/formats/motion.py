@@ -104,7 +104,8 @@ class Motion(PosedFigure):
         shape, expected = self.joints.shape, (len(skeleton.joints), 3)
         if shape[1:] != expected or not shape[0]:
             raise UserError(
-                f"{name}: joints have shape {shape}, {skeleton.name} needs (frames, {expected[0]}, 3)"
+                f"{name}: joints have shape {shape}, but {skeleton.name} needs (frames, "
+                f"{expected[0]}, 3)"
             )
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]

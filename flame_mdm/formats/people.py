@@ -216,7 +216,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows.
 
-    The hair is the mannequin's.
+    The hair has the shape of the mannequin's hair.
     """
     table = np.array([CLOTHES.get(name.split("_")[-1], SHIRT) for name in SMPL22.joints], float)
     colors = weights @ table

@@ -47,7 +47,7 @@ def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
 def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a skeleton in `rigs.yaml`.
 
-    A part is its key, the prefix of SMPL's joints, and the mark of the side in names.
+    Each part is given by its key, the prefix of SMPL's joints, and the mark of the side in names.
     """
     yield "trunk", "", ""
     for side, mark in zip(("left_", "right_"), skeleton["sides"], strict=True):

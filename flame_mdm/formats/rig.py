@@ -30,8 +30,8 @@ SNAP = 8
 BEND = 0.25
 # Maximum height in meters of the lowest joint of a clip that stands on the floor
 GROUND = 0.1
-# Distance of the knee from the line of the leg, in lengths of the thigh, at which the bend and
-# the front of the thigh have the same weight
+# Distance of the knee from the line of the leg, in thigh lengths, at which the bend of the knee
+# and the front of the thigh have the same weight
 STRAIGHT = 0.05
 REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 
@@ -58,7 +58,7 @@ class Rig:
     unit: float = CENTIMETER
     # (3, 3), rotation from the world of the file
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))
-    # (J,), world units per unit of a joint; an empty array means 1
+    # (J,), scale of each joint: world units per unit of the joint. Empty = all scales are 1
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property

@@ -48,7 +48,7 @@ class History(Logger):
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Appends a line of metrics.
 
-        In a resumed run, lines after the resumed step are dropped before.
+        A resumed run first drops the lines after the step from which it resumes.
         """
         if not self.begun:
             kept = [line for line in records(self.path) if line["step"] <= self.step]

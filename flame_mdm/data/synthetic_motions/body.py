@@ -88,7 +88,7 @@ class Body:
         self.arms += np.array(
             [rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)]
         )[:, None]
-        # Additional rise of the shoulders, beyond the arm's
+        # Rise of the shoulders in addition to the rise with the arms
         self.shoulders = np.zeros((2, len(t)))
         # Whether a foot that is too far away is pulled toward its hip, instead of a longer shin
         self.keeps_legs = False

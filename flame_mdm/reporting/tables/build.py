@@ -394,8 +394,8 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Formats the numbers of each column with the same number of decimals.
 
-    The largest number has about three digits. Settings with at most one decimal keep their text.
-    Numbers that would round to zero show two significant digits.
+    The largest number has about three digits. Values of settings with at most one decimal are
+    printed unchanged. Numbers that would round to zero show two significant digits.
     """
     for index in range(columns):
         cells = [

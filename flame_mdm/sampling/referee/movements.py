@@ -140,7 +140,7 @@ def run(body: Body, claim: Claim) -> Reading:
 
 
 def walk(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled at a speed below a run's, 2.2 m/s."""
+    """Measures the distance traveled below the speed of a run, 2.2 m/s."""
     is_walk = (body.speed > MOVING) & (body.speed < 2.2)
     distance = float(body.speed[is_walk].sum() / RATE)
     spans = spans_of(is_walk, 0.3)

@@ -202,7 +202,7 @@ def hand_on_hip(body: Body, claim: Claim) -> Reading:
 
 
 def arms_out(body: Body, claim: Claim) -> Reading:
-    """Measures how far both wrists are to the sides of the shoulders, in lengths of an arm."""
+    """Measures how far both wrists are out to the sides of the shoulders, in arm lengths."""
     aside = body.seen[:, WRISTS, 0] - body.seen[:, SHOULDERS, 0]
     outward = np.minimum(aside[:, 0], -aside[:, 1]) / body.reach
     is_up = (body.joints[:, WRISTS, 1] - body.joints[:, SHOULDERS, 1]).min(1) > -0.35

@@ -48,7 +48,7 @@ test-tools: $(READY) ## run the tests that need outside tools: a browser, ffmpeg
 
 test-robustness: $(READY) ## run all malformed inputs, process kills, launchers, full disks, benchmarks and long comparisons; before a release, and after changes to readers
 	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m robustness tests
-	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m "not robustness and not tools" tests/test_fuzz.py tests/test_untrusted_*.py
+	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m "not robustness and not tools" tests/test_fuzz.py tests/test_scenes.py tests/test_untrusted_*.py
 
 lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff check .

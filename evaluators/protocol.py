@@ -250,9 +250,7 @@ class Protocol(ClosedSchema):
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
             reason = f"the split has no clip with at least {clips.crop.min_frames} frames{only}"
-            raise UserError(
-                f"{reason}. Choose another with split=..., or add a `split` column to captions.csv"
-            )
+            raise UserError(f"{reason}. Choose another with split=NAME.{clips.advice}")
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):

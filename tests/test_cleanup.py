@@ -138,6 +138,13 @@ def test_a_foot_that_lands_does_not_skate():
     assert FootSkating(FPS).measure(motion).tolist() == [False, True]
 
 
+def test_one_foot_that_slides_is_enough_to_skate():
+    motion = torch.full((3, 22, 3), 0.5)
+    motion[:, [10, 11], 1] = 0.0
+    motion[:, 10, 0] = torch.tensor([0.0, 0.1, 0.1])
+    assert FootSkating(FPS).measure(motion).tolist() == [True, False]
+
+
 def test_hands_leave_the_body_without_a_jolt(clips):
     """Wrists of a walk are drawn 25 cm into the trunk and back within a second; all bones keep their lengths."""
     clip = next(clip for clip in clips if clip.attributes["action"] == "walk")

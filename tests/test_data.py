@@ -202,6 +202,8 @@ def test_batches_are_a_function_of_their_number_and_processes_share_them(subtest
     )
     assert all(number == n for n, batch in enumerate(stream) for _, number in batch)
     assert [batches(20, rank=rank, world=2) for rank in (0, 1)] == [stream[0::2], stream[1::2]]
+    resumed = [batches(15, first=5, rank=rank, world=2) for rank in (0, 1)]
+    assert resumed == [stream[10::2], stream[11::2]], "each process has taken five batches"
     lengths = np.random.default_rng(0).integers(24, 60, 31)
     for world in (1, 2, 3):
         with subtests.test(world=world):

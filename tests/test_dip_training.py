@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from flame_mdm.__main__ import main
-from flame_mdm.batch import Condition, MotionBatch, collate
+from flame_mdm.batch import Condition, MotionBatch, collate, length_mask
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import compose, instantiate
@@ -269,6 +269,22 @@ def test_clips_without_a_frame_to_predict_are_refused_before_training(tmp_path, 
     assert "data.crop: a sample of 40 frames has no frames after a prefix of 40" in one_error(
         capsys
     )
+
+
+def test_the_loss_of_targets_is_measured_at_the_end_of_each_motion():
+    aims = ["denoiser=dip_target", "task=generation_targets", "task.targets.choices=[[pelvis]]"]
+    config = compose("synthetic/dip", [*aims, *WORDS, "denoiser.context_frames=10"])
+    representation = instantiate(config["representation"])
+    task = GeneratorTask.build(config, representation).double().eval()
+    mask = length_mask(torch.tensor([40, 30]))
+    x = torch.randn(2, 40, representation.features, generator=torch.Generator().manual_seed(0))
+    x = x.double() * mask[..., None]
+    texts = ["a person walks", "a person sits"]
+    padded = task.losses_of(MotionBatch(x, mask, ["long", "short"], texts))
+    alone = task.losses_of(MotionBatch(x[1:, :30], mask[1:, :30], ["short"], texts[1:]))
+    assert padded["target"].min() > 0.01
+    for name in ("target", "loss"):
+        torch.testing.assert_close(padded[name][1:], alone[name])
 
 
 RUN = [

@@ -11,6 +11,10 @@ from evaluators.evaluation_request import EvaluationRequest
 from evaluators.plan import Plan
 from evaluators.protocol import Protocol
 from evaluators.results import Outcome, Scores
+from flame_mdm.data.crops import Units
+from flame_mdm.data.folder import Folder
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
 from flame_mdm.records import Value
 from flame_mdm.sampler_options import SamplerOptions
 
@@ -90,11 +94,23 @@ def test_bounds_of_real_motions_hold_for_the_number_of_motions_of_the_protocol()
     assert evaluation()._unexpected(value(0.08)) == [
         "real motions have fid 0.08, expected 0.06 +- 0.01"
     ]
+    assert evaluation()._unexpected(value(0.04)) == [
+        "real motions have fid 0.04, expected 0.06 +- 0.01"
+    ]
     assert evaluation(split="val")._unexpected(value(0.08)) == []
     assert evaluation(resized=True)._unexpected(value(0.08)) == []
     (line,) = evaluation(resized=True)._conditions()
     assert "the expected values of real motions were not checked" in line
     assert evaluation()._conditions() == []
+
+
+def test_only_own_data_gets_the_advice_to_change_its_splits(tmp_path: Path):
+    for source, advised in ((Folder(str(tmp_path)), True), (Synthetic(seed=0), False)):
+        clips = SimpleNamespace(crop=Units(), advice=source.advice_on_splits)
+        protocol = SimpleNamespace(selected=lambda clips: [], only={})
+        with pytest.raises(UserError, match="no clip with at least 40 frames") as refused:
+            Protocol.rows(cast(Any, protocol), cast(Any, clips), 0, 0)
+        assert ("captions.csv" in str(refused.value)) == advised, type(source).__name__
 
 
 def test_repeated_clips_are_said():

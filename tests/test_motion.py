@@ -1,6 +1,7 @@
 """`Motion`, and every kind of motion file through every command that takes one."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -155,6 +156,12 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
             with pytest.raises(UserError, match=message) as caught:
                 edit(model, motion, fps=fps, region="prediction")
             assert "\n" not in str(caught.value)
+
+
+def test_parts_keep_their_seconds_at_another_rate(walk: Motion):
+    parts = (("a person walks", 0, 30), ("a person stops", 30, 75))
+    resampled = replace(walk, parts=parts).resampled(20.0)
+    assert resampled.parts == (("a person walks", 0, 20), ("a person stops", 20, 50))
 
 
 @pytest.mark.parametrize("name", ["a.bvh", "folder/../a.bvh", "link.bvh", "second.bvh"])

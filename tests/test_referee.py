@@ -266,6 +266,16 @@ def test_mirroring_reversal_freezing_and_a_dropped_repetition_are_noticed():
     assert answers(raised, "raises the left arm twice")[claim] == "no"
 
 
+def test_both_arms_are_raised_only_if_both_are_up():
+    swing = np.sin(np.pi * np.arange(60) / 60)
+    up, down = -75 + 155 * swing, np.full(60, -75.0)
+    for right, answer in ((up, "yes"), (down, "no")):
+        arms = [np.stack([0 * up, 0 * up, angle], 1) for angle in (up, -right)]
+        once = posed(60, left_shoulder=arms[0], right_shoulder=arms[1]).joints
+        twice = Motion(np.concatenate([once, once]), FPS)
+        assert answers(twice, "raises both arms twice")["count raises: both, 2"] == answer
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_the_perturbation_of_an_audit_drops_one_repetition(count, subtests):
     pause = np.repeat(raising("left").joints[:1], 10, 0)

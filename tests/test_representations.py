@@ -19,6 +19,7 @@ from support.fixtures import (
     tensors,
     third_party,
 )
+from support.motions import posed
 from torch import Tensor
 from torch.nn import functional
 
@@ -252,6 +253,17 @@ def test_clean_motions_are_canonical_and_come_back_also_with_bones_opposite_to_t
                 decode_rotations(representation, features.double(), lengths), canonical[:-1], 1e-5
             )
             assert HumanML(variant="legacy").encode(joints).isfinite().all()
+
+
+def test_headings_are_smoothed_over_the_same_seconds_at_any_rate():
+    turned = []
+    for fps in (20, 60):
+        seconds = torch.arange(4 * fps) / fps
+        joints = posed(4 * fps, heading=(2.0 * seconds).sin().numpy()).joints
+        features = HumanML(fps=fps).encode(torch.from_numpy(joints))
+        turned.append(features[:, 0].cumsum(0)[fps // 20 - 1 :: fps // 20])
+    assert turned[0].abs().max() > 0.1
+    close(turned[0], turned[1][: len(turned[0])], 0.02)
 
 
 def test_many_motions_at_once_are_encoded_as_one_by_one(subtests):

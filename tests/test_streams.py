@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from itertools import islice
 from pathlib import Path
@@ -25,6 +26,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling import waypoints
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
 from flame_mdm.sampling.placement import Placement
@@ -555,6 +557,13 @@ def test_every_waypoint_is_reached_at_any_speed(subtests):
                         heading += bend
                         nearest = min(nearest, math.dist((x, z), goal))
                 assert nearest < 0.3, (speed, goal)
+
+
+@pytest.mark.parametrize("name", ["NEAR", "FASTEST", "TIGHTEST", "ROOM", "PATIENCE", "SMOOTHING"])
+def test_the_web_page_has_the_same_numbers_for_waypoints(name):
+    script = (ROOT / "tools/web/waypoints.js").read_text()
+    (number,) = re.findall(rf"const {name} = ([\d.]+);", script)
+    assert float(number) == getattr(waypoints, name)
 
 
 @pytest.mark.tools

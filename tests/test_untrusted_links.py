@@ -470,6 +470,17 @@ def test_a_folder_that_a_killed_command_left_is_removed_by_the_next_one(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+def test_what_a_killed_command_left_is_removed_by_the_next_write_to_the_folder(tmp_path):
+    if not (child := os.fork()):
+        with atomic_write(tmp_path / "walk.bvh") as file:
+            file.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert [path.name[:6] for path in tmp_path.iterdir()] == [".walk."]
+    write_json(tmp_path / "other.json", {})
+    assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
+
+
 @pytest.mark.slow
 def test_push_overwrites_the_model_file_that_it_wrote_only(tmp_path, trained):
     model = hub.export(trained, tmp_path)

@@ -130,13 +130,22 @@ class Fixed(Crop):
 class Clips(Dataset[Sample]):
     """The clips of a split that are long enough for the crop rule.
 
-    At every draw, a clip is cropped and then normalized.
+    At every draw, a clip is cropped and then normalized. `advice` is part of the error if the
+    split has no clips; see `flame_mdm.data.advice_on_splits`.
     """
 
     def __init__(
-        self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int
+        self,
+        store: Store,
+        split: Split,
+        *,
+        representation: Representation,
+        crop: Crop,
+        seed: int,
+        advice: str = "",
     ):
         self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
+        self.advice = advice
         of_split = [clip for clip in store.clips if clip.split == split]
         self.clips = [clip for clip in of_split if clip.length >= crop.min_frames]
         self.too_short = len(of_split) - len(self.clips)

@@ -216,10 +216,7 @@ class MotionDataModule(LightningDataModule):
             if n and not used[split]:
                 advice.append(f"all {split} clips are too short: lower data.crop.min_frames")
             elif not used[split]:
-                remedy = (
-                    " Add a `split` column to captions.csv" if self.source.named_by_recipe else ""
-                )
-                advice.append(f"no {split} clips.{remedy}")
+                advice.append(f"no {split} clips.{self.source.advice_on_splits}")
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
             advice.append(
                 "no captions: add captions.csv and prepare with force=true, or train with condition=none"
@@ -274,7 +271,12 @@ class MotionDataModule(LightningDataModule):
         ):
             split = "train"
         return Clips(
-            self.store, split, representation=self.representation, crop=self.crop, seed=self.seed
+            self.store,
+            split,
+            representation=self.representation,
+            crop=self.crop,
+            seed=self.seed,
+            advice=self.source.advice_on_splits,
         )
 
     def train_dataloader(self) -> Loader:

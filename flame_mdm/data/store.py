@@ -255,8 +255,8 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         entries, frames = _pack(folder, source.name, encoded, representation.features)
     splits = Counter(entry.split for entry in entries)
     if not splits["train"]:
-        advice = " Add a `split` column to captions.csv" if source.named_by_recipe else ""
-        raise UserError(f"{source.name}: no clip is in the training split.{advice}")
+        reason = f"{source.name}: no clip is in the training split."
+        raise UserError(f"{reason}{source.advice_on_splits}")
     index = "".join(f"{_line(entry)}\n" for entry in entries)
     (folder / "clips.jsonl").write_text(index, encoding="utf-8")
     mean, std = source.statistics() or training_statistics(folder, entries, frames, representation)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import functools
 import hashlib
 import json
 import math
@@ -71,7 +72,8 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
     A failure leaves no files behind. The temporary name is unique, so that several processes can
     write the same file; the last process wins. A link at `path` is replaced; the file to which it
-    leads does not change.
+    leads does not change. Temporary files that killed processes left in the folder are removed
+    before the first file that this process writes there.
 
     Args:
         path: file to write.
@@ -130,6 +132,7 @@ def _temporary(path: Path) -> Iterator[Path]:
     temporary = path
     try:
         with made_folder(path.parent), temporary_beside(path) as temporary:
+            _remove_abandoned_once(path.parent.absolute())
             yield temporary
     except UserError as error:
         if str(temporary) not in str(error):
@@ -143,6 +146,16 @@ def _temporary(path: Path) -> Iterator[Path]:
         if error.errno is None or not within:
             raise
         raise UserError(f"{path}: cannot be written: {write_failure(error, path)}") from error
+
+
+@functools.cache
+def _remove_abandoned_once(folder: Path) -> None:
+    """Removes what killed processes left behind, before the first file of this process.
+
+    Listing the folder for each of thousands of files would take too long.
+    """
+    with suppress(PermissionError):  # a folder that cannot be listed
+        remove_abandoned(folder)
 
 
 def write_failure(error: BaseException, path: Path) -> str:

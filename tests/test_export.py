@@ -80,6 +80,13 @@ def test_recorded_motion_comes_out_exactly_and_neither_limbs_flip_nor_angles_jum
     assert torch.rad2deg(angles.diff(dim=0).abs().max()) < 100
 
 
+def test_euler_angles_go_on_where_the_middle_one_passes_a_quarter_turn():
+    bend = torch.linspace(0, 170, 36, dtype=torch.float64).deg2rad()
+    axes = torch.stack([0 * bend, 0 * bend, bend], -1)
+    angles = continuous_euler(rotation.axis_angle_to_matrix(axes)[:, None], ["YZX"])[:, 0]
+    torch.testing.assert_close(angles, axes[:, [1, 2, 0]], rtol=0, atol=1e-6)
+
+
 def test_turns_and_backward_walks_do_not_flip_and_bent_limbs_show_their_twist(subtests):
     start, way = np.array([0, 0.95, 0]), np.linspace(0, 2, 60)[:, None] * [0, 0, 1]
     for made in (two_circles(), walking(0.0, start - way), walking(np.pi, start + way)):

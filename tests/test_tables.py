@@ -195,6 +195,16 @@ def test_cells_ranks_and_real_motions(folder):
     )
 
 
+def test_a_baseline_is_shown_but_not_ranked(folder):
+    change(folder, "MFM", baseline="noisy", checkpoint=None)
+    lines = rows(folder)
+    mdm, mfm = lines["measured: MDM"], lines["measured: MFM"]
+    assert mfm.marks == mdm.marks
+    assert not any(cell and cell.rank for cell in mfm.cells)
+    assert mdm.cells[0] is not None
+    assert mdm.cells[0].rank == 1, "the baseline has a lower FID"
+
+
 def test_rows_of_another_evaluator_are_marked_and_not_compared(folder, subtests):
     for changes in (
         {"extractor": {"sha256": "d" * 64}},

@@ -481,6 +481,13 @@ def test_what_a_killed_command_left_is_removed_by_the_next_write_to_the_folder(t
     assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_json_file_never_has_numbers_that_json_lacks(number: float, tmp_path: Path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "result.json", {"fid": float(number)})
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_push_overwrites_the_model_file_that_it_wrote_only(tmp_path, trained):
     model = hub.export(trained, tmp_path)

@@ -11,6 +11,7 @@ from evaluators.evaluation_request import EvaluationRequest
 from evaluators.plan import Plan
 from evaluators.protocol import Protocol
 from evaluators.results import Outcome, Scores
+from flame_mdm.data import advice_on_splits
 from flame_mdm.data.crops import Units
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.synthetic import Synthetic
@@ -106,7 +107,7 @@ def test_bounds_of_real_motions_hold_for_the_number_of_motions_of_the_protocol()
 
 def test_only_own_data_gets_the_advice_to_change_its_splits(tmp_path: Path):
     for source, advised in ((Folder(str(tmp_path)), True), (Synthetic(seed=0), False)):
-        clips = SimpleNamespace(crop=Units(), advice=source.advice_on_splits)
+        clips = SimpleNamespace(crop=Units(), advice=advice_on_splits(source))
         protocol = SimpleNamespace(selected=lambda clips: [], only={})
         with pytest.raises(UserError, match="no clip with at least 40 frames") as refused:
             Protocol.rows(cast(Any, protocol), cast(Any, clips), 0, 0)

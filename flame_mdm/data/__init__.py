@@ -103,14 +103,6 @@ class MotionSource(ABC):
     # Names to leave out
     exclude: Collection[str] = ()
 
-    @property
-    def advice_on_splits(self) -> str:
-        """Advice for a split without clips, after a space.
-
-        "" for a published data set, whose splits are fixed.
-        """
-        return " Add a `split` column to captions.csv" if self.named_by_recipe else ""
-
     @cached_property
     def excluded(self) -> Counter[str]:
         """Number of clips or labels left out, by reason; saved in the store.
@@ -217,6 +209,14 @@ class MotionSource(ABC):
             raise UserError(
                 f"{self.name} has {published:g} frames per second, not {fps:g}: set representation.fps"
             )
+
+
+def advice_on_splits(source: MotionSource) -> str:
+    """Returns advice for a split without clips, after a space.
+
+    It is "" for a published data set, whose splits are fixed.
+    """
+    return " Add a `split` column to captions.csv" if source.named_by_recipe else ""
 
 
 def required(path: Path, get_it: str) -> Path:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Sampler
 
 from flame_mdm.batch import collate
-from flame_mdm.data import MotionSource, Split
+from flame_mdm.data import MotionSource, Split, advice_on_splits
 from flame_mdm.data.crops import Clips, Crop, Draw, Sample
 from flame_mdm.data.resident import SHARE, ResidentLoader, free_memory, resident_features
 from flame_mdm.data.store import Store, write_store
@@ -216,7 +216,7 @@ class MotionDataModule(LightningDataModule):
             if n and not used[split]:
                 advice.append(f"all {split} clips are too short: lower data.crop.min_frames")
             elif not used[split]:
-                advice.append(f"no {split} clips.{self.source.advice_on_splits}")
+                advice.append(f"no {split} clips.{advice_on_splits(self.source)}")
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
             advice.append(
                 "no captions: add captions.csv and prepare with force=true, or train with condition=none"
@@ -276,7 +276,7 @@ class MotionDataModule(LightningDataModule):
             representation=self.representation,
             crop=self.crop,
             seed=self.seed,
-            advice=self.source.advice_on_splits,
+            advice=advice_on_splits(self.source),
         )
 
     def train_dataloader(self) -> Loader:

@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from flame_mdm.data import SPLITS, Clip, MotionSource, Split
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, advice_on_splits
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.progress import ProgressBar
@@ -256,7 +256,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
     splits = Counter(entry.split for entry in entries)
     if not splits["train"]:
         reason = f"{source.name}: no clip is in the training split."
-        raise UserError(f"{reason}{source.advice_on_splits}")
+        raise UserError(f"{reason}{advice_on_splits(source)}")
     index = "".join(f"{_line(entry)}\n" for entry in entries)
     (folder / "clips.jsonl").write_text(index, encoding="utf-8")
     mean, std = source.statistics() or training_statistics(folder, entries, frames, representation)

@@ -608,16 +608,6 @@ def test_other_sampling_options_have_other_folders_of_motions(runs):
     assert len(set(folders)) == len(folders)
 
 
-def test_results_of_other_sizes_have_other_files(runs):
-    config = read_checkpoint(runs.model)["config"]
-    shared: dict[str, Any] = {name: config[name] for name in ("data", "representation")}
-    shared |= {"protocol": "synthetic", "baseline": "real", "extractor": "none"}
-    shared["data_root"] = str(runs.root)
-    sizes: list[dict[str, Any]] = [{}, {"quick": True}, {"replications": 3}]
-    plans = [Plan(EvaluationRequest(**shared, **size), "cpu") for size in sizes]
-    assert len({plan.path for plan in plans}) == len(sizes)
-
-
 def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs, subtests):
     data = runs.data()
     protocol = load_protocol("synthetic", data.representation)

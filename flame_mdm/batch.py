@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -104,6 +104,8 @@ class Condition:
         """
         if self.null is None:
             raise ValueError("this condition has no null condition, so samples cannot be dropped")
+        if not self.pooled.shape[1]:  # unconditioned: the condition is its null condition
+            return self
         null = self.null
         pooled = torch.where(drop[:, None], null.pooled.to(self.pooled), self.pooled)
         if self.token_mask is None:
@@ -271,6 +273,31 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
     """
     copied = device.type == "cuda" and x.device.type == "cpu"
     return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
+
+
+class Constant:
+    """Numbers that do not change, as one tensor per device.
+
+    They are no buffer of a module, so that neither casting a model nor building it without
+    values changes them.
+
+    Example:
+        >>> table = Constant([1.0, 2.0])
+        >>> table.on(torch.device("cpu")) is table.on(torch.device("cpu"))
+        True
+    """
+
+    def __init__(self, values: Sequence[Any]):
+        self.values = values
+        self.tensors: dict[torch.device, Tensor] = {}
+
+    def on(self, device: torch.device) -> Tensor:
+        """Returns the tensor on a device. Only the first call for a device waits for a copy."""
+        if device not in self.tensors:
+            # The first call may be in a validation, whose tensors cannot be used in training.
+            with torch.inference_mode(False):
+                self.tensors[device] = torch.tensor(self.values, device=device)
+        return self.tensors[device]
 
 
 def collate(

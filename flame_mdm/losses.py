@@ -1,9 +1,11 @@
 """Reconstruction error over real frames, and geometric losses of the clean estimate."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 CONTACT_SPEED = 0.01
 """Maximum displacement per frame, in meters, of a foot in contact in the data."""
@@ -35,7 +37,27 @@ def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
         >>> masked_mse(torch.zeros(1, 2, 3), torch.full((1, 2, 3), 2.0), torch.ones(1, 2) > 0).tolist()
         [4.0]
     """
-    return masked_mean((a - b).square(), mask)
+    return _MaskedSquaredError.apply(*torch.broadcast_tensors(a, b), mask)  # type: ignore[return-value]
+
+
+class _MaskedSquaredError(torch.autograd.Function):
+    """`masked_mean((a - b).square(), mask)`, bit for bit, in about half as many passes."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
+        difference = a - b
+        squares = difference.square().flatten(2)
+        entries = mask.sum(1).clamp(min=1) * squares.shape[2]
+        ctx.save_for_backward(difference, mask, entries)
+        return squares.mul_(mask[..., None]).sum((1, 2)) / entries
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        difference, mask, entries = ctx.saved_tensors
+        factor = (2 * (gradients[0] / entries))[:, None] * mask
+        of_a = difference * factor.reshape(*mask.shape, *[1] * (difference.ndim - 2))
+        return of_a, -of_a if ctx.needs_input_grad[1] else None, None
 
 
 def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> Tensor:
@@ -95,6 +117,7 @@ class MotionLosses(nn.Module):
         super().__init__()
         self.to_joints = to_joints
         self.feet, self.edges = list(feet), list(edges)
+        self._indices: dict[torch.device, tuple[Tensor, Tensor]] = {}
         self.joints, self.velocity, self.foot_contact, self.bone_length = (
             joints,
             velocity,
@@ -102,6 +125,19 @@ class MotionLosses(nn.Module):
             bone_length,
         )
         self.root_relative, self.velocity_features = root_relative, velocity_features
+
+    def indices(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Returns the feet (N,) and the bones (M, 2), int64, on a device.
+
+        They are copied to it once. Lists would be copied in every step, for which a GPU waits.
+        """
+        if device not in self._indices:
+            # The first call may be in a validation, whose tensors cannot be used in training.
+            with torch.inference_mode(False):
+                feet = torch.tensor(self.feet, dtype=torch.long, device=device)
+                edges = torch.tensor(self.edges, dtype=torch.long, device=device)
+                self._indices[device] = feet, edges.reshape(-1, 2)
+        return self._indices[device]
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns the weighted losses (B,) by name.
@@ -123,19 +159,16 @@ class MotionLosses(nn.Module):
         if not (self.joints or self.foot_contact or self.bone_length):
             return losses
         predicted, real = self.to_joints(x0_hat), self.to_joints(x)
+        feet, edges = self.indices(x.device)
         if self.root_relative:
             predicted, real = predicted - predicted[:, :, :1], real - real[:, :, :1]
         if self.joints:
             losses["joints"] = self.joints * masked_mse(predicted, real, mask)
         if self.foot_contact:
-            in_contact = (
-                real[:, :, self.feet].diff(dim=1).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
-            )
-            slide = torch.where(in_contact, predicted[:, :, self.feet].diff(dim=1), 0.0)
+            in_contact = real[:, :, feet].diff(dim=1).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
+            slide = torch.where(in_contact, predicted[:, :, feet].diff(dim=1), 0.0)
             losses["foot_contact"] = self.foot_contact * masked_mean(slide.square(), moving)
         if self.bone_length:
-            lengths, real_lengths = (
-                bone_lengths(joints, self.edges) for joints in (predicted, real)
-            )
+            lengths, real_lengths = (bone_lengths(joints, edges) for joints in (predicted, real))
             losses["bone_length"] = self.bone_length * masked_mse(lengths, real_lengths, mask)
         return losses

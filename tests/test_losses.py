@@ -10,7 +10,7 @@ from support.fixtures import golden, golden_case, golden_cases, groups, meta
 from torch import Tensor
 
 from flame_mdm.batch import length_mask
-from flame_mdm.losses import MotionLosses, masked_mse
+from flame_mdm.losses import MotionLosses, masked_mean, masked_mse
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 
@@ -167,3 +167,28 @@ def test_only_what_weighs_is_computed():
         ]
         < 1e-10
     )
+
+
+def test_losses_can_be_computed_in_a_validation_before_the_training():
+    losses = MotionLosses(
+        lambda x: x.unflatten(-1, (-1, 3)), [1], [(0, 1)], foot_contact=1.0, bone_length=1.0
+    )
+    x, mask = torch.randn(2, 5, 6), torch.ones(2, 5, dtype=torch.bool)
+    with torch.inference_mode():
+        expected = losses(x + 1, x, mask)
+    x0_hat = (x + 1).requires_grad_()
+    terms = losses(x0_hat, x, mask)
+    torch.testing.assert_close(terms, expected)
+    sum(terms.values()).sum().backward()
+    assert x0_hat.grad is not None
+
+
+@pytest.mark.parametrize("shape", [(3, 7, 5), (3, 7, 4, 3)])
+def test_the_squared_error_and_its_gradients_are_those_of_its_definition_bit_for_bit(shape):
+    a, b = torch.randn(2, *shape).unbind(0)
+    mask, factor = torch.arange(7) < torch.tensor([[7], [4], [0]]), torch.randn(3)
+    inputs = [a.requires_grad_(), b.requires_grad_()]
+    results = [masked_mse(a, b, mask), masked_mean((a - b).square(), mask)]
+    assert torch.equal(*results)
+    gradients = [torch.autograd.grad((result * factor).sum(), inputs) for result in results]
+    assert all(torch.equal(*pair) for pair in zip(*gradients, strict=True))

@@ -14,13 +14,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from flame_mdm.batch import Constant
 from flame_mdm.errors import UserError, did_you_mean
 
 JOINTS = ("pelvis", "left_foot", "right_foot", "left_wrist", "right_wrist", "head")
 SLOTS = (*JOINTS, "traj", "heading")
 HEADING = SLOTS.index("heading")
-COORDINATES = torch.tensor([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+COORDINATES = Constant([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
 """Coordinates (8, 3) of the slots that are lengths. The x of the heading is an angle."""
+
+FLOOR = Constant([1.0, 0.0, 1.0])
+"""Factors (3,) of x, y and z that project a position on the floor."""
 
 # Added to the number of requested values, as in the authors' code, so that the error of a target
 # that requests nothing is 0
@@ -77,9 +81,9 @@ class TargetConditions:
             )
         if not 0 <= drop_prob <= 1:
             raise UserError(f"task.targets.drop_prob={drop_prob}: give a probability from 0 to 1")
-        self.columns = [joints.index(name) for name in JOINTS]
-        self.facing = list(facing)
-        self.choices = torch.tensor([[slot in choice for slot in SLOTS] for choice in choices])
+        self.columns = Constant([joints.index(name) for name in JOINTS])
+        self.facing = Constant(list(facing))
+        self.choices = Constant([[slot in choice for slot in SLOTS] for choice in choices])
         self.drop_prob, self.weight, self.heading_modulo_pi = drop_prob, weight, heading_modulo_pi
 
     def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
@@ -94,10 +98,10 @@ class TargetConditions:
             if lengths is None
             else joints[torch.arange(len(joints), device=joints.device), lengths - 1]
         )
-        pelvis = last[:, :1] * last.new_tensor([1.0, 0.0, 1.0])
-        angle = heading(last[:, self.facing])
+        pelvis = last[:, :1] * FLOOR.on(last.device).to(last.dtype)
+        angle = heading(last[:, self.facing.on(last.device)])
         turned = torch.stack([angle, torch.zeros_like(angle), torch.zeros_like(angle)], -1)
-        return torch.cat([last[:, self.columns], pelvis, turned[:, None]], 1)
+        return torch.cat([last[:, self.columns.on(last.device)], pelvis, turned[:, None]], 1)
 
     def draw(self, joints: Tensor, u: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Returns targets (B, 8, 4) from the ends of real motions.
@@ -107,8 +111,9 @@ class TargetConditions:
             u: (B,) uniform numbers in [0, 1), which select one of the choices.
             lengths: (B,) int64, number of real frames per motion. Default: F.
         """
-        drawn = (u * len(self.choices)).long()
-        return requested(self.locations(joints, lengths), self.choices.to(joints.device)[drawn])
+        choices = self.choices.on(joints.device)
+        drawn = (u * len(choices)).long()
+        return requested(self.locations(joints, lengths), choices[drawn])
 
     def error(self, joints: Tensor, target: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Returns the weighted error (B,) of predicted motions (B, F, J, 3).
@@ -117,7 +122,7 @@ class TargetConditions:
         the squared error of the heading in square radians. It is 0 if a target requests nothing.
         """
         predicted, values, valid = self.locations(joints, lengths), target[..., :3], target[..., 3:]
-        counted = valid * COORDINATES.to(target)
+        counted = valid * COORDINATES.on(target.device).to(target.dtype)
         squares = ((predicted - values).square() * counted).sum((1, 2)) / (
             counted.sum((1, 2)) + EPSILON
         )

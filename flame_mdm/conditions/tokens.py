@@ -91,7 +91,7 @@ class LearnedTokens(ConditionEncoder):
         )
         self.norm = nn.LayerNorm(features)
         self.null = nn.Parameter(nn.init.normal_(torch.empty(features), std=0.02))
-        self._rows: dict[str, Tensor] = {}  # rows (T, 2) of the captions encoded so far
+        self._rows: dict[str, np.ndarray] = {}  # rows (T, 2) of the captions encoded so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
@@ -147,14 +147,18 @@ class LearnedTokens(ConditionEncoder):
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
         for caption in numbers.keys() - self._rows.keys():
-            self._rows[caption] = torch.tensor(self.rows(caption))
+            self._rows[caption] = np.array(self.rows(caption), np.int64)
         rows = [self._rows[caption] for caption in numbers]
-        token_mask = length_mask(torch.tensor([len(words) for words in rows]))
-        index = sent(token_mask.flatten().nonzero()[:, 0], device)
-        token_mask = sent(token_mask, device)
-        tokens = self._encode(sent(torch.cat(rows), device), index, token_mask)
+        lengths = np.array([len(words) for words in rows])
+        # The host computes what depends on values: the device would have to be waited for.
+        is_real = np.arange(lengths.max()) < lengths[:, None]
+        of_caption = np.array([numbers[caption] for caption in batch.text])
+        words, index, token_mask, of_sample = (
+            sent(torch.from_numpy(values), device)
+            for values in (np.concatenate(rows), np.flatnonzero(is_real), is_real, of_caption)
+        )
+        tokens = self._encode(words, index, token_mask)
         pooled = tokens.sum(1) / token_mask.sum(1, keepdim=True)
-        of_sample = sent(torch.tensor([numbers[caption] for caption in batch.text]), device)
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def encode(self, words: Tensor, counts: Tensor) -> Condition:

@@ -9,7 +9,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from flame_mdm.batch import Condition, Denoise, MotionBatch
+from flame_mdm.batch import Condition, Constant, Denoise, MotionBatch
 from flame_mdm.checkpoints.loading import PARTS, find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.config import Config, flatten
@@ -31,6 +31,7 @@ class DistillationTask(GeneratorTask):
     """
 
     kind = DistilledGenerator
+    grids: dict[int, Constant]  # times of the teacher's steps, by their number
 
     @classmethod
     def build(
@@ -44,6 +45,7 @@ class DistillationTask(GeneratorTask):
         """Builds the task of a recipe without training its text encoder."""
         task = super().build(config, representation, actions=actions, facts=facts)
         task.generator.condition.requires_grad_(False)
+        task.grids = {}
         return task.eval()
 
     def train(self, mode: bool = True) -> Self:
@@ -137,9 +139,9 @@ class DistillationTask(GeneratorTask):
 
         student = self.generator
         process = student.process
-        times = torch.tensor(
-            process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)])
-        )
+        count = counts[min(int(progress * len(counts)), len(counts) - 1)]
+        grid = self.grids.setdefault(count, Constant(process.grid(count)))
+        times = grid.on(self.device)
         u = torch.rand(len(batch), device=self.device) if u is None else u
         index = (u * len(times)).long().clamp(max=len(times) - 1)
         noise = torch.randn_like(batch.x) if noise is None else noise
@@ -162,7 +164,7 @@ class DistillationTask(GeneratorTask):
             batch.x,
             batch.mask,
             cond,
-            times=times.to(self.device),
+            times=times,
             index=index,
             noise=noise,
             auxiliary=self.losses,

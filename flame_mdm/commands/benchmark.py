@@ -1,13 +1,12 @@
 """`flame-mdm benchmark NAME`: trains and evaluates a set of small models, and writes their table."""
 
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands.tables import TablesSettings, evaluate_missing
+from flame_mdm.commands.trainings import plan, run_trainings
 from flame_mdm.config import EXPERIMENTS
 from flame_mdm.config.options import option, required
 from flame_mdm.errors import UserError, say
@@ -19,7 +18,7 @@ from flame_mdm.safe_io import read_yaml
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkSettings:
-    """usage: flame-mdm benchmark NAME [out=FOLDER]
+    """usage: flame-mdm benchmark NAME [out=FOLDER] [jobs=N]
 
     Trains a motion-CLIP and a model of each kind, evaluates them, writes a table, and compares
     its values with the expected ranges. If interrupted, the same command continues where it
@@ -32,6 +31,9 @@ class BenchmarkSettings:
     OBJECTS: ClassVar = ("exp",)
     exp: str = required("a file in experiments/benchmark")
     out: str | None = option(None, "folder; default runs/benchmark/<exp>")
+    jobs: int = option(
+        1, "trainings at the same time; they share the cores, and need about 2 GiB of memory each"
+    )
     device: str | None = option(
         None, "device of the evaluations, such as cpu or cuda; default: cuda if available"
     )
@@ -46,39 +48,25 @@ def main(settings: BenchmarkSettings) -> None:
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if settings.exp not in names:
         raise UserError(f"no benchmark is called '{settings.exp}'. Available: {', '.join(names)}")
-    plan = read_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
+    if settings.jobs < 1:
+        raise UserError(f"jobs={settings.jobs}: give the number of trainings at the same time")
+    described = read_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
     out = Path(settings.out or Path("runs") / "benchmark" / settings.exp)
     out.mkdir(parents=True, exist_ok=True)  # reports an error before hours of work, not after
-    for words in plan["train"]:
-        train(words, settings.data_root)
-    name, spec = plan["table"], load_spec(plan["table"])
+    run_trainings(plan(described["train"], settings.data_root), settings.jobs, out)
+    name, spec = described["table"], load_spec(described["table"])
     options = TablesSettings(
         device=settings.device, batch_size=settings.batch_size, data_root=settings.data_root
     )
     faults = evaluate_missing({name: spec}, Path(options.results), options)
     table = build(name, spec, Path(options.results))
     write(table, out)
-    for line, right in check(table, plan.get("expected", {})):
+    for line, right in check(table, described.get("expected", {})):
         say(f"{'as expected' if right else 'NOT AS EXPECTED'}: {line}")
         faults += [] if right else [line]
     say(f"{out / name}.html, .md, .tex, .csv")
     if faults:
         raise UserError("; ".join(faults))
-
-
-def train(words: Sequence[str], data_root: str) -> None:
-    """Runs `flame-mdm train` in a separate process; raises `SystemExit` if it is interrupted."""
-    root = [f"data_root={data_root}"] if data_root else []
-    say(f"== training {' '.join(words)}")
-    code = subprocess.run(
-        [sys.executable, "-m", "flame_mdm", "train", *words, *root], check=False
-    ).returncode
-    if code >= 128 or code < 0:
-        raise SystemExit(code if code > 0 else 128 - code)
-    if code:
-        raise UserError(
-            f"training {' '.join(words)} failed (see above). Run the benchmark again to continue"
-        )
 
 
 def check(

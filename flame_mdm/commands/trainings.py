@@ -1,0 +1,121 @@
+"""Trainings of a benchmark, in processes of their own, one after another or side by side."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flame_mdm.config import compose, flatten
+from flame_mdm.data.parallel import cores
+from flame_mdm.errors import UserError, say
+
+GIB_PER_JOB = 2.0
+"""Free memory in GiB that must be left to start another training beside running ones."""
+POLL = 0.2
+"""Seconds between two looks at running trainings."""
+
+
+@dataclass
+class Training:
+    """A training of a benchmark.
+
+    Attributes:
+        words: arguments of `flame-mdm train`.
+        folder: the run directory.
+        needs: numbers of the trainings whose runs this one reads.
+    """
+
+    words: Sequence[str]
+    folder: str
+    needs: set[int] = field(default_factory=set)
+
+    @property
+    def title(self) -> str:
+        """The arguments in one line."""
+        return " ".join(self.words)
+
+
+def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
+    """Returns the trainings of a benchmark. One that names the run of an earlier one needs it."""
+    root = [f"data_root={data_root}"] if data_root else []
+    trainings: list[Training] = []
+    for name, *overrides in entries:
+        config = compose(name, [*overrides, *root])
+        texts = [value for value in flatten(config).values() if isinstance(value, str)]
+        needs = {
+            number
+            for number, earlier in enumerate(trainings)
+            if any(
+                text == earlier.folder or text.startswith(f"{earlier.folder}/") for text in texts
+            )
+        }
+        trainings.append(Training([name, *overrides, *root], config["run"]["dir"], needs))
+    return trainings
+
+
+def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
+    """Runs trainings, up to `jobs` at the same time.
+
+    With several jobs, each has its share of the cores, and writes its output to a file in `logs`.
+    A training starts beside others only if `GIB_PER_JOB` of memory are free. Its batches and
+    random draws do not depend on other trainings.
+
+    Raises:
+        UserError: If a training failed. The others are stopped, and can be resumed.
+        SystemExit: If a training was interrupted.
+    """
+    environment = dict(os.environ)
+    if jobs > 1:
+        environment.setdefault("OMP_NUM_THREADS", str(max(1, cores() // jobs)))
+    waiting, ended = dict(enumerate(trainings)), set[int]()
+    running: dict[int, subprocess.Popen[bytes]] = {}
+    with ExitStack() as files:
+        try:
+            while waiting or running:
+                ready = [number for number, job in waiting.items() if job.needs <= ended]
+                for number in ready:
+                    if len(running) >= jobs or (running and not _has_memory()):
+                        break
+                    job = waiting.pop(number)
+                    say(f"== training {job.title}")
+                    output = None
+                    if jobs > 1:
+                        path = logs / f"{number + 1}_{job.words[0].replace('/', '_')}.log"
+                        say(f"   output: {path}")
+                        output = files.enter_context(path.open("ab"))
+                    command = [sys.executable, "-m", "flame_mdm", "train", *job.words]
+                    running[number] = subprocess.Popen(
+                        command, env=environment, stdout=output, stderr=output
+                    )
+                for number, process in list(running.items()):
+                    if process.poll() is not None:
+                        _check(trainings[number], process.returncode)
+                        ended.add(number)
+                        del running[number]
+                time.sleep(POLL)
+        finally:
+            for process in running.values():
+                process.terminate()  # saves a checkpoint
+            for process in running.values():
+                process.wait()
+
+
+def _has_memory() -> bool:
+    import torch
+
+    from flame_mdm.data.resident import free_memory
+
+    return free_memory(torch.device("cpu")) >= GIB_PER_JOB * 2**30
+
+
+def _check(training: Training, code: int) -> None:
+    if code >= 128 or code < 0:
+        raise SystemExit(code if code > 0 else 128 - code)
+    if code:
+        raise UserError(
+            f"training {training.title} failed (see its output). Run the benchmark again to continue"
+        )

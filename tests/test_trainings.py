@@ -1,0 +1,124 @@
+"""Trainings of a benchmark side by side."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from support.runs import TINY
+
+from flame_mdm.checkpoints.model_files import read_checkpoint
+from flame_mdm.commands import trainings
+from flame_mdm.commands.benchmark import BenchmarkSettings, main
+from flame_mdm.commands.trainings import Training, plan, run_trainings
+from flame_mdm.config import EXPERIMENTS
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import read_yaml
+
+
+class Process:
+    """A training that ends after some looks at it."""
+
+    started: ClassVar[list["Process"]] = []
+    at_once: ClassVar[list[set[str]]] = []  # names of the running trainings, at each start
+    codes: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, command: list[str], **options: Any):
+        self.name, self.options = command[4], options
+        self.looks, self.returncode, self.terminated = 0, None, False
+        running = {p.name for p in self.started if p.returncode is None}
+        self.started.append(self)
+        self.at_once.append(running | {self.name})
+
+    def poll(self) -> int | None:
+        self.looks += 1
+        if self.looks > 2:
+            self.returncode = self.codes.get(self.name, 0)
+        return self.returncode
+
+    def terminate(self) -> None:
+        self.terminated = True
+
+    def wait(self) -> None:
+        self.returncode = 143
+
+
+@pytest.fixture
+def processes(monkeypatch) -> type[Process]:
+    Process.started, Process.at_once, Process.codes = [], [], {}
+    monkeypatch.setattr(trainings.subprocess, "Popen", Process)
+    monkeypatch.setattr(trainings, "POLL", 0)
+    monkeypatch.setattr(trainings, "_has_memory", lambda: True)
+    monkeypatch.setattr(trainings, "cores", lambda: 8)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    return Process
+
+
+NAMES = ["extractor", "teacher", "other", "student"]
+
+
+def jobs() -> list[Training]:
+    """Four trainings, of which the last one reads the run of the second one."""
+    return [Training([name], name, {1} if name == "student" else set()) for name in NAMES]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_so_many_trainings_run_at_once_and_none_before_what_it_needs(processes, tmp_path, count):
+    run_trainings(jobs(), count, tmp_path)
+    assert sorted(process.name for process in processes.started) == sorted(NAMES)
+    assert max(map(len, processes.at_once)) == min(count, 3)
+    assert not any({"teacher", "student"} <= running for running in processes.at_once)
+    threads = {process.options["env"].get("OMP_NUM_THREADS") for process in processes.started}
+    assert threads == {None if count == 1 else str(8 // count)}
+    logs = sorted(path.name for path in tmp_path.iterdir())
+    expected = [f"{number}_{name}.log" for number, name in enumerate(NAMES, 1)]
+    assert logs == ([] if count == 1 else expected)
+
+
+def test_no_training_starts_beside_others_without_memory(processes, tmp_path, monkeypatch):
+    monkeypatch.setattr(trainings, "_has_memory", lambda: False)
+    run_trainings(jobs(), 4, tmp_path)
+    assert [process.name for process in processes.started] == NAMES
+    assert max(map(len, processes.at_once)) == 1
+
+
+@pytest.mark.parametrize(("code", "error"), [(1, UserError), (143, SystemExit), (-9, SystemExit)])
+def test_a_training_that_ends_badly_stops_the_others(processes, tmp_path, code, error):
+    processes.codes["extractor"] = code
+    with pytest.raises(error, match=r"training extractor failed|143|137"):
+        run_trainings(jobs(), 2, tmp_path)
+    assert [(process.name, process.terminated) for process in processes.started] == [
+        ("extractor", False),
+        ("teacher", True),
+    ]
+
+
+def test_a_training_needs_the_earlier_ones_whose_runs_it_names():
+    entries = read_yaml(EXPERIMENTS / "benchmark" / "few_steps.yaml")["train"]
+    planned = plan(entries, "some/root")
+    assert [training.needs for training in planned] == [set(), set(), {1}, set()]
+    assert all(training.words[-1] == "data_root=some/root" for training in planned)
+
+
+def test_the_number_of_trainings_at_once_is_checked(tmp_path):
+    settings = BenchmarkSettings(exp="synthetic", out=str(tmp_path), jobs=0)
+    with pytest.raises(UserError, match=r"^jobs=0: give the number of trainings at the same time$"):
+        main(settings)
+
+
+@pytest.mark.robustness
+def test_trainings_side_by_side_give_the_same_weights(data_root, tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    states = []
+    for count in (1, 2):
+        words = [*TINY, "trainer.max_steps=3", "callbacks.samples=null", "logger=csv"]
+        folders = [tmp_path / f"{count}_{seed}" for seed in (0, 1)]
+        entries = [
+            ["quickstart", *words, f"seed={seed}", f"run.dir={folder}"]
+            for seed, folder in enumerate(folders)
+        ]
+        run_trainings(plan(entries, str(data_root)), count, tmp_path)
+        paths: list[Path] = [folder / "checkpoints" / "last.ckpt" for folder in folders]
+        states.append([read_checkpoint(path)["state_dict"] for path in paths])
+    for alone, beside in zip(*states, strict=True):
+        assert all(torch.equal(value, beside[name]) for name, value in alone.items())

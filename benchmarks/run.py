@@ -45,8 +45,8 @@ HEAD = """# Speed
 a ratio of measurements that alternate in one run, on an idle machine unless the section states otherwise. The absolute
 figures next to it hold only for that machine. `make bench ONLY=host,steps` repeats some sections, and `make bench
 DEVICE=cuda` adds the sections of a GPU. With `MDM_REPO=PATH`, a clone of the authors' code, the authors' training step
-is measured, too. Sections that name a commit were measured by a script of that commit. Another page explains [which
-options to choose](../speed.md).
+is measured, too. All sections of a CPU together take about a quarter of an hour on two cores. A section that names a
+commit has not been measured again since. Another page explains [which options to choose](../speed.md).
 """
 
 
@@ -162,6 +162,7 @@ def main(*words: str) -> None:
     data = PAGE.with_suffix(".json")
     sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
 
+    begin = time.perf_counter()
     for number, name in enumerate(names, 1):
         print(f"{number}/{len(names)} {name}", flush=True)
         start = time.perf_counter()
@@ -173,7 +174,7 @@ def main(*words: str) -> None:
         data.write_text(json.dumps(sections, indent=1) + "\n")
         PAGE.write_text(render(sections))
         print(f"    {section['summary']} ({time.perf_counter() - start:.0f} s)", flush=True)
-    print(f"page: {PAGE}")
+    print(f"page: {PAGE} ({(time.perf_counter() - begin) / 60:.1f} minutes)")
 
 
 if __name__ == "__main__":

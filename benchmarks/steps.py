@@ -267,9 +267,8 @@ def measure(settings: Settings) -> Section:
     )
     return section(
         "Training steps",
-        f"""The full-size step is a step of `humanml3d/mdm` (8 layers of 512, dropout 0.1), "
-        "{batches}. Lengths are uniform from 40 to 196 frames, in units of 4, similar to "
-        "HumanML3D's lengths, and batches are drawn by the
+        f"""The full-size step is a step of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are
+        uniform from 40 to 196 frames, in units of 4, similar to HumanML3D's lengths, and batches are drawn by the
         framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
         padded to 196 frames as in the published codes, in float32. All alternate on each of {BATCHES} batches,
         {ROUNDS} times after one that warms up. The small networks have 32 clips per batch and no text encoder, and

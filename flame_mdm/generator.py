@@ -51,18 +51,23 @@ class Parts:
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
         """Builds the parts of a recipe. Sizes that depend on other parts are set here."""
-        features = representation.features
         process: Process = instantiate(config["process"])
-        out_features = process.out_features(features)
         condition: ConditionEncoder = instantiate(config["condition"], {"num_actions": num_actions})
-        sizes = {
-            "in_features": features,
-            "out_features": out_features,
-            "cond_features": condition.features,
-            "length_unit": _length_unit(config),
-        }
+        sizes = sizes_of_denoiser(config, representation, process, condition)
         denoiser: Denoiser = instantiate(config["denoiser"], sizes)
         return cls(denoiser, process, condition, representation)
+
+
+def sizes_of_denoiser(
+    config: Config, representation: Representation, process: Process, condition: ConditionEncoder
+) -> dict[str, int]:
+    """Returns the arguments of a recipe's denoiser that depend on its other parts."""
+    return {
+        "in_features": representation.features,
+        "out_features": process.out_features(representation.features),
+        "cond_features": condition.features,
+        "length_unit": _length_unit(config),
+    }
 
 
 def _length_unit(config: Config) -> int:

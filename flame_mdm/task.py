@@ -22,6 +22,7 @@ from flame_mdm.conditions.target import TargetConditions
 from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.denoisers.recomputation import recompute_activations
 from flame_mdm.errors import UserError, renamed_names
 from flame_mdm.generator import Model, MotionGenerator, Parts, sampling_defaults
 from flame_mdm.losses import MotionLosses
@@ -39,6 +40,7 @@ class Task(Model, LightningModule):
         super().__init__()
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
+        self.reported: dict[str, Tensor | float] = {}  # values that are logged after this step
         self.prepare_data_per_node = False  # the machines of a cluster share the data folder
 
     @classmethod
@@ -104,6 +106,22 @@ class Task(Model, LightningModule):
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*self.data.captions(), *prompts}), self.data.folder.parent / "text"
 
+    @property
+    def is_reported(self) -> bool:
+        """Whether the values of the current training step are logged."""
+        trainer = self._trainer  # None if a step is computed without a trainer
+        return trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0  # type: ignore[attr-defined]
+
+    def report(self, values: Mapping[str, Tensor | float]) -> None:
+        """Keeps values of the current training step by name, if they are logged.
+
+        `Measurements` writes them to the loggers after the step. Lightning's `log` takes the time
+        of a small network per value, and keeps the host busy in all later steps.
+        """
+        if self.is_reported:
+            for name, value in values.items():
+                self.reported[name] = value.detach() if isinstance(value, Tensor) else value
+
     def make_optimizer(self) -> torch.optim.Optimizer:
         """Returns the recipe's optimizer of all parameters that are trained."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
@@ -165,6 +183,8 @@ class GeneratorTask(Task):
         seed: seed of all random draws in training. Draws are functions of (seed, batch number,
             rank).
         compile: compile the denoiser with torch.compile when training begins.
+        checkpoint_activations: keep less for the backward pass and compute it again, see
+            `flame_mdm.denoisers.recomputation`. Weights are the same, steps are slower.
         targets: options of `TargetConditions`, for a denoiser with a target encoder. None = no
             targets.
 
@@ -187,6 +207,7 @@ class GeneratorTask(Task):
         num_inference_steps: int | list[int],
         seed: int = 0,
         compile: bool = False,
+        checkpoint_activations: bool = False,
         targets: dict[str, Any] | None = None,
     ):
         super().__init__(optimizer=optimizer, seed=seed)
@@ -211,6 +232,7 @@ class GeneratorTask(Task):
         if (self.targets is None) != (getattr(parts.denoiser, "target", None) is None):
             raise UserError("task.targets and denoiser.target_encoder: give both or neither")
         self.cond_drop_prob, self.compiles = cond_drop_prob, compile
+        self.checkpoints_activations = checkpoint_activations
         self.val_losses = torch.nn.ModuleDict()
 
     @classmethod
@@ -268,6 +290,8 @@ class GeneratorTask(Task):
             self.add_facts(vocabulary(captions, shared or None))
             if data.source.verbs:
                 self.add_facts({"verbs": list(data.source.verbs)})
+        if self.checkpoints_activations:
+            recompute_activations(self.generator.denoiser)
         if self.compiles:
             self.generator.denoiser.compile()
 
@@ -310,12 +334,8 @@ class GeneratorTask(Task):
         if cond.null is not None:
             cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)
-        trainer = self._trainer  # None if a step is computed without a trainer
-        if trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            self.log_dict(
-                {f"train/{name}": value.mean() for name, value in terms.items()},
-                batch_size=len(batch),
-            )
+        if self.is_reported:
+            self.report({f"train/{name}": value.mean() for name, value in terms.items()})
         return terms["loss"].mean()
 
     def dropped(self, batch: MotionBatch) -> Tensor:
@@ -394,7 +414,9 @@ def _conditioned(
     `u` (B,) are uniform numbers in (0, 1). These numbers determine which targets are requested.
     """
     prefix, batch = generator.split_prefix(batch)
-    cond = replace(generator.condition(batch), prefix=prefix)
+    cond = generator.condition(batch)
+    if prefix is not None:
+        cond = replace(cond, prefix=prefix)
     if targets is not None and u is not None:
         joints = generator.representation.to_joints(batch.x)
         cond = replace(cond, target=targets.draw(joints, u, batch.lengths))

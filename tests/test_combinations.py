@@ -127,7 +127,7 @@ PAIRS = [(process, "learned") for process in PROCESSES] + [("x0", "action"), ("x
 
 @pytest.mark.parametrize(("process", "condition"), PAIRS)
 @each_denoiser
-def test_trains_and_samples(denoiser, process, condition, monkeypatch, subtests):
+def test_trains_and_samples(denoiser, process, condition, subtests):
     task, motions = build(denoiser, process, condition), batch()
     # Such a denoiser reads tokens instead of the pooled vector.
     if condition == "none" and DENOISERS[denoiser].get("max_tokens"):
@@ -136,8 +136,6 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch, subtests)
         ):
             generated(task, motions)
         return
-    logged: dict[str, Tensor] = {}
-    monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.update(values))
     optimizer = task.make_optimizer()
     reached: set[str] = set()
     task.train()
@@ -153,8 +151,8 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch, subtests)
         }
         optimizer.step()
     assert reached == {name for name, _ in task.named_parameters()}, "parameters without a gradient"
-    assert {"train/loss", "train/mse"} <= logged.keys()
-    assert ("train/vlb" in logged) == (process == "learned_range")
+    assert {"train/loss", "train/mse"} <= task.reported.keys()
+    assert ("train/vlb" in task.reported) == (process == "learned_range")
     for sampler in samplers(process):
         with subtests.test(sampler=sampler):
             x = generated(task, motions, SamplerOptions(sampler=sampler))

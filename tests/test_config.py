@@ -607,6 +607,26 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch, sub
 
 
 @pytest.mark.parametrize(
+    "strategy",
+    [
+        "fsdp",
+        "fsdp_cpu_offload",
+        "deepspeed_stage_2",
+        {"_target_": "lightning.pytorch.strategies.model_parallel.ModelParallelStrategy"},
+        {"_target_": "lightning.pytorch.strategies.FSDPStrategy"},
+    ],
+)
+def test_strategies_that_divide_a_model_are_refused(strategy):
+    with pytest.raises(UserError, match=r"^trainer\.strategy=.*Use trainer\.strategy=ddp; "):
+        check_devices({"accelerator": "cpu", "strategy": strategy})
+
+
+@pytest.mark.parametrize("strategy", ["auto", "ddp", "ddp_find_unused_parameters_true"])
+def test_other_strategies_are_allowed(strategy):
+    check_devices({"accelerator": "cpu", "strategy": strategy})
+
+
+@pytest.mark.parametrize(
     ("gpus", "accelerator", "devices", "message"),
     [
         *(

@@ -64,7 +64,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
         logits, labels = self._classified(batch)
         loss = F.cross_entropy(logits, labels)
         accuracy = (logits.argmax(1) == labels).float().mean()
-        self.log_dict({"train/loss": loss, "train/accuracy": accuracy}, batch_size=len(batch))
+        self.report({"train/loss": loss, "train/accuracy": accuracy})
         return loss
 
     def _classified(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:

@@ -241,8 +241,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         self.seed_step(batch_idx)
         text, motion = self.text_features(batch), self.network(batch.x, batch.mask)
         loss = info_nce(motion, text, self.network.logit_scale)
-        values = {"train/loss": loss, "train/temperature": (-self.network.logit_scale).exp()}
-        self.log_dict(values, batch_size=len(batch))
+        self.report({"train/loss": loss, "train/temperature": (-self.network.logit_scale).exp()})
         return loss
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:

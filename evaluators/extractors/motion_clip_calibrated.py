@@ -124,9 +124,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
             "calibration_error": error,
             "temperature": temperature,
         }
-        self.log_dict(
-            {f"train/{name}": value for name, value in values.items()}, batch_size=len(batch)
-        )
+        self.report({f"train/{name}": value for name, value in values.items()})
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:

@@ -243,7 +243,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
             loss = matching_loss(
                 *self._embed(batch), self.margin, torch.tensor(fits, device=self.device)
             )
-        self.log("train/loss", loss, batch_size=len(batch))
+        self.report({"train/loss": loss})
         # Gives all parameters a gradient, as DDP requires
         return loss + 0 * sum(parameter.sum() for parameter in self._idle())
 

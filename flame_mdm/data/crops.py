@@ -177,17 +177,23 @@ class Clips(Dataset[Sample]):
         return samples
 
     def draw(
-        self, indices: Sequence[int] | np.ndarray, batch: int
+        self, indices: Sequence[int] | np.ndarray, batch: int | Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns first frame, number of frames and caption index (B,) of clips in a batch.
+        """Returns first frame, number of frames and caption index (B,) of clips.
 
         These numbers are functions of (seed, batch, index). In evaluation (batch -1), they never
         change.
+
+        Args:
+            indices: (B,) indices of the clips.
+            batch: number of the batch, or the batch (B,) of each clip.
         """
         rows = np.asarray(indices)
-        if batch < 0:
+        batches = [batch] if isinstance(batch, int) else batch
+        if batches[0] < 0:
             return *self.crop.draw(self.frames[rows], None), self.evaluated[rows]
-        below = integers(key("sample", self.seed, batch) + rows)
+        keys = {number: key("sample", self.seed, number) for number in dict.fromkeys(batches)}
+        below = integers(np.array([keys[number] for number in batches], np.int64) + rows)
         return *self.crop.draw(self.frames[rows], below), below(self.captions[rows])
 
     @cached_property

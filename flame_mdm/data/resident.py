@@ -5,6 +5,7 @@ Batches are gathered there, without workers and copies.
 
 import os
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,9 @@ from flame_mdm.representations import Representation
 # free memory. The rest is for the model and its activations.
 SHARE = 4
 CHUNK = 1 << 16  # number of frames that are copied at once, so that copying takes little memory
+# Number of batches whose crops are drawn at once, which takes the host less time than one by one
+# and on a GPU needs only one copy for all of them
+PLANNED = 16
 
 
 def free_memory(device: torch.device) -> int:
@@ -83,9 +87,10 @@ class ResidentLoader:
         self, clips: Clips, batches: Iterable[list[Draw]], features: Tensor, multiple: int
     ):
         self.clips, self.batches, self.features, self.multiple = clips, batches, features, multiple
-        self.begin = np.array([clip.start for clip in clips.clips], np.int64)
+        entries = clips.clips
+        self.begin = np.array([clip.start for clip in entries], np.int64)
         self.actions = np.array(
-            [-1 if clip.action is None else clip.action for clip in clips.clips], np.int64
+            [-1 if clip.action is None else clip.action for clip in entries], np.int64
         )
         self.frames = torch.arange(clips.crop.longest(), device=features.device)
         self.mean, self.std = (
@@ -97,36 +102,52 @@ class ResidentLoader:
         return len(self.batches)  # type: ignore[arg-type]
 
     def __iter__(self) -> Iterator[MotionBatch]:
-        return map(self._batch, self.batches)
+        batches = iter(self.batches)
+        while planned := list(islice(batches, PLANNED)):
+            yield from self._gathered(planned)
 
-    def _batch(self, draws: list[Draw]) -> MotionBatch:
-        rows = np.array([index for index, _ in draws])
-        first, length, caption = self.clips.draw(rows, draws[0][1])
-        begin = self.begin[rows]
-        values = np.stack(
-            [begin + first, begin + self.clips.frames[rows] - 1, length, self.actions[rows]]
-        )
-        start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)[
-            ..., None
+    def _gathered(self, planned: list[list[Draw]]) -> Iterator[MotionBatch]:
+        """Draws the crops of several batches at once, and yields the batches."""
+        rows = np.array([index for draws in planned for index, _ in draws])
+        # All clips of a batch are drawn for the number of the first one.
+        numbers = [draws[0][1] for draws in planned for _ in draws]
+        first, length, caption = self.clips.draw(rows, numbers)
+        sizes = [len(draws) for draws in planned]
+        padded = [
+            padded_length(int(longest), self.multiple, len(self.frames))
+            for longest in np.maximum.reduceat(length, np.cumsum([0, *sizes[:-1]]))
         ]
-        frames = self.frames[: padded_length(int(length.max()), self.multiple, len(self.frames))]
-        mask = frames < lengths
-        rows_of_frames = torch.minimum(start + frames, last).masked_fill(
+
+        begin, labels = self.begin[rows], self.actions[rows]
+        values = np.stack([begin + first, begin + self.clips.frames[rows] - 1, length, labels])
+        start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)
+        frames = self.frames[: max(padded)]
+        mask = frames < lengths[:, None]
+        # Past its last frame, a clip repeats it. Past the end of a sample are zeros.
+        rows_of_frames = torch.minimum(start[:, None] + frames, last[:, None]).masked_fill(
             ~mask, len(self.features) - 1
         )
-        x = F.embedding(rows_of_frames, self.features)
-        if adapts_cuts(self.clips.representation):
-            x = ((self.clips.representation.rebase(x) - self.mean) / self.std).masked_fill(
-                ~mask[..., None], 0
+
+        end = 0
+        for size, width in zip(sizes, padded, strict=True):
+            part, end = slice(end, end + size), end + size
+            entries = [self.clips.clips[index] for index in rows[part].tolist()]
+            captions = caption[part].tolist()
+            has_text = all(clip.captions for clip in entries)
+            yield MotionBatch(
+                x=self._features(rows_of_frames[part, :width], mask[part, :width]),
+                mask=mask[part, :width].contiguous(),
+                ids=[clip.id for clip in entries],
+                text=[clip.captions[n] for clip, n in zip(entries, captions, strict=True)]
+                if has_text
+                else None,
+                action=None if (labels[part] < 0).any() else action[part],
             )
-        entries = [self.clips.clips[index] for index in rows]
-        has_text = bool(self.clips.captions[rows].all())
-        return MotionBatch(
-            x=x,
-            mask=mask,
-            ids=[clip.id for clip in entries],
-            text=[clip.captions[n] for clip, n in zip(entries, caption.tolist(), strict=True)]
-            if has_text
-            else None,
-            action=None if (values[3] < 0).any() else action[:, 0],
-        )
+
+    def _features(self, rows: Tensor, mask: Tensor) -> Tensor:
+        """Returns the normalized features (B, F, D) in rows (B, F) of all frames."""
+        x = F.embedding(rows, self.features)
+        if not adapts_cuts(self.clips.representation):
+            return x
+        x = (self.clips.representation.rebase(x) - self.mean) / self.std
+        return x.masked_fill(~mask[..., None], 0)

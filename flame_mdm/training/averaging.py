@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
@@ -42,6 +43,7 @@ class MovingAverage(WeightAveraging):
         self.from_initial_weights = from_initial_weights
         self.averages: list[Tensor] = []
         self.weights: list[Tensor] = []
+        self.updates = torch.zeros(0)  # number of updates, which is saved with the averages
         self.begun = False
 
     def averaged(self) -> Any:
@@ -59,8 +61,10 @@ class MovingAverage(WeightAveraging):
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
             # shared buffers, so that both models always have the current buffers
             copy._buffers = module._buffers
-        updates = int(self._average_model.n_averaged)  # type: ignore[union-attr]
-        self.begun = updates > 0 or (self.from_initial_weights and trainer.global_step > 0)
+        self.updates = self._average_model.n_averaged  # type: ignore[union-attr]
+        self.begun = int(self.updates) > 0 or (
+            self.from_initial_weights and trainer.global_step > 0
+        )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Copies the initial weights before the first step,
@@ -79,7 +83,7 @@ class MovingAverage(WeightAveraging):
             self.average(self.averages, self.weights, None)
         else:
             self._copy_weights()
-        self._average_model.n_averaged += 1  # type: ignore[union-attr]
+        self.updates += 1
         self._latest_update_step, self.begun = step, True
 
     def _copy_weights(self) -> None:

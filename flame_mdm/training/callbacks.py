@@ -122,11 +122,12 @@ class Checkpoints(Checkpoint):
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`.
 
-    Other steps are not slowed. The norm of all gradients is measured before clipping. Seconds per
-    step do not include validation. Adds `facts.training` to checkpoints: `hours` of training so
-    far, including validation; `processes`, the number of processes; `device`, `speed` and
-    `precision`; and `memory_gib`, the peak memory. On CUDA, this is the memory of tensors; on
-    other devices, the memory of the first process.
+    The values that the task reports are logged with them. Other steps are not slowed. The norm of
+    all gradients is measured before clipping. Seconds per step do not include validation. Adds
+    `facts.training` to checkpoints: `hours` of training so far, including validation;
+    `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
+    peak memory. On CUDA, this is the memory of tensors; on other devices, the memory of the first
+    process.
     """
 
     def __init__(self) -> None:
@@ -173,27 +174,51 @@ class Measurements(Callback):
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
         """Logs the norm of the gradients."""
-        if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+        assert isinstance(pl_module, Task)
+        if pl_module.is_reported:
             gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
-            pl_module.log("train/grad_norm", get_total_norm(gradients))
-            pl_module.log("train/lr", optimizer.param_groups[0]["lr"])
+            norm, lr = get_total_norm(gradients), optimizer.param_groups[0]["lr"]
+            pl_module.report({"train/grad_norm": norm, "train/lr": lr})
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Logs steps and clips per second."""
-        step, steps = trainer.global_step, trainer.global_step - self.first
+        """Logs the reported values, and steps and clips per second."""
+        step = trainer.global_step
+        steps = step - self.first
         if step % trainer.log_every_n_steps or not steps:  # type: ignore[attr-defined]  # or gradients are accumulated
             return
+        assert isinstance(pl_module, Task)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         seconds = (time.perf_counter() - self.since) / steps
         samples = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
-        pl_module.log("train/epochs", step * samples / len(data.train))
-        pl_module.log("train/samples_per_second", samples / seconds)
-        pl_module.log("train/seconds_per_step", seconds)
+        values: dict[str, Tensor | float] = {
+            **pl_module.reported,
+            "train/epochs": step * samples / len(data.train),
+            "train/samples_per_second": samples / seconds,
+            "train/seconds_per_step": seconds,
+        }
         if pl_module.device.type == "cuda":
-            pl_module.log(
-                "train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30
-            )
+            memory = torch.cuda.max_memory_allocated(pl_module.device)
+            values["train/gpu_memory_gib"] = memory / 2**30
+        pl_module.reported.clear()
+        log_values(trainer, values)
         self.since, self.first = time.perf_counter(), step
+
+
+def log_values(trainer: Trainer, values: Mapping[str, Tensor | float]) -> None:
+    """Writes values of a training step to all loggers, and shows them to all callbacks.
+
+    Tensors are copied from the device together, so that it is waited for only once.
+    """
+    tensors = {name: x for name, x in values.items() if isinstance(x, Tensor)}
+    copied = torch.stack([x.detach().float() for x in tensors.values()]).tolist() if tensors else []
+    numbers = {**values, **dict(zip(tensors, copied, strict=True))}
+    shown = {name: torch.tensor(number) for name, number in numbers.items()}
+    trainer.callback_metrics.update(shown)
+    trainer.logged_metrics.update(shown)
+    for logger in trainer.loggers:
+        # Lightning counts steps from 0.
+        logger.log_metrics({**numbers, "epoch": trainer.current_epoch}, trainer.global_step - 1)
+        logger.save()
 
 
 class Report(Callback):

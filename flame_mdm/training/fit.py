@@ -26,8 +26,12 @@ from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Re
 from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, check_optimizers, newest
 from flame_mdm.training.guards import lost_worker, out_of_memory
 from flame_mdm.training.loggers import History
+from flame_mdm.training.overhead import NoProfiler, skip_empty_hooks, skip_exchange_of_signals
 from flame_mdm.training.provenance import WriteProvenance
 from flame_mdm.training.speed import accelerate
+
+SHARDING = ("fsdp", "deepspeed", "modelparallel")
+"""Parts of the names of strategies that divide a model among processes."""
 
 
 def fit(folder: Path, config: Config) -> None:
@@ -71,22 +75,28 @@ def fit(folder: Path, config: Config) -> None:
         # Added before the callbacks that use the averaged weights in validation.
         callbacks.append(MovingAverage(**config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
+    callbacks.append(measurements)
+    # Shows values that `measurements` has logged
     callbacks += [Progress()] if config["trainer"].get("enable_progress_bar", True) else []
-    callbacks += [measurements, Report(folder)]
+    callbacks.append(Report(folder))
     loggers = [instantiate(config["logger"])] if config["logger"] else []
     plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
         # Lightning would save during a step, to a file that it would then prefer to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
+    unless_chosen = {} if config["trainer"].get("profiler") else {"profiler": NoProfiler()}
     trainer: Trainer = instantiate(
         config["trainer"]
         | {"precision": precision, "enable_progress_bar": False},  # replaced with `Progress`
+        **unless_chosen,
         logger=[*loggers, History(folder, step)],
         callbacks=callbacks,
         plugins=plugins,
         default_root_dir=str(folder),
         enable_model_summary=False,
     )
+    skip_empty_hooks(trainer, task)
+    skip_exchange_of_signals(trainer)
     try:
         if resumed:
             check_optimizers(resumed, task.make_optimizer())
@@ -121,10 +131,11 @@ def fit(folder: Path, config: Config) -> None:
 
 
 def check_devices(trainer: Config) -> None:
-    """Raises `UserError` if this machine lacks the devices of a recipe.
+    """Raises `UserError` if this machine lacks the devices of a recipe, or if the recipe shards.
 
     On a CPU, there is at most one process per core.
     """
+    _check_strategy(trainer.get("strategy", "auto"))
     accelerator, devices = trainer.get("accelerator", "auto"), trainer.get("devices", 1)
     has_mps = torch.backends.mps.is_available() and accelerator in ("auto", "gpu")
     gpus, cores = 1 if has_mps else torch.cuda.device_count(), os.cpu_count() or 1
@@ -138,6 +149,15 @@ def check_devices(trainer: Config) -> None:
             f"GPU{'s' * (most > 1)}" if gpus else f"CPU cores, and {NO_GPU}"
         )
         raise UserError(f"trainer.devices={devices}: {there}. Give at most trainer.devices={most}")
+
+
+def _check_strategy(strategy: str | Config) -> None:
+    name = strategy if isinstance(strategy, str) else str(strategy.get("_target_"))
+    if any(kind in name.lower().replace("_", "") for kind in SHARDING):
+        raise UserError(
+            f"trainer.strategy={name}: a model is not divided among processes, because averages and exact resuming "
+            "need whole weights. Use trainer.strategy=ddp; docs/memory.md has the memory that models need"
+        )
 
 
 def _start_from(task: GeneratorTask, source: str) -> None:

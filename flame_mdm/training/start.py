@@ -15,6 +15,7 @@ FREE = (
     "data.resident",
     "data.source.path",
     "data.source.workers",
+    "task.checkpoint_activations",
     "trainer.max_steps",
     "trainer.max_time",
     "trainer.devices",

@@ -1,0 +1,32 @@
+"""Activation checkpointing: the backward pass computes the inside of layers again."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+
+def stacked_layers(denoiser: nn.Module) -> list[nn.Module]:
+    """Returns the layers of a denoiser that are stacked: all members of its `nn.ModuleList`s."""
+    stacks = [module for module in denoiser.modules() if isinstance(module, nn.ModuleList)]
+    return [layer for stack in stacks for layer in stack]
+
+
+def recompute_activations(denoiser: nn.Module) -> None:
+    """Makes the backward pass compute the inside of stacked layers again instead of keeping it.
+
+    Only the inputs of the layers are kept, which takes less memory and about a third more time
+    (Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost"). Random draws are
+    repeated, so that the gradients are the same, bit for bit.
+    """
+    for layer in stacked_layers(denoiser):
+        layer.forward = partial(_recomputed, layer.forward)
+
+
+def _recomputed(forward: Callable[..., Tensor], *inputs: Any) -> Tensor:
+    if not torch.is_grad_enabled():
+        return forward(*inputs)
+    return checkpoint(forward, *inputs, use_reentrant=False)

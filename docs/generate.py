@@ -10,10 +10,11 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from flame_mdm.config import EXPERIMENTS, recipes
+from flame_mdm.config import EXPERIMENTS, compose, recipes
 from flame_mdm.reporting.tables.settings import HYPERPARAMETERS, hyperparameters, setting_text
 from flame_mdm.reporting.tables.specs import PUBLISHED, load_spec
 from flame_mdm.safe_io import read_yaml
+from flame_mdm.training.memory import training_memory
 
 HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
 
@@ -27,6 +28,12 @@ def head(name: str) -> tuple[str, str]:
     )
     what, _, deviations = comment.partition("Deviations")
     return what.strip(), ("Deviations" + deviations if deviations else "")
+
+
+def _wide(width: int, layers: int) -> list[str]:
+    """Returns the overrides of a wide network, with feed-forward layers four times as wide."""
+    sizes = {"latent_dim": width, "ff_size": 4 * width, "num_layers": layers}
+    return [f"denoiser.{name}={size}" for name, size in sizes.items()]
 
 
 def recipes_page() -> str:
@@ -285,7 +292,54 @@ def _line(x: float, y: float, text: str, style: str) -> str:
     return f'<text x="{x:g}" y="{y:g}" text-anchor="middle" fill="#1f2733" {style}>{escape(text)}</text>'
 
 
+SIZES: dict[str, tuple[str, list[str]]] = {
+    "`humanml3d/mdm`": ("humanml3d/mdm", []),
+    "`humanml3d/mdm_unet`": ("humanml3d/mdm_unet", []),
+    "`humanml3d/mdm_gru`": ("humanml3d/mdm_gru", []),
+    "`humanml3d/mdm_decoder`": ("humanml3d/mdm_decoder", []),
+    "`humanml3d/dip`": ("humanml3d/dip", []),
+    "`humanml3d/mfm`": ("humanml3d/mfm", []),
+    "`humanml3d/flame`": ("humanml3d/flame", []),
+    "`humanml3d/mdm`, 1024 wide, 16 layers": ("humanml3d/mdm", _wide(1024, 16)),
+    "`humanml3d/mdm`, 2048 wide, 24 layers": ("humanml3d/mdm", _wide(2048, 24)),
+}
+"""Rows of the page about memory: a recipe and overrides, by label."""
+
+MEMORY = """# Memory of a training
+
+{head}
+Computed from the recipes, in GiB per process and in float32, with the recipe's batch size and its longest motions. The
+state is the weights, their gradients, both states of Adam and, if the recipe averages weights, the average. It is the
+same for each batch size. Activations are what the forward pass keeps for the backward pass; they grow with
+`data.batch_size`, and `speed=fast` on a GPU halves them. The frozen text encoder is not on the device while the model
+trains. Libraries and kernels need about one more GiB.
+
+| model | parameters, M | batch | state | activations | with `task.checkpoint_activations` |
+|---|---:|---:|---:|---:|---:|
+{rows}
+
+The overrides of the wide models are `denoiser.latent_dim`, `denoiser.ff_size` (four times as wide) and
+`denoiser.num_layers`.
+
+[GPUs and clusters](clusters.md#larger-models) explains what to do if a model does not fit.
+"""
+
+
+def memory_page() -> str:
+    """Returns the page with the memory that trainings need."""
+    rows = []
+    for label, (recipe, words) in SIZES.items():
+        config = compose(recipe, words)
+        need = training_memory(config)
+        sizes = [need.state, need.activations, need.recomputed]
+        cells = [label, f"{need.parameters / 1e6:.1f}", str(config["data"]["batch_size"])]
+        cells += [f"{size / 2**30:.2f}" for size in sizes]
+        rows.append(f"| {' | '.join(cells)} |")
+    return MEMORY.format(head=HEAD, rows="\n".join(rows))
+
+
 PAGES = {
+    "memory.md": memory_page,
     "recipes.md": recipes_page,
     "hyperparameters.md": hyperparameters_page,
     "assets/house.svg": house,

@@ -33,6 +33,7 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     """Launched by Lightning."""
     words = [*tiny, *RUN, f"data_root={tmp_path / 'data'}", "data.source.workers=1"]
     ours = ["callbacks.samples.every_n_steps=2", "trainer.max_steps=4"]
+    ours.append("+task.checkpoint_activations=true")  # changes no weights
     line = ["flame_mdm", "train", "quickstart", *words, *TWO, *ours]
     code, out, err = ended(forked(tmp_path, line), tmp_path)
     assert code == 0, err

@@ -9,7 +9,6 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.profilers import PassThroughProfiler
-from lightning.pytorch.strategies import Strategy
 
 STEP_HOOKS = (
     "on_train_batch_start",
@@ -42,12 +41,11 @@ def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
     There are six hooks per step, which most callbacks do not override. Calling one takes longer
     than many operations of torch.
     """
-    owners: list[tuple[object, type]] = [(task, LightningModule), (trainer.strategy, Strategy)]
+    owners: list[tuple[object, type]] = [(task, LightningModule)]
     owners += [(callback, Callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
     for owner, base in owners:
         for name in STEP_HOOKS:
-            empty = getattr(base, name, None)
-            if empty is not None and getattr(type(owner), name) is empty:
+            if getattr(type(owner), name) is getattr(base, name):
                 setattr(owner, name, None)
 
 

@@ -15,7 +15,7 @@ def recur(gru: nn.GRU, x: Tensor) -> Tensor:
     """Computes the outputs of a GRU without dropout, from its inputs, in the GRU's layout.
 
     torch runs about twelve operations per frame in the forward pass, and in the backward pass
-    adds a gradient of the weights per frame. Here, the forward pass runs five operations per
+    adds a gradient of the weights per frame. Here, the forward pass runs six operations per
     frame, the backward pass four, and the weights get their gradients from one matrix product.
     """
     x = x.transpose(0, 1) if gru.batch_first else x

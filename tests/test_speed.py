@@ -98,18 +98,6 @@ def test_the_fast_recurrence_is_that_of_torch(batch_first):
     torch.testing.assert_close(*gradients)
 
 
-@pytest.mark.parametrize(("size", "stride", "padding"), [(3, 1, 1), (3, 2, 1), (1, 1, 0)])
-@pytest.mark.parametrize("frames", [8, 9])
-def test_the_fast_convolution_is_that_of_torch(size, stride, padding, frames):
-    layer = nn.Conv1d(4, 6, size, stride, padding, dtype=torch.float64)
-    x = torch.randn(2, 4, frames, dtype=torch.float64, requires_grad=True)
-    results = [cpu_layers.convolve(layer, x), layer(x)]
-    torch.testing.assert_close(*results)
-    factor, inputs = torch.randn_like(results[0]), (x, layer.weight, layer.bias)
-    gradients = [torch.autograd.grad((result * factor).sum(), inputs) for result in results]
-    torch.testing.assert_close(*gradients)
-
-
 @pytest.mark.parametrize("shifted", [True, False])
 def test_the_fast_masked_norm_is_that_of_the_reference(shifted):
     torch.manual_seed(0)

@@ -73,7 +73,16 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 
         return call
 
+    select = Tensor.__getitem__
+
+    def selected(tensor: Tensor, index: Any) -> Tensor:
+        parts = index if isinstance(index, tuple) else (index,)
+        if tensor.device.type != "cpu" and any(isinstance(part, list) for part in parts):
+            recorded.seen.append((recorded.label, "list as index"))  # is copied to the device
+        return select(tensor, index)
+
     with monkeypatch.context() as patched, recorded:
+        patched.setattr(Tensor, "__getitem__", selected)
         for name in METHODS:
             patched.setattr(Tensor, name, recording(name, getattr(Tensor, name)))
         yield recorded

@@ -93,9 +93,9 @@ def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
                     )
                 for number, process in list(running.items()):
                     if process.poll() is not None:
+                        del running[number]
                         _check(trainings[number], process.returncode)
                         ended.add(number)
-                        del running[number]
                 time.sleep(POLL)
         finally:
             for process in running.values():

@@ -1,4 +1,4 @@
-"""Layers of `speed=fast` that a CPU computes in less time: GRU, convolution, masked group norm.
+"""Layers of `speed=fast` that a CPU computes with fewer operations: GRU and masked group norm.
 
 They compute the same as the layers that they replace, up to rounding.
 """
@@ -97,49 +97,6 @@ class _Recurrence(torch.autograd.Function):
         to_inputs = torch.cat([flat[..., : 2 * size], totals * of_new], -1)
         of_weight = flat.flatten(0, 1).t() @ before.flatten(0, 1)
         return to_inputs, of_weight, flat.sum((0, 1))
-
-
-def convolve(layer: nn.Conv1d, x: Tensor) -> Tensor:
-    """Computes a convolution over time of x (B, C, F) with one matrix product.
-
-    In bfloat16, products of matrices gain much more on a CPU than oneDNN's convolutions.
-    """
-    return _Convolution.apply(x, layer.weight, layer.bias, layer.stride[0], layer.padding[0])
-
-
-class _Convolution(torch.autograd.Function):
-    """The product of windows (B F', K C) and the weights (K C, O)."""
-
-    @staticmethod
-    @custom_fwd(device_type="cpu", cast_inputs=torch.bfloat16)
-    def forward(
-        ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, stride: int, padding: int
-    ) -> Tensor:
-        rows, channels, frames = x.shape
-        outputs, _, size = weight.shape
-        padded = functional.pad(x.transpose(1, 2), (0, 0, padding, padding)).contiguous()
-        count = (frames + 2 * padding - size) // stride + 1
-        strides = (padded.stride(0), stride * channels, 1)
-        windows = padded.as_strided((rows, count, size * channels), strides).flatten(0, 1)
-        matrix = weight.permute(2, 1, 0).reshape(size * channels, outputs)
-        ctx.save_for_backward(windows, matrix)
-        ctx.shapes = rows, channels, frames, count, size, stride, padding
-        return torch.addmm(bias, windows, matrix).unflatten(0, (rows, count)).transpose(1, 2)
-
-    @staticmethod
-    @custom_bwd(device_type="cpu")
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        windows, matrix = ctx.saved_tensors
-        rows, channels, frames, count, size, stride, padding = ctx.shapes
-        flat = gradients[0].transpose(1, 2).flatten(0, 1).to(windows.dtype)
-        of_weight = (windows.t() @ flat).unflatten(0, (size, channels)).permute(2, 1, 0)
-        of_windows = (flat @ matrix.t()).view(rows, count, size, channels)
-        of_padded = windows.new_zeros(rows, frames + 2 * padding, channels)
-        for offset in range(size):
-            reached = slice(offset, offset + stride * (count - 1) + 1, stride)
-            of_padded[:, reached] += of_windows[:, :, offset]
-        of_x = of_padded[:, padding : padding + frames].transpose(1, 2)
-        return of_x, of_weight, flat.sum(0), None, None
 
 
 def masked_group_norm(

@@ -1,7 +1,5 @@
 """`speed=fast`: bfloat16, compilation, and cheaper dropout and attention; see docs/benchmarks/speed.md."""
 
-from functools import partial
-
 import torch
 from torch import Tensor, nn
 
@@ -9,10 +7,10 @@ from flame_mdm.config import Config
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.layers import Attention
-from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
+from flame_mdm.denoisers.unet import MaskedGroupNorm
 from flame_mdm.errors import say
 from flame_mdm.task import GeneratorTask, Task
-from flame_mdm.training.cpu_layers import convolve, masked_group_norm, recur
+from flame_mdm.training.cpu_layers import masked_group_norm, recur
 
 COMPILED_FROM = 5000
 """Minimum number of training steps for which the network is compiled.
@@ -70,8 +68,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
 
 
 def _simplify(network: nn.Module) -> None:
-    """Replaces dropout with `CheapDropout`, and attention, recurrence, convolutions and masked
-    norms with faster functions.
+    """Replaces dropout with `CheapDropout`, and attention, recurrence and masked norms with
+    functions of fewer operations.
     """
     for module in list(network.modules()):
         if isinstance(module, Attention):
@@ -80,10 +78,6 @@ def _simplify(network: nn.Module) -> None:
             module.recur = recur
         elif isinstance(module, MaskedGroupNorm):
             module.normalize = masked_group_norm
-        elif isinstance(module, MDMUNet):
-            for layer in module.modules():
-                if isinstance(layer, nn.Conv1d):
-                    layer.forward = partial(convolve, layer)
         for name, child in module.named_children():
             if isinstance(child, nn.Dropout):
                 setattr(module, name, CheapDropout(child.p).train(child.training))

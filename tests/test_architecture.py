@@ -423,6 +423,9 @@ MAY_WRITE = {
     "flame_mdm.formats.characters": {"write: binary.save": PUBLIC},
     "flame_mdm.formats.glb_writer": {"write: binary.save": PUBLIC},
     "flame_mdm.formats.vrma": {"write: binary.save": PUBLIC},
+    "flame_mdm.training.callbacks": {
+        "log_values: logger.save": "loggers write their own files, as after a step of Lightning"
+    },
     "flame_mdm.training.checkpointing": {
         "save_checkpoint: path.replace": "the last checkpoint becomes the previous one"
     },

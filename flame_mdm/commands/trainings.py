@@ -12,6 +12,7 @@ from pathlib import Path
 from flame_mdm.config import compose, flatten
 from flame_mdm.data.parallel import cores
 from flame_mdm.errors import UserError, say
+from flame_mdm.safe_io.paths import open_in_place
 
 GIB_PER_JOB = 2.0
 """Free memory in GiB that must be left to start another training beside running ones."""
@@ -86,7 +87,7 @@ def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
                     if jobs > 1:
                         path = logs / f"{number + 1}_{job.words[0].replace('/', '_')}.log"
                         say(f"   output: {path}")
-                        output = files.enter_context(path.open("ab"))
+                        output = files.enter_context(open_in_place(path))
                     command = [sys.executable, "-m", "flame_mdm", "train", *job.words]
                     running[number] = subprocess.Popen(
                         command, env=environment, stdout=output, stderr=output

@@ -86,11 +86,11 @@ class _Recurrence(torch.autograd.Function):
         totals = torch.empty_like(new)  # gradients of h', which also come from later frames
         kept = torch.zeros_like(new[0])
         steps = [gradient, factors, to_hidden, to_hidden.flatten(2), totals, totals[:, :, None], z]
-        for given, factor, out, flat, total, of_gates, share in zip(
+        for direct, factor, out, flat, total, of_gates, share in zip(
             *(reversed(part.unbind(0)) for part in steps),
             strict=True,
         ):
-            torch.add(given, kept, out=total)
+            torch.add(direct, kept, out=total)
             torch.mul(factor, of_gates, out=out)
             kept = torch.addmm(total * share, flat, weight)
         flat = to_hidden.flatten(2)

@@ -75,10 +75,9 @@ def fit(folder: Path, config: Config) -> None:
         # Added before the callbacks that use the averaged weights in validation.
         callbacks.append(MovingAverage(**config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
-    callbacks.append(measurements)
-    # Shows values that `measurements` has logged
-    callbacks += [Progress()] if config["trainer"].get("enable_progress_bar", True) else []
-    callbacks.append(Report(folder))
+    # The progress bar shows values that `measurements` has logged.
+    shown = [Progress()] if config["trainer"].get("enable_progress_bar", True) else []
+    callbacks += [measurements, *shown, Report(folder)]
     loggers = [instantiate(config["logger"])] if config["logger"] else []
     plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():

@@ -107,9 +107,9 @@ def test_the_fast_masked_norm_is_that_of_the_reference(shifted):
     if shifted:
         parts += [torch.randn(3, 8, dtype=torch.float64) for _ in range(2)]
     inputs = [part.requires_grad_() for part in (x, *parts)]
-    arguments = (*inputs[1:], *[None] * (5 - len(inputs)))
+    scale, shift = inputs[3:] if shifted else (None, None)
     results = [
-        normalize(inputs[0], mask, 4, *arguments)
+        normalize(inputs[0], mask, 4, inputs[1], inputs[2], scale, shift)
         for normalize in (cpu_layers.masked_group_norm, masked_group_norm)
     ]
     torch.testing.assert_close(*results)

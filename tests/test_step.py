@@ -261,7 +261,7 @@ def test_lightning_calls_only_hooks_that_do_something(tiny, tmp_path, monkeypatc
     def step(task: GeneratorTask, batch: Any, batch_idx: int) -> Tensor:
         for owner, base in [
             (task, LightningModule),
-            *((c, Callback) for c in task.trainer.callbacks),
+            *((c, Callback) for c in task.trainer.callbacks),  # type: ignore[attr-defined]
         ]:
             for name in STEP_HOOKS:
                 is_empty = getattr(type(owner), name) is getattr(base, name)

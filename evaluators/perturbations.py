@@ -24,7 +24,7 @@ from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SKELETONS
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.seeds import key
 
 Draws = np.random.Generator
@@ -443,7 +443,7 @@ def _through(other: HumanML, scene: Scene) -> list[np.ndarray]:
 def through_others(representation: HumanML) -> list[Perturbation]:
     """Returns one perturbation per other representation with the same skeleton and frame rate."""
     files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
-    others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
+    others: list[HumanML] = [instantiate(read_package_yaml(path)) for path in files]
     about, skeleton, fps = (
         "encoded and decoded by another representation",
         representation.skeleton,

@@ -23,7 +23,7 @@ from flame_mdm.data.store import Entry
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations import Representation
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml, read_yaml
 from flame_mdm.schemas import ClosedSchema, Int, Number, check_shape
 from flame_mdm.seeds import key
 
@@ -353,7 +353,7 @@ def _protocols(path: Path) -> dict[str, Config]:
     """Returns the protocols in a file by name:
     its variants and, if it has metrics, the file itself.
     """
-    content = read_yaml(path)
+    content = (read_package_yaml if path.parent == FOLDER else read_yaml)(path)
     variants = content.pop("variants", {}) if isinstance(content, dict) else None
     if not isinstance(variants, dict) or not all(
         isinstance(variant, dict) for variant in variants.values()

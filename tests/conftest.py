@@ -9,13 +9,15 @@ os.environ.pop("MAKELEVEL", None)  # commands say the same whether make or pytes
 os.environ.pop("MAKEFLAGS", None)
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from hydra._internal.core_plugins import file_config_source
 from hypothesis import settings
 from support.distributed import GlooPool
-from support.fixtures import compositions_once, recipe
+from support.fixtures import ParsedOnce, compositions_once, recipe
 from support.npm import node_modules as node_modules
 from support.refusals import Refused
 from support.runs import TINY
@@ -23,6 +25,7 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.config import composition
 from flame_mdm.data import parallel
+from flame_mdm.sampling import output
 
 torch.set_num_threads(1)
 # Imports make millions of objects that stay; `pytest_collection_finish` enables it again
@@ -30,6 +33,10 @@ gc.disable()
 # Tests run on all cores: more processes would only import torch again
 parallel.PATIENCE = math.inf
 composition.compose_unchecked = compositions_once(composition.compose_unchecked)
+vars(file_config_source)["OmegaConf"] = ParsedOnce
+# Pictures of samples have a sixteenth of their pixels; `test_visualize.py` looks at larger ones
+output.write_gif = partial(output.write_gif, size=64)
+output.contact_sheet = partial(output.contact_sheet, size=48)
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")  # the same examples on every machine
 

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal, get_type_hints
 
 import pytest
 import torch
+import yaml
 from support.fixtures import recipe
 from support.refusals import one_error
 
@@ -42,6 +43,7 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import read_package_yaml, read_yaml
 from flame_mdm.training.fit import check_devices
 
 PARTS = ("task", "representation", "process", "condition", "denoiser", "data")
@@ -73,6 +75,39 @@ def test_every_recipe_composes_is_short_and_says_what_it_is():
         ):
             wrong.append(name)
     assert wrong == []
+
+
+def faults_of_yaml(path: Path) -> list[str]:
+    """Returns what `read_package_yaml` reads in another way than `read_yaml`.
+
+    Numbers such as 1e-4 and dates have other types, and of keys of the same name, the last counts.
+    """
+    faults, nodes = [], [yaml.compose(path.read_text(), yaml.CSafeLoader)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, yaml.ScalarNode):
+            number = node.style is None and re.fullmatch(r"[-+]?\d+[eE][-+]?\d+", node.value)
+            if number or node.tag.endswith(":timestamp"):
+                faults.append(f"{path.name}: {node.value}")
+        elif isinstance(node, yaml.MappingNode):
+            keys = [key.value for key, _ in node.value]
+            faults += [f"{path.name}: {key} twice" for key in keys if keys.count(key) > 1]
+            nodes += [value for _, value in node.value]
+        elif node is not None:
+            nodes += node.value
+    return faults
+
+
+def test_yaml_files_of_the_package_mean_the_same_to_both_readers(tmp_path):
+    folders = [Path(flame_mdm.__file__).parent, config.EXPERIMENTS]
+    assert [
+        fault for folder in folders for p in folder.rglob("*.yaml") for fault in faults_of_yaml(p)
+    ] == []
+    path = tmp_path / "a.yaml"
+    path.write_text("{a: 1e-4, b: 2020-01-01, c: [{d: 1.0, d: 2}]}")
+    assert faults_of_yaml(path) == ["a.yaml: d twice", "a.yaml: 2020-01-01", "a.yaml: 1e-4"]
+    content = read_yaml(config.EXPERIMENTS / "base.yaml")
+    assert content == read_package_yaml(config.EXPERIMENTS / "base.yaml")
 
 
 WRONG = {

@@ -16,7 +16,7 @@ from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 CONFIGS = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
 TRANSFORMER = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
@@ -27,7 +27,7 @@ D, C, LENGTHS = 7, 12, [11, 8, 1]
 def tiny(path: str | Path, out_features: int = D, **options) -> Denoiser:
     """The denoiser of a YAML in the smallest sizes, in float64 so that only real differences show."""
     torch.manual_seed(0)
-    config = read_yaml(ROOT / "experiments/denoiser" / path)
+    config = read_package_yaml(ROOT / "experiments/denoiser" / path)
     config |= {key: value for key, value in TINY.items() if key in config}
     return instantiate(config, D, out_features, C, **options).double().eval()
 
@@ -115,7 +115,7 @@ def test_paper_sizes(subtests) -> None:
     for name, parameters in sizes.items():
         with subtests.test(name=name):
             with torch.device("meta"):
-                config = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
+                config = read_package_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
                 widths = {
                     "flame": (147, 294, 768),
                     "dip": (263, 263, 768),

@@ -532,6 +532,7 @@ def test_from_clips_to_a_prompt_and_resumed(
                 f"text={STYLED}",
                 "adapter=whole/limp.safetensors",
                 "samples=1",
+                "seconds=0.5",
             ]
         )
         == 0

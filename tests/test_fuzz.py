@@ -30,13 +30,13 @@ from flame_mdm.reporting.study import tally
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.specs import load_spec
 from flame_mdm.runs import read_history
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.training.loggers import WandbRun
 
 pytestmark = pytest.mark.slow
 
 TEXT = "text=a person walks"
-CASES: dict[str, Any] = read_yaml(ROOT / "tests" / "support" / "refused.yaml")
+CASES: dict[str, Any] = read_package_yaml(ROOT / "tests" / "support" / "refused.yaml")
 FOUR = adult(4)
 
 

@@ -36,7 +36,7 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import rotation
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import key, seeded_noise
 
@@ -50,7 +50,7 @@ SIZES = {
 }
 RECIPES = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
 # One recipe of each class of denoisers
-NETWORKS = {read_yaml(path)["_target_"]: path.stem for path in RECIPES}
+NETWORKS = {read_package_yaml(path)["_target_"]: path.stem for path in RECIPES}
 CONDITIONS = {"MDMEncoder": "action", "MDMUNet": "none"}  # other classes are conditioned on texts
 VARIANTS = [
     (name, CONDITIONS.get(target.rpartition(".")[2], "learned"))
@@ -151,7 +151,7 @@ def test_noise_and_words_of_the_runner_are_those_of_the_package() -> None:
 def tiny(name: str, condition: str) -> MotionGenerator:
     """A model with random weights."""
     config = dict(recipe("quickstart"))
-    denoiser: Any = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
+    denoiser: Any = read_package_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
     config["denoiser"] = denoiser | {key: value for key, value in SIZES.items() if key in denoiser}
     target = {
         "learned": "tokens.LearnedTokens",

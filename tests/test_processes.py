@@ -37,7 +37,7 @@ from flame_mdm.processes.guidance import (
     steer,
 )
 from flame_mdm.processes.schedules import build_schedule, timesteps
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml, read_yaml
 
 GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
 T: int = meta(GAUSSIAN)["options"]["T"]
@@ -152,7 +152,7 @@ def test_corruption_posterior_and_variational_bound(case, dtype):
 
 RECIPES = sorted((ROOT / "experiments" / "process").glob("*.yaml"))
 PROCESSES: dict[str, Process] = {
-    **{path.stem: instantiate(read_yaml(path)) for path in RECIPES},
+    **{path.stem: instantiate(read_package_yaml(path)) for path in RECIPES},
     "x0": GaussianDiffusion(prediction="x0"),
     "epsilon": GaussianDiffusion(prediction="epsilon"),
     "skip": GaussianDiffusion(

@@ -22,10 +22,10 @@ from flame_mdm.checkpoints.locating import find
 from flame_mdm.conditions.vocabulary import advice, check_known
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
-from flame_mdm.safe_io import read_yaml, sha256
+from flame_mdm.safe_io import read_package_yaml, sha256
 from flame_mdm.sampling.output import default_folder
 
-SENTENCES = read_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
+SENTENCES = read_package_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
 PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, waving"]
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from support.fixtures import recipe
 
 from evaluators.evaluator import Evaluator, Motions
@@ -20,8 +19,9 @@ from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.settings import hyperparameters as settings
 from flame_mdm.reporting.tables.specs import ABOUT, load_spec, spec_names
 from flame_mdm.reporting.tables.specs import PUBLISHED as PUBLISHED_FILE
+from flame_mdm.safe_io import read_package_yaml
 
-PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(PUBLISHED_FILE.read_text())
+PUBLISHED: dict[str, dict[str, Any]] = read_package_yaml(PUBLISHED_FILE)
 del PUBLISHED["hyperparameters"]  # which tests/test_recipes.py checks
 PAPERS = [name for name in spec_names() if name.startswith(("flame_", "mdm_", "mfm_"))]
 SPECS = {name: load_spec(name) for name in spec_names()}
@@ -212,9 +212,7 @@ def test_papers_checkpoints_are_chosen_by_fid(subtests):
 def test_real_motions_have_what_protocols_expect(subtests):
     names = {"mm_dist": "MM-Dist", "diversity": "Diversity", "fid": "FID"}
     names["motions_for_text/top3"] = "R precision (top 3)"
-    values = yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())[
-        "expected"
-    ]
+    values = read_package_yaml(EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml")["expected"]
     for table, part, data in (("mdm_1", "HumanML3D", "humanml3d"), ("mdm_2", "KIT-ML", "kit")):
         with subtests.test(table=table, part=part, data=data):
             real = next(

@@ -14,7 +14,7 @@ from flame_mdm.conditions.language.reading import NotUnderstood, Reader
 from flame_mdm.conditions.language.wording import predicate
 from flame_mdm.data.synthetic import prompts
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 pytestmark = [
     pytest.mark.tools,
@@ -44,7 +44,7 @@ ODD = [
 def typed_texts() -> list[str]:
     """Returns the texts of both fixtures, and those at the limits."""
     lines = (FIXTURES / "typed_requests.jsonl").read_text(encoding="utf-8").splitlines()
-    sentences = read_yaml(FIXTURES / "sentences.yaml")
+    sentences = read_package_yaml(FIXTURES / "sentences.yaml")
     return [
         *(json.loads(line)["text"] for line in lines),
         *(row["text"] for row in sentences),

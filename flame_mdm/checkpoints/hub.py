@@ -15,7 +15,14 @@ from flame_mdm.checkpoints.model_files import (
 )
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
-from flame_mdm.safe_io import atomic_folder, read_text, read_yaml, regular_file, sha256, write_text
+from flame_mdm.safe_io import (
+    atomic_folder,
+    read_package_yaml,
+    read_text,
+    regular_file,
+    sha256,
+    write_text,
+)
 
 CARD = Path(__file__).with_name("card.md")
 MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
@@ -106,7 +113,7 @@ def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
     from jinja2 import Template
 
     config, facts = model["config"], model["facts"]
-    licenses = read_yaml(Path(__file__).with_name("licenses.yaml"))
+    licenses = read_package_yaml(Path(__file__).with_name("licenses.yaml"))
     names = [
         name for name in ("denoiser", "process", "condition", "representation") if name in config
     ]
@@ -124,7 +131,7 @@ def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
         f"sha256 of {FILE}": file_sha256,
         **{f"weights: {name}": value for name, value in model["origin"].items()},
     }
-    terms = read_yaml(MOTION_LICENSES)
+    terms = read_package_yaml(MOTION_LICENSES)
     sources = [motions | terms.get(motions["license"], {}) for motions in facts.get("licenses", ())]
     template = Template(CARD.read_text(encoding="utf-8"), keep_trailing_newline=True)
     dataset = "mixture" if sources else facts.get("dataset")

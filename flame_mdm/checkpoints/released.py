@@ -23,7 +23,7 @@ from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.generator import MotionGenerator
-from flame_mdm.safe_io import read_npy, read_yaml, sha256
+from flame_mdm.safe_io import read_npy, read_package_yaml, sha256
 from flame_mdm.task import Task
 
 NETWORKS = {
@@ -181,7 +181,7 @@ def _recipe(
 
 def _option(group: str, name: str) -> Config:
     """Reads a mapping from `experiments/`, without resolving interpolations."""
-    return read_yaml(EXPERIMENTS / group / f"{name}.yaml")
+    return read_package_yaml(EXPERIMENTS / group / f"{name}.yaml")
 
 
 def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from flame_mdm.checkpoints.torch_files import check_keys, check_torch
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 Network = TypeVar("Network", bound=nn.Module)
 
-NAMES: dict[str, Any] = read_yaml(Path(__file__).with_name("released.yaml"))
+NAMES: dict[str, Any] = read_package_yaml(Path(__file__).with_name("released.yaml"))
 """The authors' names, and ours."""
 ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 

@@ -13,7 +13,7 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.format import Table, write
 from flame_mdm.reporting.tables.specs import load_spec
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ def main(settings: BenchmarkSettings) -> None:
         raise UserError(f"no benchmark is called '{settings.exp}'. Available: {', '.join(names)}")
     if settings.jobs < 1:
         raise UserError(f"jobs={settings.jobs}: give the number of trainings at the same time")
-    described = read_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
+    described = read_package_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
     out = Path(settings.out or Path("runs") / "benchmark" / settings.exp)
     out.mkdir(parents=True, exist_ok=True)  # reports an error before hours of work, not after
     run_trainings(plan(described["train"], settings.data_root), settings.jobs, out)

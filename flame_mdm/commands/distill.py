@@ -14,7 +14,7 @@ from flame_mdm.config import EXPERIMENTS, Config, movable, save
 from flame_mdm.config.options import option
 from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.safe_io.paths import check_tree
 
 RECIPE = "student.yaml"
@@ -91,6 +91,6 @@ def student_recipe(settings: DistillSettings) -> Config:
     }
     if samples := recipe["callbacks"].get("samples"):
         changes["callbacks"] = {"samples": {"every_n_steps": min(steps, samples["every_n_steps"])}}
-    shared = read_yaml(EXPERIMENTS / "distillation" / "consistency.yaml")
+    shared = read_package_yaml(EXPERIMENTS / "distillation" / "consistency.yaml")
     merged: Any = OmegaConf.to_container(OmegaConf.merge(movable(recipe), shared, changes))
     return merged

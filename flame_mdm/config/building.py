@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from flame_mdm.config.signatures import Config, check, definition, parameters, walk
 from flame_mdm.errors import UserError, first_line, shortened
-from flame_mdm.safe_io import read_yaml, write_text
+from flame_mdm.safe_io import read_package_yaml, read_yaml, write_text
 
 _PACKAGE = Path(__file__).parent.parent
 EXPERIMENTS = (
@@ -227,6 +227,8 @@ def _is_of_kind(target: str, kind: str) -> bool:
 @functools.cache
 def _shipped(kind: str) -> frozenset[str]:
     nodes = [
-        node for file in (EXPERIMENTS / kind).glob("*.yaml") for _, node in walk(read_yaml(file))
+        node
+        for file in (EXPERIMENTS / kind).glob("*.yaml")
+        for _, node in walk(read_package_yaml(file))
     ]
     return frozenset(node["_target_"] for node in nodes if "_target_" in node)

@@ -21,9 +21,9 @@ from flame_mdm.data import archives, required
 from flame_mdm.data.parallel import cores, in_order
 from flame_mdm.errors import UserError
 from flame_mdm.formats.resampling import check_frames, frame_rate
-from flame_mdm.safe_io import naming, read_npz, read_yaml
+from flame_mdm.safe_io import naming, read_npz, read_package_yaml
 
-FACTS = read_yaml(Path(__file__).with_suffix(".yaml"))
+FACTS = read_package_yaml(Path(__file__).with_suffix(".yaml"))
 SUBSETS: dict[str, list[str]] = FACTS["subsets"]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")

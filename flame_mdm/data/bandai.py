@@ -31,7 +31,7 @@ from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.readers import read_recording
 from flame_mdm.representations.skeleton import SMPL22, SMPL24
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 _MAP = LAYOUTS["Bandai-Namco"].map
 JOINTS = {
@@ -88,7 +88,7 @@ REST = {
 # it decodes.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
-WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
+WORDS = read_package_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]

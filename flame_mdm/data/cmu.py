@@ -30,9 +30,9 @@ from flame_mdm.formats.readers import read_recording
 from flame_mdm.formats.recordings import is_at_60
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.safe_io import naming, read_json, read_yaml
+from flame_mdm.safe_io import naming, read_json, read_package_yaml
 
-FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
+FACTS: dict[str, Any] = read_package_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
 # Endings of the files that are unpacked from an archive
 SUFFIXES = (

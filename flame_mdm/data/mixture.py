@@ -9,7 +9,7 @@ from typing import Literal
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 Use = Literal["any", "research"]
 
@@ -17,7 +17,7 @@ Use = Literal["any", "research"]
 @cache
 def known_licenses() -> dict[str, dict[str, str]]:
     """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` per license."""
-    return read_yaml(Path(__file__).with_name("licenses.yaml"))
+    return read_package_yaml(Path(__file__).with_name("licenses.yaml"))
 
 
 class Mixture(MotionSource):

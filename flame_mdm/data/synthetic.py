@@ -27,7 +27,7 @@ from flame_mdm.data.synthetic_actions import (
 )
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 # Durations of clips
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0
@@ -59,8 +59,8 @@ def content() -> dict[str, Any]:
     Captions have single keys, and the forms of verbs have their infinitives as keys. `core_verbs`
     are the infinitives of the core actions.
     """
-    grammar = read_yaml(Path(__file__).with_name("synthetic.yaml"))
-    more = read_yaml(Path(__file__).with_name("synthetic_more.yaml"))
+    grammar = read_package_yaml(Path(__file__).with_name("synthetic.yaml"))
+    more = read_package_yaml(Path(__file__).with_name("synthetic_more.yaml"))
     grammar["captions"] = {
         key: value for keys, value in grammar["captions"].items() for key in keys.split(", ")
     }

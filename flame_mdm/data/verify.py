@@ -17,7 +17,7 @@ from flame_mdm.data.t2m import words_of
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
-from flame_mdm.safe_io import read_yaml, write_text
+from flame_mdm.safe_io import read_package_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 # Distance in meters. A clip counts as still if no joint moves farther from its first position.
@@ -139,7 +139,7 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
     counted = {
         f"{name} of the store" if name in raw else name: number for name, number in counted.items()
     } | raw
-    published = read_yaml(PUBLISHED).get(store.info["dataset"], {})
+    published = read_package_yaml(PUBLISHED).get(store.info["dataset"], {})
     figures = {}
     for name in published | counted:
         figure, number = published.get(name), counted.get(name)

@@ -19,7 +19,7 @@ from flame_mdm.formats.names import Match, best_match, spelled
 from flame_mdm.formats.resampling import RATES
 from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
-from flame_mdm.safe_io import read_yaml, regular_file
+from flame_mdm.safe_io import read_package_yaml, read_yaml, regular_file
 
 # For each axis that may point up, the rows of the rotation that maps it to +y
 UP = {
@@ -201,7 +201,7 @@ def _layout(
 
 LAYOUTS: dict[str, Layout] = {
     name: _layout(**fields)
-    for name, fields in read_yaml(Path(__file__).with_name("layouts.yaml")).items()
+    for name, fields in read_package_yaml(Path(__file__).with_name("layouts.yaml")).items()
 }
 """Known skeletons, recognized by the names of their joints."""
 

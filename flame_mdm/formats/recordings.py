@@ -3,9 +3,11 @@
 import re
 from pathlib import Path
 
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
-AT_60: frozenset[str] = frozenset(read_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"])
+AT_60: frozenset[str] = frozenset(
+    read_package_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"]
+)
 """Subjects and single recordings that CMU recorded at 60 frames per second."""
 # Skeletons of CMU's recordings and their conversions
 CMU_SKELETONS = (

@@ -19,7 +19,7 @@ from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import JOINT, SMPL22
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 DIRECTIONS = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)}
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
@@ -32,7 +32,7 @@ Such poses are bent limbs, a hanging arm, and a body that turns or bows.
 @cache
 def presets() -> dict[str, dict[str, Any]]:
     """Returns the skeletons in `rigs.yaml` by name."""
-    return read_yaml(Path(__file__).with_name("rigs.yaml"))
+    return read_package_yaml(Path(__file__).with_name("rigs.yaml"))
 
 
 def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:

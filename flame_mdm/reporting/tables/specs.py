@@ -14,12 +14,12 @@ from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from flame_mdm.config import EXPERIMENTS, Config, plain
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml, read_yaml
 from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
-LABELS: dict[str, dict[str, str]] = read_yaml(Path(__file__).with_name("labels.yaml"))
+LABELS: dict[str, dict[str, str]] = read_package_yaml(Path(__file__).with_name("labels.yaml"))
 # Labels of values that are not metrics, for columns and for the x-axes of figures
 ABOUT = LABELS["values"]
 SWEPT = (
@@ -203,7 +203,7 @@ def _at_most(noun: str, count: int, most: int) -> None:
 
 def load_mapping(path: Path) -> Config:
     """Reads a YAML file that contains one mapping of plain values; raises `UserError` otherwise."""
-    content = read_yaml(path)
+    content = (read_package_yaml if path.parent == SPECS else read_yaml)(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: not a mapping")
     plain(content, path)

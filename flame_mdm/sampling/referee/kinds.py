@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.sampling.referee import movements, postures
 from flame_mdm.sampling.referee.body import Body
 from flame_mdm.sampling.referee.claims import Claim
@@ -158,7 +158,7 @@ def threshold_key(claim: Claim) -> str:
 @cache
 def thresholds() -> dict[str, Any]:
     """Returns the calibrated thresholds by `threshold_key`: "no", "yes" and number of motions."""
-    return read_yaml(FILE)["thresholds"] if FILE.exists() else {}
+    return read_package_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 
 def band(claim: Claim) -> tuple[float, float]:

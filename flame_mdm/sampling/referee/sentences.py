@@ -14,7 +14,7 @@ from typing import Any
 
 from flame_mdm.conditions.language.morphology import inflections
 from flame_mdm.conditions.language.tables import phrases, word_values
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.sampling.referee.claims import Claim, unique
 from flame_mdm.sampling.referee.kinds import KINDS, ORDER
 
@@ -365,7 +365,7 @@ def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
 
 @cache
 def _content() -> dict[str, Any]:
-    return read_yaml(Path(__file__).with_suffix(".yaml"))
+    return read_package_yaml(Path(__file__).with_suffix(".yaml"))
 
 
 @cache

@@ -259,9 +259,10 @@ def test_smpls_offsets_come_from_its_file_without_running_code(
             for protocol in (0, 2, 4)
         ]
     for path in paths:
-        np.testing.assert_allclose(load_offsets(path), offsets)
-        with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
-            restricted_pickle.read(path)
+        with subtests.test(path=path.name):
+            np.testing.assert_allclose(load_offsets(path), offsets)
+            with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
+                restricted_pickle.read(path)
     attack, wrong = Attack(os.mkdir, str(tmp_path / "run")), "not a SMPL model of 24 joints"
     wrongs = {"J_regressor": np.ones((52, 50)), "v_template": 3, "kintree_table": np.zeros((2, 24))}
     for name, value, message in (
@@ -327,7 +328,7 @@ def test_uestc_from_raw_files_to_batch(tmp_path: Path):
     }
 
 
-def test_front_view_is_actors_camera():
+def test_front_view_is_actors_camera(subtests):
     """Against the depth that reproduces the size of the picture, solved from the joints."""
     rng = np.random.default_rng(1)
     pose, joints, camera = (
@@ -347,16 +348,20 @@ def test_front_view_is_actors_camera():
         )
     places = np.array(places) - places[0]
     for side, angle in ((2, -5 * np.pi / 4), (1, 0.0)):
-        motion = front_view(pose, joints[:, uestc.ROOT], camera, uestc.Video(0, "x", 0, 5, 1, side))
-        turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
-        np.testing.assert_allclose(
-            motion[:, :3], (joints[:, uestc.ROOT] + places) @ turn.T, atol=1e-5
-        )
-        turned, before = (
-            Rotation.from_rotvec(vectors).as_matrix() for vectors in (motion[:, 3:6], pose[:, :3])
-        )
-        np.testing.assert_allclose(turned, turn @ before, atol=1e-5)
-        np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
+        with subtests.test(side=side):
+            motion = front_view(
+                pose, joints[:, uestc.ROOT], camera, uestc.Video(0, "x", 0, 5, 1, side)
+            )
+            turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+            np.testing.assert_allclose(
+                motion[:, :3], (joints[:, uestc.ROOT] + places) @ turn.T, atol=1e-5
+            )
+            turned, before = (
+                Rotation.from_rotvec(vectors).as_matrix()
+                for vectors in (motion[:, 3:6], pose[:, :3])
+            )
+            np.testing.assert_allclose(turned, turn @ before, atol=1e-5)
+            np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
 
 
 def test_damaged_lists_are_named(tmp_path: Path, subtests):

@@ -78,19 +78,20 @@ def test_clips_of_a_folder(tiny, subtests):
     same(clips(tiny, mirror=False), originals)
 
 
-def test_bones_keep_their_length_and_joints_their_position(tiny):
+def test_bones_keep_their_length_and_joints_their_position(tiny, subtests):
     assert tuple(JOINTS) == SMPL22.joints
     by_id = {clip.id: clip.motion for clip in clips(tiny, mirror=False)}
     for seed, id_ in enumerate(TAKES):
-        motion, take = by_id[id_], synthetic_take(seed, TAKES[id_])
-        lengths = np.linalg.norm(motion[:, 1:] - motion[:, SMPL22.parents[1:]], axis=2)
-        np.testing.assert_allclose(lengths, np.tile(lengths[:1], (len(lengths), 1)), atol=1e-6)
-        expected = (
-            take.positions()[::3, [take.joints.index(name) for name in JOINTS.values()]] / 100
-        )
-        # The files have no spine1, which lies between pelvis and spine2.
-        expected[:, 3] = 0.6 * expected[:, 0] + 0.4 * expected[:, 6]
-        np.testing.assert_allclose(motion[::2][: len(expected)], expected, atol=1e-6)
+        with subtests.test(clip=id_):
+            motion, take = by_id[id_], synthetic_take(seed, TAKES[id_])
+            lengths = np.linalg.norm(motion[:, 1:] - motion[:, SMPL22.parents[1:]], axis=2)
+            np.testing.assert_allclose(lengths, np.tile(lengths[:1], (len(lengths), 1)), atol=1e-6)
+            expected = (
+                take.positions()[::3, [take.joints.index(name) for name in JOINTS.values()]] / 100
+            )
+            # The files have no spine1, which lies between pelvis and spine2.
+            expected[:, 3] = 0.6 * expected[:, 0] + 0.4 * expected[:, 6]
+            np.testing.assert_allclose(motion[::2][: len(expected)], expected, atol=1e-6)
 
 
 def test_mirrored_copies(tiny, subtests):

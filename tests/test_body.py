@@ -182,7 +182,7 @@ def test_bodies_in_files_are_drawn_and_damaged_ones_named(tmp_path, subtests):
     np.savez(tmp_path / "b.npz", **stored | {"bones": stored["bones"] + 30})
     np.savez(tmp_path / "c.npz", points=stored["points"])
     for name in "abc":
-        with pytest.raises(UserError, match=rf"{name}\.npz: "):
+        with subtests.test(name=name), pytest.raises(UserError, match=rf"{name}\.npz: "):
             load_body(str(tmp_path / f"{name}.npz"))
 
 

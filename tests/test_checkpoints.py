@@ -764,7 +764,7 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtes
             r"^nobody/model@v1: no such file or folder, and .* cannot be downloaded.*$",
         ),
     ):
-        with one_line_error(message):
+        with subtests.test(message=message), one_line_error(message):
             load(name)
 
 

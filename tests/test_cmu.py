@@ -91,7 +91,7 @@ def source(folder: Path, **options) -> cmu.CMU:
 
 
 @pytest.mark.slow
-def test_clips_have_their_motion_captions_and_splits(folder):
+def test_clips_have_their_motion_captions_and_splits(folder, subtests):
     humanml = HumanML("smpl22", "legacy")
     data = source(folder)
     store = write_store(folder / "store", data, humanml)
@@ -111,8 +111,9 @@ def test_clips_have_their_motion_captions_and_splits(folder):
         ("000002", joints),
         ("M000002", SMPL22.mirror(torch.from_numpy(joints)).numpy()),
     ):
-        expected = humanml.encode(torch.from_numpy(motion))
-        np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-5)
+        with subtests.test(name=name):
+            expected = humanml.encode(torch.from_numpy(motion))
+            np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-5)
     assert clips["000004"].length == 109, "60 frames per second: 401 frames are 6.7 s"
     with tarfile.open(folder / "motions.tar.xz", "w:xz") as archive:
         archive.add(folder / "motions", "cmu/motions")
@@ -325,7 +326,7 @@ def real(tmp_path_factory):
 
 @needs_third_party
 @pytest.mark.slow
-def test_angles_are_those_of_the_public_conversion(real):
+def test_angles_are_those_of_the_public_conversion(real, subtests):
     """The first frame of 02_03.bvh in https://github.com/una-dinosauria/cmu-mocap: Euler angles z, y, x."""
     motion = asf.read(real / "asf_amc/02_03.amc", 120)
     expected: dict[str, tuple[float, ...]] = {
@@ -335,9 +336,10 @@ def test_angles_are_those_of_the_public_conversion(real):
     expected |= {"lowerneck": (-2.7887, 3.2343, -15.4607)}
     columns = dict(zip(motion.joints, motion.columns(), strict=True))
     for name, angles in expected.items():
-        np.testing.assert_allclose(
-            motion.frames[0, columns[name]], angles, atol=1.1e-4, err_msg=name
-        )
+        with subtests.test(name=name):
+            np.testing.assert_allclose(
+                motion.frames[0, columns[name]], angles, atol=1.1e-4, err_msg=name
+            )
 
 
 @needs_third_party

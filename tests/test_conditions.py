@@ -271,7 +271,9 @@ def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models, su
     assert torch.equal(real_tokens(dropped), real_tokens(cond))
 
 
-def test_the_encoder_of_flame_attends_to_padding_encodes_the_null_and_saves_its_pooler(models):
+def test_the_encoder_of_flame_attends_to_padding_encodes_the_null_and_saves_its_pooler(
+    models, subtests
+):
     """20 tokens whatever the caption; the null is the encoded empty caption; the pooler is the same everywhere."""
     flame: dict[str, Any] = {"tokens": True, "attend_padding": True, "encode_null": True}
     first, second = (
@@ -286,10 +288,11 @@ def test_the_encoder_of_flame_attends_to_padding_encodes_the_null_and_saves_its_
     assert (empty.pooled - cond.pooled[:1]).abs().max() > 0.01
     torch.testing.assert_close(first.pooler_weight[0, :2], torch.tensor([0.00251460, -0.00264210]))
     second.load_state_dict({"pooler_weight": torch.eye(WIDTH), "pooler_bias": torch.ones(WIDTH)})
-    for encoder in (first, second):
-        cond = encoder(batch_of(CAPTIONS))
-        expected = torch.tanh(cond.tokens[:, 0] @ encoder.pooler_weight.T + encoder.pooler_bias)
-        torch.testing.assert_close(cond.pooled, expected, rtol=1e-3, atol=1e-3)
+    for number, encoder in enumerate((first, second)):
+        with subtests.test(encoder=number):
+            cond = encoder(batch_of(CAPTIONS))
+            expected = torch.tanh(cond.tokens[:, 0] @ encoder.pooler_weight.T + encoder.pooler_bias)
+            torch.testing.assert_close(cond.pooled, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_frozen_model_is_no_part_of_the_module_and_ignores_training_and_autocast(models):
@@ -397,7 +400,7 @@ def with_narrow_projection(clip: str, folder: Path) -> str:
     return str(folder)
 
 
-def test_bad_options_batches_and_models_are_refused(models, tmp_path):
+def test_bad_options_batches_and_models_are_refused(models, tmp_path, subtests):
     def encoder(
         model: str, features: int = 4, pooling: Any = "mean", **options: Any
     ) -> PretrainedText:
@@ -442,7 +445,10 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path):
             )
         )
     for call, message in cases:
-        with pytest.raises((UserError, FileNotFoundError), match=message):
+        with (
+            subtests.test(message=message),
+            pytest.raises((UserError, FileNotFoundError), match=message),
+        ):
             call()
 
 

@@ -232,7 +232,10 @@ def test_each_argument_of_an_optimizer_of_a_wrong_type_is_named_with_its_value(n
         "line_search_fn",
         "adjust_lr_fn",
     }:
-        with pytest.raises(UserError, match=rf"^optimizer\.{key}=abc: must be "):
+        with (
+            subtests.test(key=key),
+            pytest.raises(UserError, match=rf"^optimizer\.{key}=abc: must be "),
+        ):
             check({"optimizer": {"_target_": target, key: "abc"}})
     for value in ([0.9], [0.9, "x"], 0.9):
         with subtests.test(value=value):
@@ -336,8 +339,12 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
             ENCODER | {"_args_": [{"_partial_": True, "_target_": target}]},
         ):
             for part in ("denoiser", "callbacks"):
-                with pytest.raises(
-                    UserError, match=rf"names .* at {part}.*\. Its code is only run if you trust it"
+                with (
+                    subtests.test(part=part),
+                    pytest.raises(
+                        UserError,
+                        match=rf"names .* at {part}.*\. Its code is only run if you trust it",
+                    ),
                 ):
                     trust({part: hidden})
     monkeypatch.setenv("FLAME_MDM_TRUST", "decimal, fractions ")

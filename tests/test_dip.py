@@ -395,7 +395,7 @@ def turned(angle: float) -> Tensor:
 
 
 @pytest.mark.parametrize(("modulo_pi", "cost"), [(False, math.pi**2), (True, 0.0)])
-def test_facing_backwards_costs_nothing_in_the_authors_loss_alone(modulo_pi, cost):
+def test_facing_backwards_costs_nothing_in_the_authors_loss_alone(modulo_pi, cost, subtests):
     aims = TargetConditions(
         SMPL22.joints, SMPL22.facing, choices=[["heading"]], heading_modulo_pi=modulo_pi
     )
@@ -406,11 +406,14 @@ def test_facing_backwards_costs_nothing_in_the_authors_loss_alone(modulo_pi, cos
     )
     # The error of a small turn is its square, also across 180 degrees, and positive angles turn to the left, to +x.
     for target, angle in ((0.3, 0.1), (math.pi - 0.1, -math.pi + 0.1)):
-        requested_turn = aims.draw(turned(target), torch.zeros(1))
-        torch.testing.assert_close(requested_turn[0, 7, 0], torch.tensor(target), rtol=0, atol=1e-5)
-        torch.testing.assert_close(
-            aims.error(turned(angle), requested_turn), torch.tensor([0.04]), rtol=0, atol=1e-5
-        )
+        with subtests.test(target=target, angle=angle):
+            requested_turn = aims.draw(turned(target), torch.zeros(1))
+            torch.testing.assert_close(
+                requested_turn[0, 7, 0], torch.tensor(target), rtol=0, atol=1e-5
+            )
+            torch.testing.assert_close(
+                aims.error(turned(angle), requested_turn), torch.tensor([0.04]), rtol=0, atol=1e-5
+            )
 
 
 def test_each_choice_of_targets_is_drawn_equally_often():

@@ -341,7 +341,7 @@ def trained_in_process(rank: int, words: list[str], steps: int) -> dict[str, Ten
     return {name: value.detach() for name, value in task.state_dict().items()}
 
 
-def test_two_processes_train_as_one_with_both_batches(data_root, pool):
+def test_two_processes_train_as_one_with_both_batches(data_root, pool, subtests):
     prepared(data_root)
     sgd = [
         "ema=null",
@@ -351,5 +351,6 @@ def test_two_processes_train_as_one_with_both_batches(data_root, pool):
     ]
     words = [*WORDS, *sgd, f"data_root={data_root}"]
     expected = reference(words, 3, "synthetic/dip")
-    for weights in pool.run(trained_in_process, (0, words, 3), (1, words, 3)):
-        torch.testing.assert_close(weights, expected, rtol=1e-4, atol=1e-6)
+    for rank, weights in enumerate(pool.run(trained_in_process, (0, words, 3), (1, words, 3))):
+        with subtests.test(rank=rank):
+            torch.testing.assert_close(weights, expected, rtol=1e-4, atol=1e-6)

@@ -224,7 +224,9 @@ def as_version_0_2(run: Path, name: str, old_name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp_path, capsys):
+def test_a_resumed_distillation_ends_in_the_same_weights(
+    trained, data_root, tmp_path, capsys, subtests
+):
     run, last = tmp_path / "run", tmp_path / "run" / "checkpoints" / "last.ckpt"
     words = ["distill", str(trained), str(run), *SHORT, f"data.root={data_root}"]
     words.append("logger._target_=lightning.pytorch.loggers.TensorBoardLogger")
@@ -236,7 +238,8 @@ def test_a_resumed_distillation_ends_in_the_same_weights(trained, data_root, tmp
     assert main(words) == 0
     again = torch.load(last, weights_only=True)
     for key in ("state_dict", "current_model_state"):
-        torch.testing.assert_close(again[key], once[key], atol=0, rtol=0)
+        with subtests.test(key=key):
+            torch.testing.assert_close(again[key], once[key], atol=0, rtol=0)
     capsys.readouterr()
     again["facts"]["teacher"] = "another"
     torch.save(again, last)
@@ -403,7 +406,7 @@ def test_strength_0_is_the_base_and_1_the_trained_model(taught):
     assert not torch.allclose(full, base, atol=1e-2)
 
 
-def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
+def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path, subtests):
     files = [taught / "limp.safetensors", taught / "march.safetensors"]
     both = flame_mdm.load(taught / "base.safetensors", adapter=files, strength=[0.5, 2])
     name, table = "denoiser.transformer.layers.0.feed_forward.0.weight", "condition.words.weight"
@@ -418,7 +421,8 @@ def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
             0, torch.tensor(rows), strength * 10 * part[f"{table}.vectors"]
         )
     for key in (name, table):
-        torch.testing.assert_close(both.state_dict()[key], expected[key])
+        with subtests.test(key=key):
+            torch.testing.assert_close(both.state_dict()[key], expected[key])
     merged = export(
         taught / "base.safetensors",
         tmp_path / "merged.safetensors",

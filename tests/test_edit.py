@@ -247,7 +247,7 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
     assert np.abs(read.joints[:count] - motion.joints).max() < (0.15 if fps == 10 else 0.01)
 
 
-def test_bad_edits_are_one_line(diffusion, flow, motion):
+def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
     short, suffix = build(TINY, max_frames=36), {"region": "suffix"}
     cases: list[tuple[MotionGenerator, dict, str]] = [
         (diffusion, {}, r"no part of the motion is kept: choose region.*strength=0\.5"),
@@ -313,11 +313,11 @@ def test_bad_edits_are_one_line(diffusion, flow, motion):
         ),
     ]
     for model, options, message in cases:
-        with one_line_error(message):
+        with subtests.test(message=message), one_line_error(message):
             edit(model, motion, **options)
 
 
-def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
+def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, subtests):
     joints, file = np.zeros((9, 22, 3)), tmp_path / "motion.npz"
     clean = {"joints": joints, "fps": 20, "representation": "humanml-clean-smpl22"}
     cases: list[tuple[Any, dict[str, Any], str]] = [
@@ -344,11 +344,12 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         (CLIP, {"cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
     ]
     for source, options, message in cases:
-        path = file if isinstance(source, dict) else source
-        if isinstance(source, dict):
-            np.savez(file, **source)
-        with one_line_error(message):
-            read_motion(diffusion.representation, path, data_root=store, **options)
+        with subtests.test(message=message):
+            path = file if isinstance(source, dict) else source
+            if isinstance(source, dict):
+                np.savez(file, **source)
+            with one_line_error(message):
+                read_motion(diffusion.representation, path, data_root=store, **options)
     np.savez(file, joints=joints[:, :21], fps=20)
     with one_line_error(
         r"motion.npz: the model needs rotations of SMPL's joints, but kit21 does not determine them"

@@ -219,25 +219,26 @@ def test_amass_files_are_those_of_amass_and_keep_rotations(tmp_path, subtests):
 
 
 def test_features_that_are_rotations_of_smpl_are_exported_and_those_of_humanml_are_not(
-    tmp_path, circle
+    tmp_path, circle, subtests
 ):
     raw = 0.2 * torch.randn(9, 75, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for representation in (SMPL(FPS), Rot6D(FPS)):
-        features = representation.encode(raw)
-        joints = representation.decode(features).numpy()
-        np.savez(
-            tmp_path / "a.npz",
-            joints=joints,
-            features=features,
-            fps=FPS,
-            representation=representation.name,
-        )
-        made = read(tmp_path / "a.npz")
-        np.testing.assert_allclose(made.posed().joints(), joints[:, :22], atol=1e-5)
-        made.save(tmp_path / "b.npz")
-        again = np.load(tmp_path / "b.npz")["poses"]
-        # All rotations but the root's, whose world differs, are kept.
-        np.testing.assert_allclose(again[:, 3:66], raw[:, 6:69], atol=1e-5)
+        with subtests.test(representation=representation.name):
+            features = representation.encode(raw)
+            joints = representation.decode(features).numpy()
+            np.savez(
+                tmp_path / "a.npz",
+                joints=joints,
+                features=features,
+                fps=FPS,
+                representation=representation.name,
+            )
+            made = read(tmp_path / "a.npz")
+            np.testing.assert_allclose(made.posed().joints(), joints[:, :22], atol=1e-5)
+            made.save(tmp_path / "b.npz")
+            again = np.load(tmp_path / "b.npz")["poses"]
+            # All rotations but the root's, whose world differs, are kept.
+            np.testing.assert_allclose(again[:, 3:66], raw[:, 6:69], atol=1e-5)
     for name, features in (("a", np.zeros((160, 263))), ("b", np.full((160, 263), 7.0))):
         arrays = {
             "joints": circle.joints,

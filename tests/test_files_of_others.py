@@ -53,11 +53,12 @@ def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(
 ):
     path, expected = tmp_path / "a.npz", walk().joints
     for numbers in (66, 72, 156, 165):
-        parts = amass(walk(), numbers=numbers)
-        np.savez(path, **parts)
-        np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
-        np.savez(path, **(parts | {"poses": parts["poses"].reshape(len(expected), -1, 3)}))
-        np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
+        with subtests.test(numbers=numbers):
+            parts = amass(walk(), numbers=numbers)
+            np.savez(path, **parts)
+            np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
+            np.savez(path, **(parts | {"poses": parts["poses"].reshape(len(expected), -1, 3)}))
+            np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
     poses = parts.pop("poses")
     np.savez(path, root_orient=poses[:, :3], pose_body=poses[:, 3:66], **parts)
     np.testing.assert_allclose(read(path).joints, expected, atol=1e-5)
@@ -154,7 +155,7 @@ def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
         )
 
 
-def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
+def test_up_of_commands_and_of_json_files_acts(tmp_path: Path, subtests):
     motion = walk()
     np.savez(tmp_path / "a.npz", **amass(motion, "y"))
     assert any("lying down" in note and "up=y" in note for note in read(tmp_path / "a.npz").notes)
@@ -180,10 +181,11 @@ def test_up_of_commands_and_of_json_files_acts(tmp_path: Path):
         "unit": "metre",
     }
     for stated, key in (({"up": "z"}, None), ({}, "z"), ({"up": "z"}, "z")):
-        (tmp_path / "a.json").write_text(json.dumps(content | stated))
-        np.testing.assert_allclose(
-            read(tmp_path / "a.json", up=key).joints, motion.joints, atol=1e-4
-        )
+        with subtests.test(stated=stated, key=key):
+            (tmp_path / "a.json").write_text(json.dumps(content | stated))
+            np.testing.assert_allclose(
+                read(tmp_path / "a.json", up=key).joints, motion.joints, atol=1e-4
+            )
     (tmp_path / "a.json").write_text(json.dumps(content | {"up": "down"}))
     with pytest.raises(UserError, match="up: down"):
         read(tmp_path / "a.json")

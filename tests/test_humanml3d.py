@@ -527,7 +527,7 @@ def smpl(root, **options):
     )
 
 
-def test_each_caption_is_a_clip_of_smpl_parameters(mine, tmp_path):
+def test_each_caption_is_a_clip_of_smpl_parameters(mine, tmp_path, subtests):
     poses = np.random.default_rng(0).normal(0, 0.2, (45, 72))
     entry = {"poses": poses, "joints3D": HUMANACT12, "motion_length": 45}
     file = written(mine / "humanact12_processed.pkl", {"P11G01R02F1812T1847A0402.npy": entry})
@@ -548,8 +548,9 @@ def test_each_caption_is_a_clip_of_smpl_parameters(mine, tmp_path):
         ("000004#0", recorded),
         ("000002#1", np.concatenate([HUMANACT12[:, 0], poses], 1)),
     ):
-        expected = SMPL().encode(torch.from_numpy(parameters)).numpy()
-        np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-6)
+        with subtests.test(name=name):
+            expected = SMPL().encode(torch.from_numpy(parameters)).numpy()
+            np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-6)
     assert store.info["excluded"] == {}
     assert {c.split for c in store.clips if c.source == "000004"} == {"val"}
 

@@ -194,11 +194,12 @@ def test_skating_resizing_wrists_drawn_in_and_pops(walk, subtests):
 
 def test_freezing_cropping_speeds_frame_rates_and_another_half(walk, subtests):
     for percent, moving in ((10, 18), (50, 10), (100, 1)):
-        frozen = p.freeze(walk[:20], percent)
-        np.testing.assert_array_equal(frozen[:moving], walk[:moving])
-        np.testing.assert_array_equal(
-            frozen[moving:], np.repeat(walk[moving - 1 : moving], 20 - moving, 0)
-        )
+        with subtests.test(percent=percent):
+            frozen = p.freeze(walk[:20], percent)
+            np.testing.assert_array_equal(frozen[:moving], walk[:moving])
+            np.testing.assert_array_equal(
+                frozen[moving:], np.repeat(walk[moving - 1 : moving], 20 - moving, 0)
+            )
     np.testing.assert_array_equal(p.crop(walk[:40], 25), walk[:30])
     assert len(p.crop(walk[:4], 90)) == 3
 
@@ -219,7 +220,7 @@ def test_freezing_cropping_speeds_frame_rates_and_another_half(walk, subtests):
     np.testing.assert_allclose(np.diff(joined[28:40], axis=0), np.diff(rest, axis=0), atol=1e-12)
 
 
-def test_encoding_keeps_frames_heights_and_features():
+def test_encoding_keeps_frames_heights_and_features(subtests):
     representation = HumanML()
     motion = torch.from_numpy(synthetic("jump").joints).double()
     features = representation.encode(motion)
@@ -229,6 +230,9 @@ def test_encoding_keeps_frames_heights_and_features():
     # The smoothed heading depends on the last frame, which is continued.
     np.testing.assert_allclose(again[:-1], features[:-1].numpy(), atol=1e-2)
     for meters in (-0.05, 0.05):  # lifted motions keep their height
-        (encoded,) = encode(representation, [p.lift(joints, 100 * meters)])
-        offset = representation.decode(torch.from_numpy(encoded)).numpy() - joints
-        np.testing.assert_allclose(offset, np.broadcast_to([0, meters, 0], joints.shape), atol=1e-4)
+        with subtests.test(meters=meters):
+            (encoded,) = encode(representation, [p.lift(joints, 100 * meters)])
+            offset = representation.decode(torch.from_numpy(encoded)).numpy() - joints
+            np.testing.assert_allclose(
+                offset, np.broadcast_to([0, meters, 0], joints.shape), atol=1e-4
+            )

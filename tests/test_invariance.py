@@ -248,19 +248,21 @@ def test_too_few_samples_and_wrong_inputs_are_errors(subtests):
         update_metrics({"mid": alignment.MutualInformationDivergence()}, **values)
 
 
-def test_samples_given_twice_and_features_that_are_not_finite_are_errors():
+def test_samples_given_twice_and_features_that_are_not_finite_are_errors(subtests):
     bad = evaluation()
     for name in ("generated", "text", "real", "joints", "logits", "nearest"):
         bad[name][3, 0] = math.nan
     for name, metric in all_metrics().items():
-        if isinstance(metric, SampleMetric):
-            with pytest.raises(UserError, match="1 samples were given twice"):
-                measure(
-                    {name: metric}, batches(evaluation(), [torch.arange(COUNT), torch.tensor([3])])
-                )
-            metric.reset()
-        with pytest.raises(UserError, match="not finite"):
-            measure({name: metric}, [bad])
+        with subtests.test(name=name):
+            if isinstance(metric, SampleMetric):
+                with pytest.raises(UserError, match="1 samples were given twice"):
+                    measure(
+                        {name: metric},
+                        batches(evaluation(), [torch.arange(COUNT), torch.tensor([3])]),
+                    )
+                metric.reset()
+            with pytest.raises(UserError, match="not finite"):
+                measure({name: metric}, [bad])
 
 
 def loss_and_gradients(

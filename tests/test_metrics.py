@@ -95,20 +95,23 @@ def test_frechet_distance_equals_the_authors(case: str, subtests):
 
 
 @one
-def test_text_metrics_equal_guos(stem: str):
+def test_text_metrics_equal_guos(stem: str, subtests):
     text, motion, real = tensor("t2m/text"), tensor("t2m/motion"), tensor("t2m/gt_motion")
     for size, name in ((int(array("t2m/batch")), "top123"), (len(text), "one_batch_of_160")):
-        ranks = []
-        for own in torch.arange(len(text)).split(size):
-            ranks.append(
-                retrieval_ranks(text[own], motion, own.expand(len(own), -1), torch.arange(len(own)))
+        with subtests.test(name=name):
+            ranks = []
+            for own in torch.arange(len(text)).split(size):
+                ranks.append(
+                    retrieval_ranks(
+                        text[own], motion, own.expand(len(own), -1), torch.arange(len(own))
+                    )
+                )
+            hits = torch.cat(ranks)[:, None] < torch.arange(1, 4)
+            np.testing.assert_allclose(
+                hits.double().mean(0), array(f"t2m/R_precision_{name}"), rtol=1e-12
             )
-        hits = torch.cat(ranks)[:, None] < torch.arange(1, 4)
-        np.testing.assert_allclose(
-            hits.double().mean(0), array(f"t2m/R_precision_{name}"), rtol=1e-12
-        )
-        if name == "top123":
-            np.testing.assert_array_equal(hits[:size], array("t2m/topk_batch0"))
+            if name == "top123":
+                np.testing.assert_array_equal(hits[:size], array("t2m/topk_batch0"))
     ids, values = keys(len(text)), {}
     values["matching_score"] = computed(MultimodalDistance(), generated=motion, text=text, keys=ids)
     values["fid"] = computed(
@@ -293,7 +296,7 @@ def averages(metric: reconstruction.PositionErrors, pairs: list[Any]) -> list[fl
 
 
 @one
-def test_temos_position_errors_equal_the_authors(stem: str):
+def test_temos_position_errors_equal_the_authors(stem: str, subtests):
     """Also of padded batches: their floor sees the padding, which the parts of padded motions reproduce."""
     names = [
         f"{error}_{part}"
@@ -334,8 +337,9 @@ def test_temos_position_errors_equal_the_authors(stem: str):
         "mean_global": "joints",
     }
     for part, name in names.items():
-        expected = array(f"temos_ape/transform0/{name}")
-        np.testing.assert_allclose(parts[part][:length] / 1000, expected[:length], atol=2e-6)
+        with subtests.test(name=name):
+            expected = array(f"temos_ape/transform0/{name}")
+            np.testing.assert_allclose(parts[part][:length] / 1000, expected[:length], atol=2e-6)
 
 
 def exactly_normal(mean: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> Tensor:

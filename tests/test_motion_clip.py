@@ -179,7 +179,7 @@ def test_the_released_file_becomes_an_extractor(stem, tmp_path, monkeypatch, cap
 
 
 @pytest.mark.parametrize("roughness", [False, True])
-def test_padding_and_company_do_not_change_features(roughness):
+def test_padding_and_company_do_not_change_features(roughness, subtests):
     clip, x, lengths = (
         network(roughness=roughness),
         torch.randn(3, 20, 7),
@@ -187,8 +187,9 @@ def test_padding_and_company_do_not_change_features(roughness):
     )
     together = clip(x, length_mask(lengths))
     for row, length in enumerate(lengths.tolist()):
-        alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
-        torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
+        with subtests.test(row=row):
+            alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
+            torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
     # The batch is padded beyond the table of lengths.
     clip(torch.zeros(1, 25, 7), length_mask(torch.tensor([20]), 25))
     with pytest.raises(UserError, match=r"21 frames, but this motion-CLIP takes at most 20"):

@@ -134,14 +134,15 @@ def test_a_turn_has_exactly_the_angle_and_begins_and_ends_standing():
     assert turn(motion, 3 * degrees, motion.local[0]) is None
 
 
-def test_planted_feet_stay_where_a_fixed_pose_has_them(walk: GroundedMotion):
+def test_planted_feet_stay_where_a_fixed_pose_has_them(walk: GroundedMotion, subtests):
     """A root that moves 5 % farther would let the feet slide."""
     farther = GroundedMotion(walk.local, 1.05 * walk.path, walk.heading, walk.contacts, walk.fps)
     assert slide(farther) > 0.5 * CENTIMETER
     fixed = planted(farther, fixed_start=True, fixed_end=True)
     assert slide(fixed) < 0.2 * CENTIMETER
     for frame in (0, -1):
-        np.testing.assert_allclose(fixed.world()[frame], farther.world()[frame], atol=1e-5)
+        with subtests.test(frame=frame):
+            np.testing.assert_allclose(fixed.world()[frame], farther.world()[frame], atol=1e-5)
 
 
 @pytest.mark.parametrize("at_end", [False, True])

@@ -133,14 +133,15 @@ def test_a_plan_leads_to_the_motion_of_the_sampler(subtests) -> None:
             onnx.sampling_plan(process, SamplerOptions(sampler=sampler, num_inference_steps=6))
 
 
-def test_noise_and_words_of_the_runner_are_those_of_the_package() -> None:
+def test_noise_and_words_of_the_runner_are_those_of_the_package(subtests) -> None:
     noise = seeded_noise(["a person walks#0"], 60, 263, seed=3, replication=0, like=torch.zeros(1))
     number = runner.key("noise", 3, 0, "a person walks#0")
     assert number == key("noise", 3, 0, "a person walks#0")
     for draw in (0, 1, 49):
-        np.testing.assert_allclose(
-            runner.normal(number + draw, 60, 263), noise(draw)[0].numpy(), atol=2e-6
-        )
+        with subtests.test(draw=draw):
+            np.testing.assert_allclose(
+                runner.normal(number + draw, 60, 263), noise(draw)[0].numpy(), atol=2e-6
+            )
     text = "Él kicks, twice: a_b don't"
     assert runner.words(text) == vocabulary.words(text)
     assert all(

@@ -62,13 +62,14 @@ POINTWISE: dict[str, dict[str, Any]] = {
 @golden_case("gaussian")
 def test_schedules_sampling_steps_and_their_betas(stem, subtests):
     for key in (key for key in GAUSSIAN if key.startswith("sched/")):
-        _, case, table = key.split("/")
-        name, total = case.split("_T")
-        tables = build_schedule(name, int(total)).tables
-        tables["sqrt_recip_alphas_cumprod"] = 1 / tables["signal"]
-        tables["sqrt_recipm1_alphas_cumprod"] = tables["noise"] / tables["signal"]
-        value = tables[TABLES.get(table, table)]
-        np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9, err_msg=key)
+        with subtests.test(key=key):
+            _, case, table = key.split("/")
+            name, total = case.split("_T")
+            tables = build_schedule(name, int(total)).tables
+            tables["sqrt_recip_alphas_cumprod"] = 1 / tables["signal"]
+            tables["sqrt_recipm1_alphas_cumprod"] = tables["noise"] / tables["signal"]
+            value = tables[TABLES.get(table, table)]
+            np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9, err_msg=key)
     for key in (key for key in GAUSSIAN if key.startswith("respace/")):
         with subtests.test(key=key):
             total, spec = key.removeprefix("respace/T").split("/")
@@ -223,7 +224,7 @@ def test_min_snr_weighs_an_error_of_the_clean_motion_alike_in_every_prediction(p
     torch.testing.assert_close(process.terms(output, x, noise, x_t, t, mask)["mse"], expected)
 
 
-def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
+def test_weights_of_the_error_and_the_skip_are_those_of_the_noise(subtests):
     """At T = 1000 and step 900, SNR < 1: the error of the noise counts 1, and min(SNR, 5) / SNR at step 10."""
     torch.manual_seed(0)
     (x, noise, wrong), t = torch.randn(3, 2, 4, 3), torch.tensor([10.0, 900.0])
@@ -237,7 +238,8 @@ def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
     for name, term in skip.loss(
         lambda *_: output, x, real(x), NO_CONDITION, t=t, noise=noise
     ).items():
-        torch.testing.assert_close(term, terms[name], rtol=1e-4, atol=0)
+        with subtests.test(name=name):
+            torch.testing.assert_close(term, terms[name], rtol=1e-4, atol=0)
 
 
 def test_hybrid_loss_trains_the_variance_alone():
@@ -259,7 +261,7 @@ def test_hybrid_loss_trains_the_variance_alone():
     assert (output.grad[..., 3:] != 0).all()
 
 
-def test_unknown_options_and_impossible_steps_are_refused():
+def test_unknown_options_and_impossible_steps_are_refused(subtests):
     cases: list[tuple[Any, str]] = [
         (lambda: GaussianDiffusion(num_train_timesteps=1), "1"),
         (lambda: GaussianDiffusion(skip=True), "epsilon"),
@@ -276,7 +278,7 @@ def test_unknown_options_and_impossible_steps_are_refused():
             wrong = {"process": config | {name: "other"}}
             cases.append((partial(check, wrong), rf"process\.{name}=other: must be one of "))
     for call, message in cases:
-        with pytest.raises(UserError, match=message):
+        with subtests.test(message=message), pytest.raises(UserError, match=message):
             call()
 
 

@@ -160,7 +160,7 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
     }
 
 
-def test_each_prompt_has_a_length_of_its_own(trained):
+def test_each_prompt_has_a_length_of_its_own(trained, subtests):
     model = flame_mdm.load(trained)
     motions = flame_mdm.generate(model, PROMPTS[:2], seconds=[1, 1.5], samples=2)
     assert [(m.text, len(m.joints)) for m in motions] == [(PROMPTS[0], 20)] * 2 + [
@@ -178,7 +178,7 @@ def test_each_prompt_has_a_length_of_its_own(trained):
             for value in ([[1]], ["x"], [float("nan")], 10**400, "3")
         ),
     ):
-        with one_line_error(message):
+        with subtests.test(message=message), one_line_error(message):
             flame_mdm.generate(model, PROMPTS[0], seconds=seconds)  # type: ignore[arg-type]
 
 

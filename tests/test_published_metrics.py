@@ -267,7 +267,7 @@ def tmr(group: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     "group", [pytest.param(g, id=f"tmr_retrieval-{g}") for g in groups(TMR, "ranks_t2m")]
 )
-def test_ranks_equal_tmrs(group: str):
+def test_ranks_equal_tmrs(group: str, subtests):
     name = group.removeprefix("out/")
     if name == "few_values_optimistic":
         pytest.skip("TMR never uses its option to break ties in favor of the correct answer")
@@ -282,8 +282,11 @@ def test_ranks_equal_tmrs(group: str):
         meaning = torch.from_numpy(TMR["in/sent_emb"]).double()
         correct |= meaning @ meaning.T > 2 * float(name.partition("_")[2]) - 1
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
-        if f"{group}/ranks_{way}" in TMR:
-            np.testing.assert_array_equal(best_ranks(table, correct), TMR[f"{group}/ranks_{way}"])
+        with subtests.test(way=way):
+            if f"{group}/ranks_{way}" in TMR:
+                np.testing.assert_array_equal(
+                    best_ranks(table, correct), TMR[f"{group}/ranks_{way}"]
+                )
     assert_recall(whole_set_retrieval(similarity, correct), TMR, tmr(group))
 
 

@@ -114,7 +114,9 @@ def test_a_known_skeleton_brings_the_joints_back_also_as_a_character_and_does_no
                     assert np.median(off) < 0.012, (name, joint)
 
 
-def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(kick: Motion):
+def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(
+    kick: Motion, subtests
+):
     """Each axis points toward a direction, or toward another joint."""
     for name, joint, axis, toward in (
         *(
@@ -127,15 +129,18 @@ def test_local_axes_are_those_of_the_skeleton_and_rotations_those_of_the_source(
         *(("soma", "LeftShin", "x", "LeftFoot"), ("100style", "LeftShoulder", "x", (1, 0, 0))),
         ("mixamo", "mixamorig:LeftArm", "y", (0, 1, 0)),
     ):
-        rig = preset(name, kick.posed())
-        at, number = dict(zip(rig.joints, rig.positions, strict=True)), rig.joints.index(joint)
-        direction = at[toward] - at[joint] if isinstance(toward, str) else np.array(toward, float)
-        actual = rig.neutral[number][:, "xyz".index(axis)]
-        # limbs of SMPL's T-pose slope a little
-        np.testing.assert_allclose(
-            actual, direction / np.linalg.norm(direction), atol=0.12, err_msg=f"{name} {joint}"
-        )
-        np.testing.assert_allclose(np.linalg.det(rig.neutral), 1)
+        with subtests.test(name=name, joint=joint, axis=axis):
+            rig = preset(name, kick.posed())
+            at, number = dict(zip(rig.joints, rig.positions, strict=True)), rig.joints.index(joint)
+            direction = (
+                at[toward] - at[joint] if isinstance(toward, str) else np.array(toward, float)
+            )
+            actual = rig.neutral[number][:, "xyz".index(axis)]
+            # limbs of SMPL's T-pose slope a little
+            np.testing.assert_allclose(
+                actual, direction / np.linalg.norm(direction), atol=0.12, err_msg=f"{name} {joint}"
+            )
+            np.testing.assert_allclose(np.linalg.det(rig.neutral), 1)
     rig = preset("soma", kick.posed())
     left, right = (rig.neutral[rig.joints.index(f"{side}Shin")] for side in ("Left", "Right"))
     # The right knee turns in the direction opposite to the mirrored left knee.

@@ -407,21 +407,22 @@ def test_dpm_solver_agrees_with_diffusers(ours, name):
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
-def test_fixed_steps_agree_with_torchdiffeq():
+def test_fixed_steps_agree_with_torchdiffeq(subtests):
     field = linear_denoiser(np.random.default_rng(0).normal(size=(4, 4)), np.ones((4, 1)), 2.0)
     start, times = drawn((2, 5, 4), torch.float64)(0), torch.linspace(0, 1, 8, dtype=torch.float64)
     for sampler in CALLS:
-        ours = sample(
-            FlowMatching(), field, recorded(start), sampler=sampler, num_inference_steps=7
-        )
-        method = "heun2" if sampler == "heun" else sampler
-        theirs = odeint(
-            lambda t, x: field(x, 1000 * t.expand(2), real(x), NO_CONDITION),
-            start,
-            times,
-            method=method,
-        )
-        torch.testing.assert_close(ours, theirs[-1], rtol=1e-9, atol=1e-9, msg=sampler)
+        with subtests.test(sampler=sampler):
+            ours = sample(
+                FlowMatching(), field, recorded(start), sampler=sampler, num_inference_steps=7
+            )
+            method = "heun2" if sampler == "heun" else sampler
+            theirs = odeint(
+                lambda t, x: field(x, 1000 * t.expand(2), real(x), NO_CONDITION),
+                start,
+                times,
+                method=method,
+            )
+            torch.testing.assert_close(ours, theirs[-1], rtol=1e-9, atol=1e-9, msg=sampler)
 
 
 def half_kept(x: Tensor) -> Tensor:
@@ -614,14 +615,16 @@ def test_no_loop_waits_for_the_device(build, sampler, subtests):
             )
 
 
-def test_half_precision_denoisers_are_sampled_in_float32():
+def test_half_precision_denoisers_are_sampled_in_float32(subtests):
     denoisers: list[Denoise] = [
         lambda x_t, *_: x_t.bfloat16(),
         lambda x_t, *_: x_t.bfloat16().float(),
     ]
     for sampler in DIFFUSION:
-        how = {"sampler": sampler, "num_inference_steps": 5}
-        half, single = (
-            sample(GaussianDiffusion(), denoise, drawn((1, 4, 2)), **how) for denoise in denoisers
-        )
-        torch.testing.assert_close(half, single, rtol=0, atol=0)
+        with subtests.test(sampler=sampler):
+            how = {"sampler": sampler, "num_inference_steps": 5}
+            half, single = (
+                sample(GaussianDiffusion(), denoise, drawn((1, 4, 2)), **how)
+                for denoise in denoisers
+            )
+            torch.testing.assert_close(half, single, rtol=0, atol=0)

@@ -134,7 +134,7 @@ def test_a_loop_has_no_seam(model):
     assert seam(loop=True) < 1 < seam(loop=False)
 
 
-def test_bad_requests_give_one_clear_line(model):
+def test_bad_requests_give_one_clear_line(model, subtests):
     cases: list[tuple[Any, dict[str, Any], str]] = [
         ("walks | | sits", {}, "part 2 is empty"),
         ("walks @fast", {}, "duration of a part must be a number"),
@@ -160,7 +160,7 @@ def test_bad_requests_give_one_clear_line(model):
         (["walk", 3], {}, r"^text=3 is not a string\. Give a string"),
     ]
     for text, options, message in cases:
-        with one_line_error(message):
+        with subtests.test(message=message), one_line_error(message):
             flame_mdm.generate(model, text, **options)
 
 
@@ -230,7 +230,7 @@ def test_waypoints_joints_and_poses_are_reached(model, tmp_path):
     assert np.degrees(np.arctan2(-left[2], left[0])) == pytest.approx(90, abs=1e-3)
 
 
-def test_bad_targets_give_one_clear_line(model, tmp_path):
+def test_bad_targets_give_one_clear_line(model, tmp_path, subtests):
     for content, message in (
         ([], r"the file is \[\], not a mapping; see docs/targets.md"),
         ({"roots": []}, "unknown key: roots. Did you mean root, joints"),
@@ -255,9 +255,10 @@ def test_bad_targets_give_one_clear_line(model, tmp_path):
         ({"poses": [{"time": 1, "file": "no.npz"}]}, "no.npz"),
         ("{", r"t.json: .*; see docs/targets.md"),
     ):
-        (tmp_path / "t.json").write_text(content if content == "{" else json.dumps(content))
-        with one_line_error(message):
-            flame_mdm.generate(model, TEXT, seconds=2, targets=tmp_path / "t.json")
+        with subtests.test(message=message):
+            (tmp_path / "t.json").write_text(content if content == "{" else json.dumps(content))
+            with one_line_error(message):
+                flame_mdm.generate(model, TEXT, seconds=2, targets=tmp_path / "t.json")
 
 
 def test_the_command_prints_the_distance_and_bad_words_are_one_line(
@@ -332,7 +333,7 @@ def test_unseen_and_unread_words_are_named_once_with_one_suggestion(subtests):
             assert vocabulary.nearest(text, CAPTIONS)[0] == CAPTIONS[first]
 
 
-def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, capsys):
+def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, capsys, subtests):
     monkeypatch.chdir(tmp_path)
     refusals = {
         "un uomo cammina in avanti": "texts are understood in English only",
@@ -340,9 +341,10 @@ def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, ca
         "a person": "no word says what happens. Nearest in meaning",
     }
     for text, line in refusals.items():
-        with pytest.raises(UserError, match=line):
-            flame_mdm.generate(model, text)
-        vocabulary.check_known(text, {})  # models without a vocabulary read every word
+        with subtests.test(text=text):
+            with pytest.raises(UserError, match=line):
+                flame_mdm.generate(model, text)
+            vocabulary.check_known(text, {})  # models without a vocabulary read every word
     walk = flame_mdm.generate(model, TEXT, seconds=1, **FAST)[0]
     with pytest.raises(UserError, match="no word says what happens"):
         flame_mdm.edit(model, walk, text, region="prefix")

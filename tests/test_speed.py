@@ -65,12 +65,13 @@ def test_cheap_dropout_is_a_function_of_the_seed_and_passes_gradients():
     assert layer.train()(x.to(torch.bfloat16)).dtype == torch.bfloat16
 
 
-def test_attention_by_matrix_products_is_the_fused_one():
+def test_attention_by_matrix_products_is_the_fused_one(subtests):
     query, key, value = torch.randn(3, 2, 4, 9, 8, dtype=torch.float64)
     mask = torch.arange(9) < torch.tensor([9, 4])[:, None, None, None]
     for m in (None, mask):
-        expected = functional.scaled_dot_product_attention(query, key, value, attn_mask=m)
-        torch.testing.assert_close(attention(query, key, value, attn_mask=m), expected)
+        with subtests.test(masked=m is not None):
+            expected = functional.scaled_dot_product_attention(query, key, value, attn_mask=m)
+            torch.testing.assert_close(attention(query, key, value, attn_mask=m), expected)
 
 
 def test_a_simplified_network_computes_the_same_without_dropout():

@@ -237,7 +237,7 @@ def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
         late.change("a person jumps", at=1)
 
 
-def test_frames_that_were_not_used_can_be_replaced(model):
+def test_frames_that_were_not_used_can_be_replaced(model, subtests):
     early, late = stream(model, "a person walks"), stream(model, "a person walks")
     early.change("a person sits down", at=2.25)
     expected = joints(islice(early, 4))
@@ -249,7 +249,10 @@ def test_frames_that_were_not_used_can_be_replaced(model):
     assert_same(joints([*ahead[:1], *islice(late, 2)]), np.delete(expected, slice(30, 45), 0))
     assert next(late).text == "a person sits down"
     for at in (0, 30):
-        with pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at 135\."):
+        with (
+            subtests.test(at=at),
+            pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at 135\."),
+        ):
             late.go_back(at)
     with pytest.raises(
         UserError, match="cleanup=true: a cleaned block depends on the block after it"

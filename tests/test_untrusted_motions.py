@@ -539,7 +539,7 @@ def test_every_field_of_a_store_is_checked(tmp_path: Path):
         refuses("features.npy is damaged", opened, tmp_path)
 
 
-def test_samples_of_other_kinds_and_recordings_of_amass_are_bounded(tmp_path: Path):
+def test_samples_of_other_kinds_and_recordings_of_amass_are_bounded(tmp_path: Path, subtests):
     path = tmp_path / "a.npz"
     whole: dict[str, Any] = {
         "ids": np.array(["a"]),
@@ -573,5 +573,5 @@ def test_samples_of_other_kinds_and_recordings_of_amass_are_bounded(tmp_path: Pa
         "poses": [np.zeros((4, 156), "S1"), np.zeros(())],
     }
     for name, value in [(name, value) for name, values in wrong.items() for value in values]:
-        with pytest.raises(UserError, match="here: "):
+        with subtests.test(name=name), pytest.raises(UserError, match="here: "):
             read_amass(npz(**{**whole, "mocap_framerate": 120.0, name: value}), "here")

@@ -67,7 +67,7 @@ def test_a_checkpoint_loads_with_its_averaged_weights_under_the_same_names(check
 
 
 @pytest.mark.slow
-def test_a_run_resumes_exactly(checkpoint, data_root, tmp_path):
+def test_a_run_resumes_exactly(checkpoint, data_root, tmp_path, subtests):
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
     config = (FILES / "config.yaml").read_text()
@@ -82,9 +82,10 @@ def test_a_run_resumes_exactly(checkpoint, data_root, tmp_path):
     expected, resumed = tensors("step_4.pt"), read_checkpoint(run / "checkpoints" / "last.ckpt")
     assert resumed["global_step"] == 4
     for name, part in (("weights", "current_model_state"), ("average", "state_dict")):
-        weights = {key: resumed[part][key] for key in expected[name]}
-        # The learning rate is 2e-3
-        torch.testing.assert_close(weights, expected[name], rtol=0, atol=1e-5)
+        with subtests.test(name=name):
+            weights = {key: resumed[part][key] for key in expected[name]}
+            # The learning rate is 2e-3
+            torch.testing.assert_close(weights, expected[name], rtol=0, atol=1e-5)
 
 
 def test_a_student_loads_without_its_teacher_and_is_written_again(tmp_path):

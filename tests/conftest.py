@@ -10,6 +10,7 @@ os.environ.pop("MAKEFLAGS", None)
 
 from collections.abc import Iterator
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -81,6 +82,12 @@ def pool() -> Iterator[GlooPool]:
     """Two processes of one group."""
     with GlooPool() as pool:
         yield pool
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes are forks of this one, so that they do not import torch again."""
+    monkeypatch.setattr(parallel, "get_context", lambda _: get_context("fork"))
 
 
 @pytest.fixture

@@ -64,6 +64,12 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 
 @cache
+def parsed(text: str) -> ast.Module:
+    """Syntax tree of a module, which no check changes."""
+    return ast.parse(text)
+
+
+@cache
 def sources() -> dict[str, str]:
     """Text of each module, by its dotted name."""
     names = [
@@ -77,7 +83,7 @@ def imports(texts: Mapping[str, str]) -> dict[str, set[str]]:
     """Modules of this project that each module imports, in functions and for type checking included."""
     graph: dict[str, set[str]] = {name: set() for name in texts}
     for name, text in texts.items():
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.walk(parsed(text)):
             if isinstance(node, ast.Import):
                 graph[name] |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -122,7 +128,7 @@ def cycle(graph: Mapping[str, set[str]]) -> list[str]:
 
 def strings_with_evaluators(text: str) -> list[str]:
     """Strings, apart from docstrings, that name a module inside `evaluators`."""
-    nodes = list(ast.walk(ast.parse(text)))
+    nodes = list(ast.walk(parsed(text)))
     docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
     strings = [
         str(node.value)
@@ -218,7 +224,7 @@ def test_these_checks_can_fail(tmp_path, subtests):
 
 def undocumented(text: str) -> list[str]:
     """Public classes without a docstring, and "module" if it has none."""
-    tree = ast.parse(text)
+    tree = parsed(text)
     classes = [
         node
         for node in tree.body
@@ -249,19 +255,23 @@ UNSAFE = {
     "pickle.Unpickler",
     "joblib.load",
 }
+SWITCHES = ("allow_pickle", "shell", "trust_remote_code")
+"""Keyword arguments that let a call run code out of files or words out of a shell, unless they are False."""
 UNSAFE |= {"yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.hub.load"}
 
 
 def unsafe_calls(text: str) -> list[str]:
     """Calls that run code out of files or words out of a shell."""
     unsafe = []
-    for node in (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)):
+    for node in (node for node in ast.walk(parsed(text)) if isinstance(node, ast.Call)):
         called = ast.unparse(node.func)
         options = {"weights_only": str(called != "torch.load")}
-        options |= {str(keyword.arg): ast.unparse(keyword.value) for keyword in node.keywords}
-        switches = {
-            options.get(name, "False") for name in ("allow_pickle", "shell", "trust_remote_code")
+        options |= {
+            str(keyword.arg): ast.unparse(keyword.value)
+            for keyword in node.keywords
+            if keyword.arg in ("weights_only", *SWITCHES)
         }
+        switches = {options.get(name, "False") for name in SWITCHES}
         if called in UNSAFE or switches != {"False"} or options["weights_only"] != "True":
             unsafe.append(ast.unparse(node))
     return unsafe
@@ -333,7 +343,7 @@ TEMPORARIES |= {"BytesIO", "token_hex"}
 def writing_calls(text: str) -> list[str]:
     """Calls that write to a file, as "function: call", unless they name a temporary file or a value made of one."""
     calls = []
-    tree = ast.parse(text)
+    tree = parsed(text)
     for scope in (tree, *(node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))):
         writers = [node for node in within(scope) if isinstance(node, ast.Call) and is_writer(node)]
         temporary = temporary_names(scope) if writers else set()
@@ -511,7 +521,7 @@ def statements(node: ast.AST) -> int:
 def shape(text: str) -> list[str]:
     """Modules and functions that are too long, classes with too many methods, and filler names."""
     faults = []
-    module = ast.parse(text)
+    module = parsed(text)
     if statements(module) > 320:
         faults.append(f"module of {statements(module)} statements")
     for node in ast.walk(module):

@@ -478,9 +478,9 @@ def test_containers_are_made_of_checked_keys_only(kind, bad):
     refuses(bad / "made.ckpt", "made.ckpt: damaged")
 
 
-def test_ten_thousand_states_of_an_optimizer_are_read(bad, subtests):
+def test_thousands_of_states_of_an_optimizer_are_read(bad, subtests):
     step = torch.tensor(1.0)
-    weights = {number: {"step": step, "exp_avg": torch.zeros(2)} for number in range(10_000)}
+    weights = {number: {"step": step, "exp_avg": torch.zeros(2)} for number in range(3000)}
     content = {
         "state_dict": OrderedDict(weight=torch.zeros(2)),
         "optimizer": {"state": weights},
@@ -489,7 +489,7 @@ def test_ten_thousand_states_of_an_optimizer_are_read(bad, subtests):
     for legacy in (False, True):
         with subtests.test(legacy=legacy):
             torch.save(content, bad / "large.ckpt", _use_new_zipfile_serialization=not legacy)
-            assert len(read_torch(bad / "large.ckpt")["optimizer"]["state"]) == 10_000
+            assert len(read_torch(bad / "large.ckpt")["optimizer"]["state"]) == 3000
 
 
 def test_files_of_torch_with_many_members_are_refused(bad, monkeypatch):

@@ -38,6 +38,7 @@ vars(file_config_source)["OmegaConf"] = ParsedOnce
 # Pictures of samples have a sixteenth of their pixels; `test_visualize.py` looks at larger ones
 output.write_gif = partial(output.write_gif, size=64)
 output.contact_sheet = partial(output.contact_sheet, size=48)
+output.write_mp4 = partial(output.write_mp4, size=64)
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")  # the same examples on every machine
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.core_plugins import file_config_source
+from hydra._internal.core_plugins import file_config_source, importlib_resources_config_source
 from hypothesis import settings
 from support.distributed import GlooPool
 from support.fixtures import ParsedOnce, compositions_once, recipe
@@ -34,7 +34,8 @@ gc.disable()
 # Tests run on all cores: more processes would only import torch again
 parallel.PATIENCE = math.inf
 composition.compose_unchecked = compositions_once(composition.compose_unchecked)
-vars(file_config_source)["OmegaConf"] = ParsedOnce
+for source in (file_config_source, importlib_resources_config_source):
+    vars(source)["OmegaConf"] = ParsedOnce
 # Pictures of samples have a sixteenth of their pixels; `test_visualize.py` looks at larger ones
 output.write_gif = partial(output.write_gif, size=64)
 output.contact_sheet = partial(output.contact_sheet, size=48)

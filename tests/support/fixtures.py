@@ -17,6 +17,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
+import hydra
 import numpy as np
 import pytest
 import torch
@@ -97,13 +98,17 @@ def compositions_once(compose_unchecked: Callable[..., Config]) -> Callable[...,
     return once
 
 
+FIXED = (EXPERIMENTS, Path(hydra.__file__).parent)
+"""Folders of the YAML files of recipes and of Hydra's own configuration."""
+
+
 class ParsedOnce(OmegaConf):
     """OmegaConf for Hydra, which parses the files of a recipe again for every composition."""
 
     @staticmethod
     def load(file_: Any) -> Any:
         path = Path(file_.name)
-        if not path.is_relative_to(EXPERIMENTS):
+        if not any(path.is_relative_to(folder) for folder in FIXED):
             return OmegaConf.load(file_)
         return OmegaConf.create(_parsed(path) or {})
 

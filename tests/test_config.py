@@ -86,12 +86,14 @@ def faults_of_yaml(path: Path) -> list[str]:
     while nodes:
         node = nodes.pop()
         if isinstance(node, yaml.ScalarNode):
-            number = node.style is None and re.fullmatch(r"[-+]?\d+[eE][-+]?\d+", node.value)
+            number = not node.style and re.fullmatch(r"[-+]?\d+[eE][-+]?\d+", node.value)
             if number or node.tag.endswith(":timestamp"):
                 faults.append(f"{path.name}: {node.value}")
         elif isinstance(node, yaml.MappingNode):
             keys = [key.value for key, _ in node.value]
-            faults += [f"{path.name}: {key} twice" for key in keys if keys.count(key) > 1]
+            faults += [
+                f"{path.name}: {key} twice" for key in dict.fromkeys(keys) if keys.count(key) > 1
+            ]
             nodes += [value for _, value in node.value]
         elif node is not None:
             nodes += node.value

@@ -10,7 +10,6 @@ os.environ.pop("MAKEFLAGS", None)
 
 from collections.abc import Iterator
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -84,12 +83,6 @@ def pool() -> Iterator[GlooPool]:
     """Two processes of one group."""
     with GlooPool() as pool:
         yield pool
-
-
-@pytest.fixture
-def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Worker processes are forks of this one, so that they do not import torch again."""
-    monkeypatch.setattr(parallel, "get_context", lambda _: get_context("fork"))
 
 
 @pytest.fixture

@@ -91,7 +91,6 @@ def source(folder: Path, **options) -> cmu.CMU:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("forked_workers")
 def test_clips_have_their_motion_captions_and_splits(folder, subtests):
     humanml = HumanML("smpl22", "legacy")
     data = source(folder)

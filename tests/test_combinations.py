@@ -78,7 +78,7 @@ def build(denoiser: str, process: str, condition: str = "learned") -> GeneratorT
     config["task"] = config["task"] | {
         "cond_drop_prob": 0.5,
         "guidance_scale": 2.5,
-        "num_inference_steps": 3,
+        "num_inference_steps": 4,
     }
     config["task"]["sampler"] = samplers(process)[0]
     if "target_encoder" in config["denoiser"]:

@@ -414,7 +414,6 @@ def pack(root, subset, name, inner):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("forked_workers")
 def test_archives_are_read_in_place_by_several_processes(downloads, mine, tmp_path):
     raw(mine).count()
     packed = shutil.copytree(downloads, tmp_path / "packed")

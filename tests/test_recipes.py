@@ -114,15 +114,10 @@ class Drawn(ConditionEncoder):
 
 
 def shortened(name: str) -> dict[str, Any]:
-    """A recipe with one narrow layer, or the two that U-Nets and GRUs have at least.
-
-    The language model is not trained.
-    """
+    """A recipe with one layer, or the two that U-Nets and GRUs have at least; the language model is not trained."""
     config = deepcopy(recipe(name))
     if "num_layers" in config["denoiser"]:
         config["denoiser"]["num_layers"] = 1
-    if "ff_size" in config["denoiser"]:
-        config["denoiser"]["ff_size"] = 64
     if config["condition"]["_target_"].endswith("PretrainedText"):
         config["condition"]["freeze"] = True
     return config

@@ -601,6 +601,15 @@ def test_the_page_of_long_streams_is_rendered_from_the_committed_figures():
     assert (folder / "streams-figure.svg").read_text(encoding="utf-8") == drawing
 
 
+def test_the_last_minute_of_a_long_stream_has_the_texts_of_the_first_one():
+    drift = script("tools/stream_drift.py")
+    requests = drift.texts(0)
+    assert len(requests) == drift.MINUTES * 60 / drift.SECONDS_PER_TEXT
+    assert requests[-6:] == requests[:6]
+    assert requests[6:12] != requests[:6]
+    assert drift.texts(1) != requests
+
+
 def test_steps_at_seams_are_told_from_steps_inside_blocks():
     """All joints go 1 cm per frame, and jump by 7 cm where the second block begins."""
     x = np.arange(20) * 0.01

@@ -2,12 +2,13 @@
 
     python tools/stream_drift.py [MODEL]
 
-Several streams of five minutes get a new text every ten seconds. Without MODEL, only the page and the figure are
-written again. The texts are captions of single synthetic actions that rules can recognize.
+Several streams of five minutes get a new text every ten seconds. The texts are captions of single synthetic actions
+that rules can recognize. The last minute has the same texts as the first one, so that both can be compared. Without
+MODEL, only the page and the figure are written again.
 """
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
 STREAMS = 32
 MINUTES = 5
 SECONDS_PER_TEXT = 10
+TEXTS_PER_MINUTE = 60 // SECONDS_PER_TEXT
 PERIODS = {"0–10 s": (0, 10), "50–60 s": (50, 60), "290–300 s": (290, 300)}
 WINDOW = 2.0  # seconds of the windows whose features are compared
 SHOWN = (2.0, 3.0, 4.0)  # lengths in seconds of the windows in which an action is looked for
@@ -50,7 +52,8 @@ INTRODUCTION = """# Long streams, measured
 [Streams](../streams.md) explains how a stream works. `python tools/stream_drift.py {model}` computes the figures.
 
 {streams} streams of {minutes} minutes get a new text every ten seconds, each {texts} texts. The texts are captions of
-single synthetic actions. No frame is cleaned up.
+single synthetic actions. The last minute has the texts of the first one, so that both can be compared. No frame is
+cleaned up.
 
 ## Drift
 
@@ -89,7 +92,7 @@ def main(model: str | None) -> None:
 def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
     """Returns all figures of a model."""
     fps = model.representation.fps
-    requests = [list(texts(number)) for number in range(STREAMS)]
+    requests = [texts(number) for number in range(STREAMS)]
     joints, seams = streamed(model, requests)
     lows = joints[..., TOES, 1].min(-1)
     extractor = MotionCLIPExtractor("motion_clip_synthetic", "cpu")
@@ -149,20 +152,25 @@ def figure(results: dict[str, Any]) -> Markup | None:
     return svg("Streams over time", panels)
 
 
-def texts(stream: int) -> Iterator[tuple[str, Attributes]]:
-    """Yields a text and its attributes for each ten seconds of a stream."""
+def texts(stream: int) -> list[tuple[str, Attributes]]:
+    """Returns a text and its attributes for each ten seconds of a stream.
+
+    The last minute repeats the texts of the first minute.
+    """
     names = [
         name for name, action in ACTIONS.items() if name not in UNDECIDED and not action.reverse
     ]
     rng = np.random.default_rng(key("streams", str(stream)))
     posture = "standing"
-    for _ in range(MINUTES * 60 // SECONDS_PER_TEXT):
+    requests = []
+    for _ in range((MINUTES - 1) * TEXTS_PER_MINUTE):
         # Nobody who stands can stand up, and nobody who lies on the floor types.
         fitting = [name for name in names if STARTS.get(name, "standing") in ("standing", posture)]
         name = str(rng.choice(fitting))
         attributes = ACTIONS[name].draw(rng, name)
         posture = ENDS.get(name, "standing")
-        yield draw_captions(rng, attributes, 1)[0][0], attributes
+        requests.append((draw_captions(rng, attributes, 1)[0][0], attributes))
+    return requests + requests[:TEXTS_PER_MINUTE]
 
 
 def streamed(
@@ -310,7 +318,7 @@ def page(results: dict[str, Any]) -> str:
         model=results["model"],
         streams=results["streams"],
         minutes=results["minutes"],
-        texts=results["minutes"] * 60 // SECONDS_PER_TEXT,
+        texts=results["minutes"] * TEXTS_PER_MINUTE,
         periods="\n".join(rows),
         real_fid=f"{results['real_fid']:.3f}",
         first=f"{results['jitter_first_minute']:.1f}",

@@ -441,10 +441,14 @@ def test_every_weight_is_used_or_the_import_fails(subtests) -> None:
         (
             "mdm",
             {"context_len": 20, "pred_len": 40},
-            "context_len=20: supported for trans_dec with bert, not for trans_enc",
+            "context_len=20: this value is supported only for trans_dec with bert, not for trans_enc",
         ),
         ("mdm", {"pred_len": 40}, "context_len=0, pred_len=40: both must be positive"),
-        ("mdm", {"emb_policy": "concat"}, "emb_policy=concat: supported for trans_dec with bert"),
+        (
+            "mdm",
+            {"emb_policy": "concat"},
+            "emb_policy=concat: this value is supported only for trans_dec with bert",
+        ),
         (
             "mdm",
             {"emb_before_mask": True},

@@ -386,7 +386,10 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
             r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly",
         ),
         (exchanged, "the toes point backward"),
-        (lambda d: d["buffers"][0].update(uri="hero.bin"), r"in one file: buffers\.0\.uri"),
+        (
+            lambda d: d["buffers"][0].update(uri="hero.bin"),
+            r"single glTF 2\.0 file \(\.glb\): buffers\.0\.uri",
+        ),
     ):
         with subtests.test(change=change, message=message):
             hero.write_bytes((tmp_path / "mixamo.glb").read_bytes())

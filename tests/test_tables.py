@@ -283,7 +283,7 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     )
     text = rendered(made(folder), "md")
     assert "Differs from the protocol: samples = 4, seed = 2." in text
-    assert "sampler ddim, eta 0.5, steps 0, 5, 9" in text
+    assert "sampler = ddim, eta 0.5; steps = 0, 5, 9" in text
     words = "Excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given."
     assert [words in note for _, note in made(folder).parts[0].notes].count(True) == 1
     lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": left_out}
@@ -412,7 +412,7 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder, subtests):
         note for _, note in part.notes
     ]
     assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]
-    assert "predicts – / – / velocity" in rendered(Table("timed", "", [part]), "md")
+    assert "predicts = – / – / velocity" in rendered(Table("timed", "", [part]), "md")
 
 
 def test_what_is_missing_or_changed_is_evaluated_once_and_timed_rows_have_their_own_batch_size(

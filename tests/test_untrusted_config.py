@@ -339,7 +339,7 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
     for part, name in (("facts", "max_frames"), ("facts", "actions"), ("config", "experiment")):
         lacking = {key: value for key, value in whole[part].items() if key != name}
         torch.save(whole | {part: lacking}, bad / "bad.ckpt")
-        refuses(bad / "bad.ckpt", f"bad.ckpt: damaged: {part} has no {name}")
+        refuses(bad / "bad.ckpt", f"bad.ckpt is damaged: {part} has no {name}")
     torch.save({"state_dict": {}}, bad / "bad.ckpt")
     refuses(bad / "bad.ckpt", "holds no recipe")
     says = "the weights do not match the recipe saved with them: size mismatch"
@@ -354,7 +354,7 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
         says="damaged: config.callbacks.best is 5",
     )
     path = model_file(bad / "x.safetensors", trained, origin=None)
-    attacked("push", str(path), "a/b", "dry_run=true", says="x.safetensors: damaged")
+    attacked("push", str(path), "a/b", "dry_run=true", says="x.safetensors is damaged")
     facts = {
         name: value
         for name, value in whole["facts"].items()

@@ -282,7 +282,7 @@ def test_bad_motions_are_refused_by_name(subtests):
         ({"joints": np.zeros((0, 22, 3))}, r"'m': joints have shape \(0, 22, 3\)"),
         (
             {"joints": np.zeros((4, 24, 3))},
-            r"'m': joints have shape \(4, 24, 3\), smpl22 needs \(frames, 22, 3\)",
+            r"'m': joints have shape \(4, 24, 3\), but smpl22 needs \(frames, 22, 3\)",
         ),
         ({"fps": 0}, "'m': fps is 0"),
         ({"fps": float("nan")}, "'m': fps is nan"),

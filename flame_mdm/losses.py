@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from flame_mdm.batch import Constant
+
 CONTACT_SPEED = 0.01
 """Maximum displacement per frame, in meters, of a foot in contact in the data."""
 
@@ -116,8 +118,8 @@ class MotionLosses(nn.Module):
     ):
         super().__init__()
         self.to_joints = to_joints
-        self.feet, self.edges = list(feet), list(edges)
-        self._indices: dict[torch.device, tuple[Tensor, Tensor]] = {}
+        # Lists would be copied to the device in every step, for which a GPU waits.
+        self.feet, self.edges = Constant(list(feet)), Constant(list(edges))
         self.joints, self.velocity, self.foot_contact, self.bone_length = (
             joints,
             velocity,
@@ -125,19 +127,6 @@ class MotionLosses(nn.Module):
             bone_length,
         )
         self.root_relative, self.velocity_features = root_relative, velocity_features
-
-    def indices(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Returns the feet (N,) and the bones (M, 2), int64, on a device.
-
-        They are copied to it once. Lists would be copied in every step, for which a GPU waits.
-        """
-        if device not in self._indices:
-            # The first call may be in a validation, whose tensors cannot be used in training.
-            with torch.inference_mode(False):
-                feet = torch.tensor(self.feet, dtype=torch.long, device=device)
-                edges = torch.tensor(self.edges, dtype=torch.long, device=device)
-                self._indices[device] = feet, edges.reshape(-1, 2)
-        return self._indices[device]
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns the weighted losses (B,) by name.
@@ -159,16 +148,17 @@ class MotionLosses(nn.Module):
         if not (self.joints or self.foot_contact or self.bone_length):
             return losses
         predicted, real = self.to_joints(x0_hat), self.to_joints(x)
-        feet, edges = self.indices(x.device)
         if self.root_relative:
             predicted, real = predicted - predicted[:, :, :1], real - real[:, :, :1]
         if self.joints:
             losses["joints"] = self.joints * masked_mse(predicted, real, mask)
         if self.foot_contact:
+            feet = self.feet.on(x.device)
             in_contact = real[:, :, feet].diff(dim=1).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
             slide = torch.where(in_contact, predicted[:, :, feet].diff(dim=1), 0.0)
             losses["foot_contact"] = self.foot_contact * masked_mean(slide.square(), moving)
         if self.bone_length:
+            edges = self.edges.on(x.device)
             lengths, real_lengths = (bone_lengths(joints, edges) for joints in (predicted, real))
             losses["bone_length"] = self.bone_length * masked_mse(lengths, real_lengths, mask)
         return losses

@@ -30,7 +30,7 @@ ALL = MODELS | {"sampling", "checkpoints", "schemas", "records", "runs", "report
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "sampler_options": {"errors", "config"},
-    "losses": set(),
+    "losses": {"batch"},
     "signals": set(),
     "progress": {"signals"},
     "representations": {"errors"},

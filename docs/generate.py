@@ -312,7 +312,7 @@ Computed from the recipes, in GiB per process and in float32, with the recipe's 
 state is the weights, their gradients, both states of Adam and, if the recipe averages weights, the average. It is the
 same for each batch size. Activations are what the forward pass keeps for the backward pass; they grow with
 `data.batch_size`, and `speed=fast` on a GPU halves them. The frozen text encoder is not on the device while the model
-trains. Libraries and kernels need about one more GiB.
+trains. Libraries and kernels need memory, too.
 
 | model | parameters, M | batch | state | activations | with `task.checkpoint_activations` |
 |---|---:|---:|---:|---:|---:|

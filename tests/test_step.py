@@ -1,4 +1,4 @@
-"""What a step costs the host, and that neither training nor sampling waits for the device in between."""
+"""The cost of a step for the host. Neither training nor sampling waits for the device between steps."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -292,7 +292,7 @@ def test_lightning_does_not_ask_all_processes_for_signals_in_every_step(monkeypa
 
 @pytest.fixture
 def count_calls(monkeypatch) -> Callable[[Callable[[], float]], float]:
-    """A function that returns the number of calls of functions per step, in place of seconds."""
+    """Returns a function that counts function calls per step, which replaces the measurement of seconds."""
     number = 0
 
     def count(frame: Any, event: str, argument: Any) -> None:

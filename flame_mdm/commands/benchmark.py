@@ -30,7 +30,7 @@ class BenchmarkSettings:
 
     OBJECTS: ClassVar = ("exp",)
     exp: str = required("a file in experiments/benchmark")
-    out: str | None = option(None, "folder; default runs/benchmark/<exp>")
+    out: str | None = option(None, "folder; default: runs/benchmark/<exp>")
     jobs: int = option(
         1, "trainings at the same time; they share the cores, and need about 2 GiB of memory each"
     )

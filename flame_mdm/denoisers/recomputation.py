@@ -18,7 +18,7 @@ def stacked_layers(denoiser: nn.Module) -> list[nn.Module]:
 def recompute_activations(denoiser: nn.Module) -> None:
     """Makes the backward pass compute the inside of stacked layers again instead of keeping it.
 
-    Only the inputs of the layers are kept, which takes less memory and about a third more time
+    Only the inputs of the layers are kept, which takes less memory and about a third more operations
     (Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost"). Random draws are
     repeated, so that the gradients are the same, bit for bit.
     """

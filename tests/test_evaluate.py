@@ -906,3 +906,13 @@ def test_the_evaluator_in_the_package_finds_texts_with_the_attributes_of_real_mo
         for clip, other in zip(clips, nearest, strict=True)
     ]
     assert (len(right) > 30, np.mean(right) > 0.9) == (True, True)
+
+
+def test_results_of_other_sizes_have_other_files(runs):
+    config = read_checkpoint(runs.model)["config"]
+    shared: dict[str, Any] = {name: config[name] for name in ("data", "representation")}
+    shared |= {"protocol": "synthetic", "baseline": "real", "extractor": "none"}
+    shared["data_root"] = str(runs.root)
+    sizes: list[dict[str, Any]] = [{}, {"quick": True}, {"replications": 3}]
+    plans = [Plan(EvaluationRequest(**shared, **size), "cpu") for size in sizes]
+    assert len({plan.path for plan in plans}) == len(sizes)

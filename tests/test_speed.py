@@ -13,16 +13,13 @@ from torch import nn
 from torch.nn import functional
 
 from flame_mdm.__main__ import main
-from flame_mdm.batch import Condition
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.layers import Transformer
-from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet, masked_group_norm
 from flame_mdm.seeds import seed_generator
 from flame_mdm.task import GeneratorTask
-from flame_mdm.training import cpu_layers, speed
+from flame_mdm.training import speed
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.speed import CheapDropout, attention
 
@@ -86,54 +83,6 @@ def test_a_simplified_network_computes_the_same_without_dropout():
     torch.testing.assert_close(network(x, mask, memory), expected)
     assert list(network.state_dict()) == names
     assert not any(isinstance(module, nn.Dropout) for module in network.modules())
-
-
-@pytest.mark.parametrize("batch_first", [True, False])
-def test_the_fast_recurrence_is_that_of_torch(batch_first):
-    gru = nn.GRU(5, 4, 2, batch_first=batch_first, dtype=torch.float64)
-    x = torch.randn(3, 7, 5, dtype=torch.float64, requires_grad=True)
-    inputs, factor = (x, *gru.parameters()), torch.randn(3, 7, 4, dtype=torch.float64)
-    expected, y = gru(x)[0], cpu_layers.recur(gru, x)
-    torch.testing.assert_close(y, expected)
-    gradients = [torch.autograd.grad((result * factor).sum(), inputs) for result in (y, expected)]
-    torch.testing.assert_close(*gradients)
-
-
-@pytest.mark.parametrize("shifted", [True, False])
-def test_the_fast_masked_norm_is_that_of_the_reference(shifted):
-    torch.manual_seed(0)
-    x, factor = torch.randn(2, 3, 8, 9, dtype=torch.float64)
-    mask = (torch.arange(9) < torch.tensor([[9], [4], [1]]))[:, None].double()
-    parts = [torch.randn(8, dtype=torch.float64) for _ in range(2)]
-    if shifted:
-        parts += [torch.randn(3, 8, dtype=torch.float64) for _ in range(2)]
-    inputs = [part.requires_grad_() for part in (x, *parts)]
-    scale, shift = inputs[3:] if shifted else (None, None)
-    results = [
-        normalize(inputs[0], mask, 4, inputs[1], inputs[2], scale, shift)
-        for normalize in (cpu_layers.masked_group_norm, masked_group_norm)
-    ]
-    torch.testing.assert_close(*results)
-    gradients = [torch.autograd.grad((result * factor).sum(), inputs) for result in results]
-    torch.testing.assert_close(*gradients)
-
-
-def test_fast_models_use_the_fast_layers():
-    unet = MDMUNet(6, 6, 4, latent_dim=8, channels=[8, 16], num_groups=4, dropout=0.1)
-    gru = MDMGRU(6, 6, 4, latent_dim=8, num_layers=2, dropout=0.1)
-    x_t, mask = torch.randn(2, 9, 6), torch.arange(9) < torch.tensor([[9], [4]])
-    cond = Condition(torch.ones(2, 4), torch.ones(2, 0, 4), None)
-    for network in (unet, gru):
-        expected = network.eval()(x_t, torch.zeros(2), mask, cond)
-        speed._simplify(network)
-        torch.testing.assert_close(network(x_t, torch.zeros(2), mask, cond), expected)
-    assert gru.recur is cpu_layers.recur
-    norms = [module for module in unet.modules() if isinstance(module, MaskedGroupNorm)]
-    assert all(norm.normalize is cpu_layers.masked_group_norm for norm in norms)
-    with torch.autocast("cpu", torch.bfloat16):
-        for network in (unet, gru):
-            network.train()(x_t, torch.zeros(2), mask, cond).square().mean().backward()
-            assert all(p.grad is None or p.grad.isfinite().all() for p in network.parameters())
 
 
 class Tiny(LightningModule):

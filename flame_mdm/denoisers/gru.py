@@ -1,7 +1,5 @@
 """The recurrent network of MDM (Tevet et al. 2023, section 4.1, appendix C)."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -51,7 +49,6 @@ class MDMGRU(Denoiser):
         self.input = nn.Linear(in_features + latent_dim, latent_dim)
         self.dropout = nn.Dropout(dropout)
         self.gru = nn.GRU(latent_dim, latent_dim, num_layers, batch_first=not recur_over_batch)
-        self.recur: Callable[[nn.GRU, Tensor], Tensor] = outputs
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
@@ -62,9 +59,4 @@ class MDMGRU(Denoiser):
         x = self.dropout(
             x + sinusoid(torch.arange(frames, device=x.device), x.shape[-1]).to(x_t.dtype)
         )
-        return self.output(self.recur(self.gru, x))
-
-
-def outputs(gru: nn.GRU, x: Tensor) -> Tensor:
-    """Returns the outputs of a GRU, which has the layout of x."""
-    return gru(x)[0]
+        return self.output(self.gru(x)[0])

@@ -5,7 +5,7 @@ details are as in the network of DDPM (Ho et al. 2020, appendix B), with the sca
 injection of Dhariwal and Nichol 2021.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -119,8 +119,8 @@ class ResidualBlock(nn.Module):
             mask: (B, 1, F), 1 = real frame, 0 = padding.
         """
         y = self.conv1(functional.silu(self.norm1(x, mask)) * mask)
-        scale, shift = self.scale_shift(token).chunk(2, 1)
-        y = functional.silu(self.norm2(y, mask, scale, shift))
+        scale, shift = self.scale_shift(token)[..., None].chunk(2, 1)
+        y = functional.silu(self.norm2(y, mask) * (1 + scale) + shift)
         return self.skip(x) + self.conv2(self.dropout(y) * mask)
 
 
@@ -134,41 +134,16 @@ class MaskedGroupNorm(nn.Module):
                 f"num_groups ({num_groups}) does not divide the number of channels ({channels})"
             )
         self.num_groups = num_groups
-        self.normalize: Callable[..., Tensor] = masked_group_norm
         self.weight = nn.Parameter(torch.ones(channels))
         self.bias = nn.Parameter(torch.zeros(channels))
 
-    def forward(
-        self, x: Tensor, mask: Tensor, scale: Tensor | None = None, shift: Tensor | None = None
-    ) -> Tensor:
-        """Normalizes a sequence.
-
-        Args:
-            x: (B, C, F).
-            mask: (B, 1, F), 1 = real frame, 0 = padding.
-            scale: (B, C); the result is multiplied by 1 + scale. Default: 0.
-            shift: (B, C), added afterward. Default: 0.
-        """
-        return self.normalize(x, mask, self.num_groups, self.weight, self.bias, scale, shift)
-
-
-def masked_group_norm(
-    x: Tensor,
-    mask: Tensor,
-    num_groups: int,
-    weight: Tensor,
-    bias: Tensor,
-    scale: Tensor | None,
-    shift: Tensor | None,
-) -> Tensor:
-    """Normalizes x (B, C, F); see `MaskedGroupNorm.forward`."""
-    groups = x.unflatten(1, (num_groups, -1))
-    mask = mask[:, None]
-    count = groups.shape[2] * mask.sum(-1, keepdim=True).clamp(min=1)
-    centered = groups - (groups * mask).sum((2, 3), keepdim=True) / count
-    variance = (centered * mask).square().sum((2, 3), keepdim=True) / count
-    normalized = (centered * (variance + 1e-5).rsqrt()).flatten(1, 2)
-    y = normalized * weight[:, None] + bias[:, None]
-    if scale is None or shift is None:
-        return y
-    return y * (1 + scale[..., None]) + shift[..., None]
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Normalizes x (B, C, F). The mask (B, 1, F) is 1 for real frames and 0 for padding."""
+        groups = x.unflatten(1, (self.num_groups, -1))
+        mask = mask[:, None]
+        count = groups.shape[2] * mask.sum(-1, keepdim=True).clamp(min=1)
+        centered = groups - (groups * mask).sum((2, 3), keepdim=True) / count
+        variance = (centered * mask).square().sum((2, 3), keepdim=True) / count
+        return (centered * (variance + 1e-5).rsqrt()).flatten(1, 2) * self.weight[
+            :, None
+        ] + self.bias[:, None]

@@ -5,12 +5,9 @@ from torch import Tensor, nn
 
 from flame_mdm.config import Config
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.layers import Attention
-from flame_mdm.denoisers.unet import MaskedGroupNorm
 from flame_mdm.errors import say
 from flame_mdm.task import GeneratorTask, Task
-from flame_mdm.training.cpu_layers import masked_group_norm, recur
 
 COMPILED_FROM = 5000
 """Minimum number of training steps for which the network is compiled.
@@ -68,16 +65,10 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
 
 
 def _simplify(network: nn.Module) -> None:
-    """Replaces dropout with `CheapDropout`, and attention, recurrence and masked norms with
-    functions of fewer operations.
-    """
+    """Replaces all dropout layers with `CheapDropout`, and attention with `attention`."""
     for module in list(network.modules()):
         if isinstance(module, Attention):
             module.attend = attention
-        elif isinstance(module, MDMGRU):
-            module.recur = recur
-        elif isinstance(module, MaskedGroupNorm):
-            module.normalize = masked_group_norm
         for name, child in module.named_children():
             if isinstance(child, nn.Dropout):
                 setattr(module, name, CheapDropout(child.p).train(child.training))

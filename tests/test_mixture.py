@@ -115,6 +115,17 @@ def test_copies_share_their_frames_and_are_limited(people: Path, tmp_path: Path)
     assert len({clip.start for clip in copies}) == 1
 
 
+def test_captions_of_some_actions_get_a_word_in_front(people: Path):
+    source = Folder(str(people), mirror=True, prefixes={"captured": ["walk"]})
+    captions = {clip.id: clip.captions for clip in source.clips(20.0)}
+    assert captions["one"] == ["captured, a person walks"]
+    assert captions["four"] == ["she dances with her left arm up"]
+    assert captions["Mfour"] == ["she dances with her right arm up"]
+    assert source.options["prefixes"] == {"walk": "captured"}
+    with pytest.raises(UserError, match=r"prefixes: no motion has the action fly.*captions.csv"):
+        Folder(str(people), prefixes={"captured": ["walk", "fly"]}).count()
+
+
 def test_a_recipe_of_a_mixture_is_checked_at_the_command_line():
     with pytest.raises(UserError, match="give any or research"):
         Mixture({"synthetic": Synthetic(clips=1)}, use="sale")  # pyright: ignore[reportArgumentType]

@@ -53,6 +53,19 @@ def test_the_clips_of_the_core_do_not_change():
     assert len(Synthetic.verbs) < len(Synthetic(1, actions="all").verbs)
 
 
+def test_a_share_of_the_clips_shows_actions_of_the_core():
+    few = Synthetic(400, workers=1, actions="all", core_share=0.5)
+    actions = [few.actions[few.clip(k, 10).action or 0] for k in range(400)]
+    share = sum(action in CORE for action in actions) / 400
+    without = Synthetic(400, workers=1, actions="all")
+    plain = sum(without.actions[without.clip(k, 10).action or 0] in CORE for k in range(400)) / 400
+    assert share == pytest.approx(0.5 + 0.5 * plain, abs=0.06)
+    assert few.options["core_share"] == 0.5
+    assert "core_share" not in without.options
+    with pytest.raises(UserError, match=r"core_share=0.5: give a number from 0 to 1, with actions"):
+        Synthetic(1, core_share=0.5)
+
+
 @pytest.mark.parametrize(
     "attributes",
     [*({"action": name} for name in MORE), *SIMULTANEOUS, *CYCLIC],

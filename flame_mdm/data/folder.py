@@ -8,7 +8,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -76,6 +76,9 @@ class Folder(MotionSource):
             clip occurs at most 16 times. 0 = no repetition.
         license: license of the motions for which the table states none, a key of `licenses.yaml`.
             Empty = unknown.
+        prefixes: words that are put in front of captions, each with the actions whose captions get
+            it. A model can then tell these motions from the motions of the same name in another
+            data set.
     """
 
     name = "folder"
@@ -91,6 +94,7 @@ class Folder(MotionSource):
         balance: int = 0,
         license: str = "",
         workers: int = 0,
+        prefixes: Mapping[str, Sequence[str]] | None = None,
     ):
         if balance < 0:
             raise UserError(
@@ -110,6 +114,11 @@ class Folder(MotionSource):
             self.options["balance"] = balance
         if license:
             self.options["license"] = license
+        self.prefixes = {
+            action: word for word, actions in (prefixes or {}).items() for action in actions
+        }
+        if self.prefixes:
+            self.options["prefixes"] = self.prefixes
         # For each layout, how upright the body is in each motion read so far
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         # Lines about the motions read so far
@@ -301,7 +310,20 @@ class Folder(MotionSource):
                     f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}; add one to "
                     "each, or leave these out with data.source.exclude"
                 )
+        self._put_prefixes(notes.values())
         return notes
+
+    def _put_prefixes(self, notes: Iterable[Note]) -> None:
+        """Puts the word of `prefixes` in front of the captions of each action."""
+        unknown = set(self.prefixes) - {note.action for note in notes}
+        if unknown:
+            raise UserError(
+                f"data.source.prefixes: no motion has the action {some(sorted(unknown))}; "
+                f"{self.path / TABLE} names the actions"
+            )
+        for note in notes:
+            if word := self.prefixes.get(note.action or ""):
+                note.texts = [f"{word}, {text}" for text in note.texts]
 
     @cached_property
     def splits(self) -> dict[str, Split]:

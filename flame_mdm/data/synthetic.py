@@ -216,6 +216,8 @@ class Synthetic(MotionSource):
         workers: number of processes that generate clips; 0 = one per core.
         actions: "core", 22 actions, or "all", which adds 54 actions, clips of two simultaneous
             actions, and parts of cycles.
+        core_share: with all actions, the fraction of clips that show one of the 22 actions, drawn
+            as with "core". The other clips are drawn from all actions.
     """
 
     name = "synthetic"
@@ -232,6 +234,7 @@ class Synthetic(MotionSource):
         seed: int = 0,
         workers: int = 0,
         actions: Literal["core", "all"] = "core",
+        core_share: float = 0.0,
     ):
         if clips < 1 or seed < 0:
             raise UserError(
@@ -239,10 +242,17 @@ class Synthetic(MotionSource):
             )
         if actions not in ("core", "all"):
             raise UserError(f'synthetic: actions={actions!r}: choose "core" or "all"')
+        if not 0 <= core_share <= 1 or (core_share and actions == "core"):
+            raise UserError(
+                f"synthetic: core_share={core_share}: give a number from 0 to 1, with actions=all"
+            )
         self.size, self.seed, self.workers, self.everything = clips, seed, workers, actions == "all"
+        self.core_share = core_share
         self.options = {"clips": clips, "seed": seed}
         if self.everything:
             self.options["actions"] = actions
+            if core_share:
+                self.options["core_share"] = core_share
             self.actions = tuple(ACTIONS)
             self.verbs = tuple(
                 sorted({form for forms in content()["verbs"].values() for form in forms})
@@ -292,6 +302,9 @@ class Synthetic(MotionSource):
 
     def attributes(self, rng: np.random.Generator) -> Attributes:
         """Draws the attributes of a clip."""
+        if self.core_share and rng.random() < self.core_share:
+            action = drawn_from(rng, CORE)
+            return CORE[action].draw(rng, action)
         kind = rng.random() if self.everything else 1.0
         if kind < SIMULTANEOUS:
             base, gesture = drawn_from(rng, BASES), drawn_from(rng, GESTURES)

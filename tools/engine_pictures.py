@@ -73,7 +73,7 @@ def sheet(path: Path, rows: Sequence[Sequence[Path]], labels: Sequence[str]) -> 
 
 def draw_files() -> None:
     """Draws a motion as skinned persons (an FBX and a GLB file), and as the bones of two rigs."""
-    motion = flame_mdm.generate(flame_mdm.load("quickstart"), TEXT)[0]
+    motion = flame_mdm.generate(flame_mdm.load("package"), TEXT)[0]
     versions = {
         "walk.fbx, rig=unreal": (".fbx", "unreal", False),
         "walk.glb": (".glb", None, False),
@@ -94,7 +94,7 @@ def draw_set() -> None:
     """Draws some clips of the locomotion set."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        if main(["sample", "quickstart", "set=locomotion", f"out={folder / 'set'}"]):
+        if main(["sample", "package", "set=locomotion", f"out={folder / 'set'}"]):
             raise UserError("the set cannot be written")
         files = [{"path": str(folder / "set" / f"{name}.fbx"), "count": COUNT} for name in CLIPS]
         sheet(ASSETS / "set.webp", rendered(files, SIZE, 16, folder), CLIPS)

@@ -29,7 +29,7 @@ SHOTS = {"page": "#stage", "examples": "#examples", "change": "#edit"}
 
 def draw_motions() -> None:
     """Draws six poses of a motion for each option."""
-    model = flame_mdm.load("quickstart")
+    model = flame_mdm.load("package")
     texts = {
         "text": WALK,
         "seed": WALK,
@@ -71,9 +71,7 @@ def draw_demo() -> None:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     from support.browser import browser
 
-    threading.Thread(
-        target=serve, args=(["quickstart"],), kwargs={"port": 7999}, daemon=True
-    ).start()
+    threading.Thread(target=serve, args=(["package"],), kwargs={"port": 7999}, daemon=True).start()
     with (
         tempfile.TemporaryDirectory() as folder,
         browser(Path(folder) / "profile", 1280, 1500) as tab,

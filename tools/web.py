@@ -272,7 +272,7 @@ if __name__ == "__main__":
     try:
         name, streaming = (*sys.argv[1:], "", "")[:2]
         if not name:
-            name, streaming = "quickstart", streaming or "package_dip"
+            name, streaming = "package", streaming or "package_dip"
         single = flame_mdm.load(name)
         build(single, Path("build/web"), flame_mdm.load(streaming) if streaming else None)
         say("written: build/web. To see it: python3 -m http.server -d build/web")

@@ -4,5 +4,5 @@ import os
 
 from flame_mdm.demo.app import serve
 
-models = ["quickstart", "package_dip"]
+models = ["package", "package_dip"]
 serve(models, host="0.0.0.0", port=7860, hosts=os.environ.get("SPACE_HOST", "").split())

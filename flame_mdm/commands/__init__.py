@@ -110,7 +110,7 @@ class ModelSettings:
     """Keys that name a model."""
 
     ckpt: str = required(
-        "a checkpoint, run directory, model file, shipped model (quickstart, package_dip), or hub id"
+        "a checkpoint, run directory, model file, shipped model (package, quickstart, package_dip), or hub id"
     )
     which: Which = option("last", "which checkpoint of a run directory: last or best")
 

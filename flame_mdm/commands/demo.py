@@ -19,7 +19,7 @@ class DemoSettings:
 
     OBJECTS: ClassVar = ("ckpt",)
     ckpt: list[str] = option(
-        lambda: ["quickstart", "package_dip"],
+        lambda: ["package", "package_dip"],
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(

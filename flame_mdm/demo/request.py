@@ -78,7 +78,7 @@ class DemoRequest(BaseModel):
     """
 
     model_config = RULES
-    model: str = "quickstart"
+    model: str = "package"
     text: Text = ""
     seconds: Annotated[float, Field(gt=0, le=MAX_SECONDS)] = 3.0
     samples: Samples = 1

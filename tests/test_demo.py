@@ -84,7 +84,7 @@ BAD = {
     "num_inference_steps=1000000": "num_inference_steps=1000000", "num_inference_steps=400": "400",
     "guidance_scale=NaN": "guidance_scale=NaN", "cleanup=maybe": "cleanup=maybe",
     "sampler=../../etc": "unknown sampler '../../etc': GaussianDiffusion has ancestral",
-    "model=/etc/passwd": "unknown model '/etc/passwd'", "model=quikstart": "Did you mean quickstart?",
+    "model=/etc/passwd": "unknown model '/etc/passwd'", "model=packige": "Did you mean package?",
     "text=": "the text is empty", "text=walks+|": "part 2 is empty", "text=" + quote("a\x00b\x1b[31m"): "text=",
     "text=walks+@600+|+waves": "the parts are too long: give at most 30 seconds in total",
     "text=walks+@20+|+waves+@20": "the parts are too long: give at most 30 seconds in total",
@@ -116,7 +116,7 @@ def query_of(bad: str) -> str:
 
 @pytest.fixture(scope="module")
 def studio() -> making.Studio:
-    return making.Studio(["quickstart"], "cpu")
+    return making.Studio(["package"], "cpu")
 
 
 def test_the_python_lines_and_the_files_give_the_same_motions(
@@ -205,7 +205,7 @@ import flame_mdm.demo.app as demo
 import flame_mdm.demo.studio as kept
 from test_demo import EDITED, body_of
 
-demo.SESSIONS, kept.KEPT, studio = 16, 16, demo.Studio(["quickstart"], "cpu")
+demo.SESSIONS, kept.KEPT, studio = 16, 16, demo.Studio(["package"], "cpu")
 demo.Studio = lambda *words: studio  # for the server that starts below
 app = demo.web_app(studio)
 gradio = next(route for route in app.app.routes if route.path == "").app

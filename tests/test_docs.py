@@ -280,4 +280,4 @@ def test_the_site_is_built_without_warnings_and_every_page_is_within_three_click
     assert {clicks[tmp_path / f"{goal}.html"] for goal in goals} == {1}
     start = (tmp_path / "index.html").read_text()
     # The page shows how to sample a first motion without any click.
-    assert "flame-mdm sample quickstart" in re.sub("<[^>]+>", "", start)
+    assert "flame-mdm sample package" in re.sub("<[^>]+>", "", start)

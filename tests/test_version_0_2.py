@@ -84,8 +84,9 @@ def test_a_run_resumes_exactly(checkpoint, data_root, tmp_path, subtests):
     for name, part in (("weights", "current_model_state"), ("average", "state_dict")):
         with subtests.test(name=name):
             weights = {key: resumed[part][key] for key in expected[name]}
-            # The learning rate is 2e-3
-            torch.testing.assert_close(weights, expected[name], rtol=0, atol=1e-5)
+            # The learning rate is 2e-3. Weights whose gradients are close to zero differ by up to 6e-5
+            # between processors, as Adam divides by the size of the gradient.
+            torch.testing.assert_close(weights, expected[name], rtol=0, atol=1e-4)
 
 
 def test_a_student_loads_without_its_teacher_and_is_written_again(tmp_path):

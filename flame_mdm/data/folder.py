@@ -8,7 +8,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -310,26 +310,36 @@ class Folder(MotionSource):
                     f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}; add one to "
                     "each, or leave these out with data.source.exclude"
                 )
-        self._put_prefixes(notes.values())
+        _put_prefixes(self.prefixes, notes.values(), self.path / TABLE)
         return notes
-
-    def _put_prefixes(self, notes: Iterable[Note]) -> None:
-        """Puts the word of `prefixes` in front of the captions of each action."""
-        unknown = set(self.prefixes) - {note.action for note in notes}
-        if unknown:
-            raise UserError(
-                f"data.source.prefixes: no motion has the action {some(sorted(unknown))}; "
-                f"{self.path / TABLE} names the actions"
-            )
-        for note in notes:
-            if word := self.prefixes.get(note.action or ""):
-                note.texts = [f"{word}, {text}" for text in note.texts]
 
     @cached_property
     def splits(self) -> dict[str, Split]:
         """Split of each motion, from the table or else drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
+
+
+def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: Path) -> None:
+    """Puts a word in front of the captions of some actions.
+
+    Args:
+        prefixes: the word, by action.
+        notes: captions and labels of all motions.
+        table: the file that names the actions, for the message.
+
+    Raises:
+        UserError: If no motion has one of the actions.
+    """
+    unknown = set(prefixes) - {note.action for note in notes}
+    if unknown:
+        raise UserError(
+            f"data.source.prefixes: no motion has the action {some(sorted(unknown))}; "
+            f"{table} names the actions"
+        )
+    for note in notes:
+        if word := prefixes.get(note.action or ""):
+            note.texts = [f"{word}, {text}" for text in note.texts]
 
 
 def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> None:

@@ -12,9 +12,14 @@ from pathlib import Path
 from PIL import Image
 
 import flame_mdm
+from flame_mdm.conditions.language.abilities import Abilities
+from flame_mdm.conditions.language.tables import actions
+from flame_mdm.conditions.language.understanding import Mention
+from flame_mdm.conditions.language.wording import caption
+from flame_mdm.data.synthetic_actions import ACTIONS
 from flame_mdm.demo.app import serve
 from flame_mdm.formats.readers import read
-from flame_mdm.visualize.render import contact_sheet
+from flame_mdm.visualize.render import contact_sheet, thumbnail
 
 ASSETS = Path(__file__).parent.parent / "docs" / "assets" / "options"
 WALK, STAND, WAVE = (
@@ -66,6 +71,17 @@ def draw_motions() -> None:
         contact_sheet(ASSETS / f"{name}.png", [replace(motion, id="")], size=80)
 
 
+def draw_stills() -> None:
+    """Draws the demo's pictures of actions that the synthetic set does not have."""
+    model = flame_mdm.load("package")
+    folder = Path(flame_mdm.__file__).parent / "demo" / "stills"
+    folder.mkdir(exist_ok=True)
+    for action in Abilities(model.facts).actions:
+        if not set(actions()[action].names) & set(ACTIONS):
+            (motion,) = flame_mdm.generate(model, caption((Mention(action),)), seconds=3)
+            (folder / f"{action}.webp").write_bytes(thumbnail(motion))
+
+
 def draw_demo() -> None:
     """Takes pictures of parts of the demo's page, at 60 % of their size and in 128 colors."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -93,4 +109,5 @@ def draw_demo() -> None:
 
 if __name__ == "__main__":
     draw_motions()
+    draw_stills()
     draw_demo()

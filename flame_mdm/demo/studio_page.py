@@ -3,23 +3,25 @@
 `page.js` writes the links; the server reads and answers them.
 """
 
-import math
 import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from html import escape
+from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
 import gradio as gr
 
+from flame_mdm.conditions.language.abilities import Abilities
 from flame_mdm.conditions.language.parsing import understand
-from flame_mdm.conditions.language.reading import NotUnderstood
+from flame_mdm.conditions.language.reading import NotUnderstood, Reader
 from flame_mdm.conditions.language.tables import actions
-from flame_mdm.data.synthetic import example, prompts
+from flame_mdm.data.synthetic import example
+from flame_mdm.data.synthetic_actions import ACTIONS as SYNTHETIC
 from flame_mdm.demo.chips import chips
 from flame_mdm.demo.live import STAND, WALK, LiveStreams
 from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query, query_pairs
@@ -34,6 +36,7 @@ from flame_mdm.sampling.referee.judging import evidence_marks, try_judge
 from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
+STILLS = Path(__file__).parent / "stills"
 QUEUE = 64  # maximum number of waiting requests; further requests are refused
 FORM = [
     "model",
@@ -61,7 +64,21 @@ PROGRAMS = {
 
 Other formats are under "More".
 """
-EXAMPLES = 12
+EXAMPLES = (
+    "a person walks forward",
+    "a person runs",
+    "a person waves with the left hand",
+    "a person jumps twice",
+    "a person kicks with the right leg",
+    "a person sits down",
+    "a person sneaks",
+    "a person climbs a ladder",
+    "a person does three jumping jacks",
+    "a person swings a sword",
+    "a person talks on the phone",
+    "a person does a push-up",
+)
+"""Texts to try. The page shows those that its model can do."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
 <div class="list"></div><button type="button" class="add">+ Add an action</button></div>
@@ -324,11 +341,24 @@ def _refusal(error: NotUnderstood) -> str:
     return f'{message}<p class="nearest">{_buttons({text: _still(text) for text in error.nearest})}</p>'
 
 
+@cache
 def _still(text: str) -> str:
-    """Returns the address of the picture for the action in a caption; "" without a picture."""
-    names = actions()[understand(text).mentions[0].action].names
-    drawn = (prompt for prompt, attributes in prompts() if attributes["action"] in names)
-    return next((_picture(prompt) for prompt in drawn), "")
+    """Returns the address of a picture of the action in a text; "" without a picture.
+
+    The picture shows the synthetic set's motion of the action. If the set does not have it, it is
+    one of the files in `stills`, which show samples of the model "package".
+    """
+    mention = understand(text).mentions[0]
+    name = next((name for name in actions()[mention.action].names if name in SYNTHETIC), None)
+    if name is not None:
+        side = {key: value for key, value in mention.attributes.items() if key == "side"}
+        image = thumbnail(Motion(example({"action": name} | side), 20.0))
+    else:
+        file = STILLS / f"{mention.action}.webp"
+        if not file.exists():
+            return ""
+        image = file.read_bytes()
+    return f"data:image/webp;base64,{b64encode(image).decode()}"
 
 
 def _note(kind: str, line: str) -> str:
@@ -353,13 +383,11 @@ def _examples(model: MotionGenerator) -> dict[str, str]:
     """Returns texts or actions of the training data with the addresses of their pictures;
     "" = no picture.
     """
-    if model.facts.get("dataset") == "synthetic" and model.conditioned_on == "text":
-        actions = {str(attributes["action"]): text for text, attributes in reversed(prompts())}
-        texts = [
-            text for action, text in reversed(actions.items()) if action in model.facts["actions"]
-        ]
-        step = math.ceil(len(texts) / EXAMPLES)
-        return {text: _picture(text) for text in texts[::step]}
+    if model.conditioned_on == "text" and Reader.fits(model.facts):
+        doable = Abilities(model.facts).actions
+        return {
+            text: _still(text) for text in EXAMPLES if understand(text).mentions[0].action in doable
+        }
     texts = list(
         model.facts["actions"]
         if model.conditioned_on == "action"
@@ -368,12 +396,6 @@ def _examples(model: MotionGenerator) -> dict[str, str]:
     return {one_line(text): "" for text in texts[:: max(1, len(texts) // 6)][:6]} or {
         "a person walks": ""
     }
-
-
-@cache
-def _picture(prompt: str) -> str:
-    motion = Motion(example(dict(prompts())[prompt]), 20.0)
-    return f"data:image/webp;base64,{b64encode(thumbnail(motion)).decode()}"
 
 
 def _buttons(examples: Mapping[str, str]) -> str:

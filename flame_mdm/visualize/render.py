@@ -208,8 +208,9 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     pen = ImageDraw.Draw(image)
     joints = motion.joints[frame].astype(float)
     half = round(motion.fps / 2)
-    x, _, z = motion.joints[max(0, frame - half) : frame + half + 1, 0].mean(0).tolist()
-    project = _camera(np.array([x, 0.85, z]), side)
+    x, y, z = motion.joints[max(0, frame - half) : frame + half + 1, 0].mean(0).tolist()
+    # The camera rises with a body that climbs, but not with a jump
+    project = _camera(np.array([x, max(0.85, y - 0.25), z]), side)
     pixel = size / 256 * SMOOTH
 
     ring, middle = np.linspace(0, 2 * np.pi, 49)[:, None], np.array([x, 0, z])

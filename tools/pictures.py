@@ -18,6 +18,7 @@ from flame_mdm.conditions.language.understanding import Mention
 from flame_mdm.conditions.language.wording import caption
 from flame_mdm.data.synthetic_actions import ACTIONS
 from flame_mdm.demo.app import serve
+from flame_mdm.demo.still_pictures import STILLS
 from flame_mdm.formats.readers import read
 from flame_mdm.visualize.render import contact_sheet, thumbnail
 
@@ -74,12 +75,10 @@ def draw_motions() -> None:
 def draw_stills() -> None:
     """Draws the demo's pictures of actions that the synthetic set does not have."""
     model = flame_mdm.load("package")
-    folder = Path(flame_mdm.__file__).parent / "demo" / "stills"
-    folder.mkdir(exist_ok=True)
     for action in Abilities(model.facts).actions:
         if not set(actions()[action].names) & set(ACTIONS):
             (motion,) = flame_mdm.generate(model, caption((Mention(action),)), seconds=3)
-            (folder / f"{action}.webp").write_bytes(thumbnail(motion))
+            (STILLS / f"{action}.webp").write_bytes(thumbnail(motion))
 
 
 def draw_demo() -> None:

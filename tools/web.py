@@ -41,9 +41,8 @@ from flame_mdm.conditions.language import (
     vectors,
     wording,
 )
-from flame_mdm.data.synthetic import example as synthetic_motion
-from flame_mdm.data.synthetic import prompts
 from flame_mdm.demo.chips import SHOWN
+from flame_mdm.demo.still_pictures import still
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import END_SITES, Motion
@@ -54,7 +53,6 @@ from flame_mdm.safe_io import read_npz, write_json, write_text
 from flame_mdm.sampling.streams import check_streams
 from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
-from flame_mdm.visualize.render import thumbnail
 
 SOURCE = Path(__file__).with_suffix("")
 # The page of streams, which the demo may share
@@ -194,19 +192,13 @@ def language_constants() -> dict[str, Any]:
 
 
 def write_pictures(out: Path, actions: Sequence[str]) -> None:
-    """Writes a picture of each action of the synthetic set,
-    and the names of the pictures to `pictures.json`.
-    """
+    """Writes the pictures of actions, and their names to `pictures.json`."""
     (out / "pictures").mkdir(exist_ok=True)
     pictures = {}
     for number, action in enumerate(actions):
-        names = tables.actions()[action].names
-        drawn = (stated for _, stated in prompts() if stated["action"] in names)
-        if (stated := next(drawn, None)) is None:
-            continue
-        pictures[action] = f"pictures/{number}.webp"
-        motion = Motion(synthetic_motion(stated), 20.0)
-        (out / pictures[action]).write_bytes(thumbnail(motion))
+        if (image := still(action)) is not None:
+            pictures[action] = f"pictures/{number}.webp"
+            (out / pictures[action]).write_bytes(image)
     write_json(out / "pictures.json", pictures)
 
 

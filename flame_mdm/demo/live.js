@@ -5,6 +5,7 @@ const EASE = 0.15; // seconds in which the clock gets back to its speed
 const LEAD = 0.25; // least number of seconds from a new text to the first frame that follows it
 const STEP = 0.1; // longest step of the clock in seconds; a hidden page pauses the stream
 const CHIPS = 6; // texts that can be clicked again
+const SPARE = 1.4; // time that a new text leaves for its block, in multiples of the median
 const TIMED = 5; // blocks whose median time tells how long the next one takes
 const MOST_POINTS = 16;
 const GOES = /\b(walk|run|jog|march|stride|stroll|skip|sneak|limp|strafe|stagger|tiptoe|crawl)(s|ing)?\b/i; // texts that waypoints keep
@@ -176,8 +177,8 @@ export class Live {
       this.isCanceled = true;
       this.source.cancel();
     }
-    // The clock does not slow down if the block takes as long as the ones before.
-    const lead = Math.ceil(this.fps * this.clock.speed * Math.max(LEAD, this.seconds + SLOW));
+    // The clock does not slow down if the block takes as long as the ones before. A canceled block ends with its step.
+    const lead = Math.ceil(this.fps * this.clock.speed * Math.max(LEAD, SPARE * this.seconds + SLOW));
     this.pending = { text, from: Math.min(this.end, Math.max(least, this.frame + 1 + lead)), entry };
   }
 

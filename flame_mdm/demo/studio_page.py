@@ -7,9 +7,7 @@ import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from html import escape
-from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
@@ -19,12 +17,10 @@ import gradio as gr
 from flame_mdm.conditions.language.abilities import Abilities
 from flame_mdm.conditions.language.parsing import understand
 from flame_mdm.conditions.language.reading import NotUnderstood, Reader
-from flame_mdm.conditions.language.tables import actions
-from flame_mdm.data.synthetic import example
-from flame_mdm.data.synthetic_actions import ACTIONS as SYNTHETIC
 from flame_mdm.demo.chips import chips
 from flame_mdm.demo.live import STAND, WALK, LiveStreams
 from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query, query_pairs
+from flame_mdm.demo.still_pictures import still
 from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text, one_line
 from flame_mdm.formats.motion import Motion
@@ -34,9 +30,7 @@ from flame_mdm.processes.guidance import STEERING_STEPS
 from flame_mdm.sampling.motion_request import read_parts
 from flame_mdm.sampling.referee.judging import evidence_marks, try_judge
 from flame_mdm.visualize import player_page
-from flame_mdm.visualize.render import thumbnail
 
-STILLS = Path(__file__).parent / "stills"
 QUEUE = 64  # maximum number of waiting requests; further requests are refused
 FORM = [
     "model",
@@ -341,23 +335,12 @@ def _refusal(error: NotUnderstood) -> str:
     return f'{message}<p class="nearest">{_buttons({text: _still(text) for text in error.nearest})}</p>'
 
 
-@cache
 def _still(text: str) -> str:
-    """Returns the address of a picture of the action in a text; "" without a picture.
-
-    The picture shows the synthetic set's motion of the action. If the set does not have it, it is
-    one of the files in `stills`, which show samples of the model "package".
-    """
+    """Returns the address of a picture of the action in a text; "" without a picture."""
     mention = understand(text).mentions[0]
-    name = next((name for name in actions()[mention.action].names if name in SYNTHETIC), None)
-    if name is not None:
-        side = {key: value for key, value in mention.attributes.items() if key == "side"}
-        image = thumbnail(Motion(example({"action": name} | side), 20.0))
-    else:
-        file = STILLS / f"{mention.action}.webp"
-        if not file.exists():
-            return ""
-        image = file.read_bytes()
+    image = still(mention.action, mention.attributes.get("side"))
+    if image is None:
+        return ""
     return f"data:image/webp;base64,{b64encode(image).decode()}"
 
 

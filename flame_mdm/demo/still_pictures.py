@@ -1,0 +1,29 @@
+"""Small pictures of actions, for buttons."""
+
+from functools import cache
+from pathlib import Path
+
+from flame_mdm.conditions.language.tables import Value, actions
+from flame_mdm.data.synthetic import example
+from flame_mdm.data.synthetic_actions import ACTIONS
+from flame_mdm.formats.motion import Motion
+from flame_mdm.visualize.render import thumbnail
+
+STILLS = Path(__file__).parent / "stills"
+"""Samples of the model "package" for actions that the synthetic set does not have."""
+
+
+@cache
+def still(action: str, side: Value | None = None) -> bytes | None:
+    """Returns a WebP image of an action. Returns None if there is no picture of the action.
+
+    Args:
+        action: name of the action in `actions.yaml`.
+        side: side of the body, for actions of the synthetic set that have one. Default: any.
+    """
+    names = [name for name in actions()[action].names if name in ACTIONS]
+    if names:
+        stated = {"action": names[0]} | ({} if side is None else {"side": side})
+        return thumbnail(Motion(example(stated), 20.0))
+    file = STILLS / f"{action}.webp"
+    return file.read_bytes() if file.exists() else None

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from flame_mdm.conditions.language.tables import Value, actions
 from flame_mdm.data.synthetic import example
-from flame_mdm.data.synthetic_actions import ACTIONS
+from flame_mdm.data.synthetic_actions import ACTIONS, Attributes
 from flame_mdm.formats.motion import Motion
 from flame_mdm.visualize.render import thumbnail
 
@@ -23,7 +23,9 @@ def still(action: str, side: Value | None = None) -> bytes | None:
     """
     names = [name for name in actions()[action].names if name in ACTIONS]
     if names:
-        stated = {"action": names[0]} | ({} if side is None else {"side": side})
+        stated: Attributes = {"action": names[0]}
+        if side is not None:
+            stated["side"] = side
         return thumbnail(Motion(example(stated), 20.0))
     file = STILLS / f"{action}.webp"
     return file.read_bytes() if file.exists() else None

@@ -157,13 +157,14 @@ export class Live {
   /** Changes the text from the first frame on that can still be made in time. */
   change(text) {
     if (!text) return;
+    let caption;
     try {
-      this.page.read(text);
+      caption = this.page.read(text);
     } catch (error) {
       this.say(error.message, error.nearest);
       return;
     }
-    this.say("");
+    this.say(caption === text ? "" : `Read as: ${caption}`);
     const entry = { text, typed: performance.now() };
     this.log.push(entry);
     this.replace(text, entry);

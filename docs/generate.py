@@ -308,11 +308,11 @@ SIZES: dict[str, tuple[str, list[str]]] = {
 MEMORY = """# Memory of a training
 
 {head}
-Computed from the recipes, in GiB per process and in float32, with the recipe's batch size and its longest motions. The
-state is the weights, their gradients, both states of Adam and, if the recipe averages weights, the average. It is the
-same for each batch size. Activations are what the forward pass keeps for the backward pass; they grow with
-`data.batch_size`, and `speed=fast` on a GPU halves them. The frozen text encoder is not on the device while the model
-trains. Libraries and kernels need memory, too.
+This table is computed from the recipes. The figures are GiB per process, in float32, with the recipe's batch size and
+its longest motions. The state consists of the weights, their gradients, both states of Adam and, if the recipe averages
+weights, the averaged weights. Its size does not depend on the batch size. Activations are tensors that the forward pass
+keeps for the backward pass. Their size grows with `data.batch_size`, and `speed=fast` on a GPU halves it. The frozen
+text encoder is not on the device while the model trains. Libraries and kernels also need memory.
 
 | model | parameters, M | batch | state | activations | with `task.checkpoint_activations` |
 |---|---:|---:|---:|---:|---:|

@@ -20,10 +20,10 @@ class MotionBatch:
     Attributes:
         x: (B, F, D) float32, normalized features, 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, unique in the data set. The names seed the noise of each sample, and tables
-            are joined by name.
-        text: one caption per motion. None: the data has no captions.
-        action: (B,) int64 class labels. None: the data has no classes.
+        ids: B names, unique in the data set. The name of a sample seeds its noise, and results are
+            joined by name.
+        text: one caption per motion, or None if the data contains no captions.
+        action: (B,) int64 class labels, or None if the data contains no classes.
 
     Example:
         >>> batch = collate([("a", torch.ones(4, 2), "walks", None), ("b", torch.ones(2, 2), "sits", None)])
@@ -46,17 +46,17 @@ class MotionBatch:
         return len(self.ids)
 
     def to(self, device: torch.device) -> MotionBatch:
-        """Returns the batch on a device.
+        """Moves the batch to a device.
 
-        Lightning calls this. The copy runs in the background.
+        Called by Lightning. The copy is asynchronous.
         """
         action = None if self.action is None else sent(self.action, device)
         return replace(self, x=sent(self.x, device), mask=sent(self.mask, device), action=action)
 
     def pin_memory(self) -> MotionBatch:
-        """Returns the batch in pinned memory, from which copies to a GPU run in the background.
+        """Copies the batch to pinned memory, so that copies to a GPU are asynchronous.
 
-        The data loader calls this.
+        Called by the data loader.
         """
         action = None if self.action is None else self.action.pin_memory()
         return replace(self, x=self.x.pin_memory(), mask=self.mask.pin_memory(), action=action)
@@ -68,16 +68,16 @@ class Condition:
 
     Attributes:
         pooled: (B, C), one vector per sample.
-        tokens: (B, S, C), one vector per word piece; (B, 0, C) if the encoder returns none.
-        token_mask: (B, S) bool, True = real token. None in a null condition means that a sample
-            keeps its mask when its condition is replaced.
-        null: the condition that means "no condition", with batch size 1. None: the encoder has no
-            null condition.
-        prefix: (B, P, D), normalized features of the P clean frames before the motion. None: no
-            frames come before it.
-        target: (B, 8, 4), where the motion should end; see `flame_mdm.conditions.target`. None:
+        tokens: (B, S, C), one vector per word piece. S is 0 if the encoder returns no tokens.
+        token_mask: (B, S) bool, True = real token. In a null condition, None means that a sample
+            keeps its own mask when its condition is replaced.
+        null: the null condition, which means "no condition", with batch size 1. None if the encoder
+            has no null condition.
+        prefix: (B, P, D), normalized features of the P clean frames before the motion. None if no
+            frames precede it.
+        target: (B, 8, 4), where the motion should end; see `flame_mdm.conditions.target`. None if
             it may end anywhere.
-        target_mask: (B,) bool, False = this sample has no target. None: every sample has one.
+        target_mask: (B,) bool, False = this sample has no target. None if every sample has one.
 
     Example:
         >>> null = Condition(torch.zeros(1, 3), torch.zeros(1, 0, 3), None)
@@ -95,9 +95,9 @@ class Condition:
     target_mask: Tensor | None = None
 
     def drop(self, drop: Tensor) -> Condition:
-        """Returns conditions in which some samples have the null condition.
+        """Replaces the conditions of some samples by the null condition.
 
-        Only text or action is replaced: prefix and target stay.
+        Only the text or action is replaced. The prefix and the target are kept.
 
         Args:
             drop: (B,) bool, True = replace the condition of this sample.
@@ -126,9 +126,9 @@ class Condition:
         return replace(self, pooled=pooled, tokens=tokens, token_mask=token_mask)
 
     def with_null(self) -> Condition:
-        """Returns the batch followed by its null conditions (2B).
+        """Returns the conditions followed by the null condition of each sample, (2B).
 
-        Classifier-free guidance then needs only one forward pass.
+        With this batch, classifier-free guidance needs only one forward pass.
         """
         batch = self.pooled.shape[0]
         rows = torch.arange(batch, device=self.pooled.device)
@@ -153,10 +153,10 @@ class Condition:
 
 
 class Guide(Protocol):
-    """Leads motions (B, F, D) to a goal, for example positions in the world."""
+    """Guides motions (B, F, D) to a goal, such as world positions."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns a noisy motion like `x_t`, but with a clean estimate nearer to the goal.
+        """Returns `x_t`, changed so that its clean estimate is closer to the goal.
 
         Args:
             clean: returns the clean estimate of a noisy motion.
@@ -188,8 +188,8 @@ class Edit:
             code): the result contains the model's version of the known motion.
         resample: for "x_t", how many times each step is repeated, after noise is added again
             (RePaint, algorithm 1).
-        guide: for "x0", a goal that the clean estimate is made to meet at each step, before the
-            kept part overwrites it. None: no goal.
+        guide: for "x0", a goal that is imposed on the clean estimate at each step, before the kept
+            part overwrites it. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
             with the noise of the first of these steps (SDEdit). MDM's code gives the number of
             skipped steps instead: of N steps, `skip_timesteps` = (1 - strength) N. None: sampling
@@ -225,15 +225,15 @@ class Edit:
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
-"""The function (x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features).
+"""Signature of a denoiser, with or without guidance.
 
-The function is a denoiser, with or without guidance.
+(x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features)
 """
 
 Noise = Callable[[int], Tensor]
-"""Returns noise number 0, 1, 2, ... of a sampling run, each (B, F, D).
+"""Function that returns draw number 0, 1, 2, ... of the noise of a sampling run, each (B, F, D).
 
-Sampling starts from number 0.
+Sampling starts from draw 0.
 """
 
 
@@ -246,7 +246,7 @@ def pad_to(x: Tensor, size: int) -> Tensor:
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
     """Returns the mask (B, F) bool of lengths (B,).
 
-    `frames` is F; its default is the maximum length.
+    `frames` is F. The default is the maximum length.
 
     Example:
         >>> length_mask(torch.tensor([1, 2])).tolist()
@@ -257,7 +257,7 @@ def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
 
 
 def ceil_div(count: int, size: int) -> int:
-    """Returns the number of groups of `size` items that hold `count` items."""
+    """Returns `count / size`, rounded up: the number of groups of `size` items that hold `count`."""
     return -(-count // size)
 
 
@@ -267,19 +267,19 @@ def padded_length(length: int, multiple: int, most: int) -> int:
 
 
 def sent(x: Tensor, device: torch.device) -> Tensor:
-    """Returns a tensor on a device.
+    """Moves a tensor to a device.
 
-    A copy to a GPU does not wait until the GPU has completed earlier work.
+    A copy to a GPU does not wait for earlier work on the GPU.
     """
     copied = device.type == "cuda" and x.device.type == "cpu"
     return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
 
 
 class Constant:
-    """Numbers that do not change, as one tensor per device.
+    """Constant numbers, stored as one tensor per device.
 
-    They are no buffer of a module, so that neither casting a model nor building it without
-    values changes them.
+    They are not a buffer of a module. Casting a model, or building it without values, therefore
+    does not change them.
 
     Example:
         >>> table = Constant([1.0, 2.0])
@@ -303,7 +303,7 @@ class Constant:
 def collate(
     samples: Sequence[tuple[str, Tensor, str | None, int | None]], multiple: int = 1, most: int = 0
 ) -> MotionBatch:
-    """Joins samples into a batch, padded with zeros.
+    """Collates samples into a batch, padded with zeros.
 
     Args:
         samples: id, normalized features (F, D), caption and action of each motion.

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TextIO
 
 MAX_LINE = 2_000
-"""Maximum length of an error line. Longer lines lose their middle. Own messages are shorter."""
+"""Maximum length of an error line. The middle of longer lines is left out; the project's own messages are shorter."""
 # Bidirectional control characters of Unicode
 DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
@@ -37,16 +37,16 @@ def first_line(error: BaseException) -> str:
 def did_you_mean(name: str, names: Iterable[str]) -> str:
     """Returns " Did you mean a, b?" with the names most similar to `name`.
 
-    The text suggests up to three of `names`; it is "" if none is similar.
+    Suggests at most three of `names`. Returns "" if none is similar.
     """
     near = difflib.get_close_matches(name, list(names), 3, 0.5)
     return f" Did you mean {', '.join(near)}?" if near else ""
 
 
 def shortened(text: str, most: int = MAX_LINE) -> str:
-    """Returns a text of at most `most` characters, with escaped direction characters.
+    """Shortens a text to at most `most` characters, and escapes direction characters.
 
-    A longer text ends in an ellipsis.
+    A shortened text ends with an ellipsis.
     """
     text = DIRECTIONS.sub(lambda match: _escaped(match[0]), text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
@@ -55,7 +55,7 @@ def shortened(text: str, most: int = MAX_LINE) -> str:
 def printable(text: str) -> str:
     r"""Returns the text with control and direction characters escaped (`\x1b`).
 
-    Such a text cannot control a terminal.
+    The result cannot control a terminal.
     """
     return "".join(
         char
@@ -79,9 +79,10 @@ _shown: dict[str, str] = {}
 
 
 def show_as(path: str, name: str) -> None:
-    """Makes messages show a name instead of a path from now on.
+    """Shows a name instead of a path in all later messages.
 
-    For a temporary copy of a file, the user then sees the name that he typed.
+    If a command works on a temporary copy of a file, its messages then contain the name that the
+    user typed.
     """
     _shown[path] = name
 
@@ -89,8 +90,8 @@ def show_as(path: str, name: str) -> None:
 def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line; texts may come from untrusted files.
 
-    If the reader of the output has ended, for example `head`, further lines are dropped, and the
-    command finishes its work.
+    If the output is piped to a program that has ended, such as `head`, further lines are dropped.
+    The command still finishes its work.
     """
     stream = sys.stderr if error else sys.stdout
     for line in lines:
@@ -106,7 +107,7 @@ def say(*lines: object, error: bool = False) -> None:
 
 
 def drop(stream: TextIO) -> None:
-    """Redirects a standard stream to the null device, with the text that it still buffers."""
+    """Redirects a standard stream to the null device, and discards its buffered text."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)

@@ -97,15 +97,15 @@ def sampling_defaults(
 class Model:
     """Base class of the models that checkpoints hold."""
 
-    # What its checkpoints contain, for messages
+    # Content of its checkpoints, for messages
     noun = "a model"
     # The recipe, saved in checkpoints
     config: Config
-    # About the training data: actions, maximum length, fingerprint
+    # Facts about the training data: actions, maximum length, fingerprint
     facts: dict[str, Any]
     # Number of training steps of the loaded checkpoint; None if unknown
     steps: int | None = None
-    # SHA-256 of the file that it was loaded from; "" if it was not loaded
+    # SHA-256 of the file that the model was loaded from; "" if it was not loaded
     sha256: str = ""
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
@@ -174,7 +174,7 @@ class MotionGenerator(Model, nn.Module):
         return generator
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
-        """Adds facts about the training data. The text encoder gets the vocabulary among them."""
+        """Adds facts about the training data, and passes the vocabulary to the text encoder."""
         super().add_facts(facts)
         if "vocabulary" in facts:
             self.condition.seen = frozenset(facts["vocabulary"])
@@ -189,7 +189,7 @@ class MotionGenerator(Model, nn.Module):
         return type(self.denoiser).__name__
 
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
-        """Checks arguments of `generate`; some kinds of models override this.
+        """Checks the arguments of `generate`. Subclasses may add checks.
 
         Raises:
             UserError: If this kind of model cannot sample with these arguments.
@@ -212,20 +212,20 @@ class MotionGenerator(Model, nn.Module):
     ) -> Tensor:
         """Samples motions for the conditions, lengths and ids of a batch.
 
-        The noise of a motion is a function of (seed, replication, id), so a motion is the same in
-        any batch.
+        The noise of a motion is a function of (seed, replication, id). Therefore, a motion does not
+        depend on the other motions of its batch.
 
         Args:
             batch: conditions, `mask` and `ids` of B motions; its `x` is ignored.
-            options: options of the sampler. An option that is None has the value of the recipe.
+            options: sampler options. For an option that is None, the recipe's value is used.
             seed: seed of the noise.
             replication: number of the repetition, to sample several motions per id.
             edit: part of a motion to keep.
             windows: windows that cover motions longer than the motions in training. The
                 conditions of the windows replace the conditions of the batch.
-            prefix: (B, C, D) normalized features of the frames before the motions. A model with
-                `context_frames` C needs it. Such a model continues the prefix block by block and
-                takes no edit, no windows and no trajectory.
+            prefix: (B, C, D) normalized features of the frames before the motions. Required by a
+                model with `context_frames` C. Such a model continues the prefix block by block and
+                accepts no edit, windows or trajectory.
             unconditioned: sample a conditional model with its null condition.
             shared_noise: the noise is a function of (seed, replication) and does not depend on
                 the id.
@@ -301,7 +301,7 @@ class MotionGenerator(Model, nn.Module):
         return self.condition(empty).drop(nothing == 0)
 
     def guided(self, cond: Condition, options: SamplerOptions, unconditioned: bool) -> Denoise:
-        """Returns the denoiser, guided if there is a condition to guide by."""
+        """Returns the denoiser, with guidance if there is a condition."""
         scale = options.guidance_scale
         if scale is None or cond.null is None or not self.condition.features or unconditioned:
             return self.denoiser
@@ -313,9 +313,9 @@ class MotionGenerator(Model, nn.Module):
         return self.facts["max_frames"] - self.denoiser.context_frames
 
     def split_prefix(self, batch: MotionBatch) -> tuple[Tensor | None, MotionBatch]:
-        """Splits motions into the clean frames that the denoiser reads, and the rest.
+        """Splits motions into the clean prefix that the denoiser reads, and the rest.
 
-        The clean frames are (B, C, D); None if the denoiser reads none.
+        The prefix is (B, C, D), or None if the denoiser reads no prefix.
         """
         context = self.denoiser.context_frames
         if not context:
@@ -326,11 +326,11 @@ class MotionGenerator(Model, nn.Module):
 
 
 FADE = 0.5
-"""Number of seconds over which a jump between two blocks of a stream fades."""
+"""Seconds over which a jump between two blocks of a stream is faded out."""
 
 
 class Blocks:
-    """Motions that grow by blocks; each block continues the last frames of the one before.
+    """Motions that are generated in blocks; each block continues the last frames of the previous one.
 
     Source: Tevet et al. 2025, "CLoSD". The noise of a block is a function of (seed, replication,
     id, number of the block). A change of a condition therefore changes only the later blocks.
@@ -339,15 +339,15 @@ class Blocks:
         model: a model whose denoiser has `context_frames` C.
         ids: B names of the motions; they seed the noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
-        options: options of the sampler; all of them have a value.
+        options: sampler options; none of them is None.
         seed: seed of the noise.
         replication: number of the repetition, to sample several motions per id.
         unconditioned: whether the conditions are null conditions, so that no guidance is needed.
-        fade: number of frames after a seam over which a jump between two blocks fades away, see
-            `joined`; 0 = blocks as DiP's code has them.
+        fade: number of frames after a seam over which a jump between two blocks is faded out; see
+            `joined`. 0 = no fading, as in DiP's code.
 
     Raises:
-        UserError: If the prefix is missing or has another shape.
+        UserError: If the prefix is missing or has the wrong shape.
     """
 
     def __init__(
@@ -413,16 +413,16 @@ class Blocks:
 def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
     """Removes the jump between frames and the block that continues them.
 
-    The block is moved so that the step at the seam is the mean of the steps before and after it,
-    and returns to where it was over the next frames ("inertialization", Bollo 2018).
+    The block is shifted so that the step at the seam is the mean of the steps before and after it.
+    The shift then decays to zero over the next frames ("inertialization", Bollo 2018).
 
     Args:
         before: (B, C, D) features of the frames before the block.
         x: (B, P, D) features of the block.
-        fade: number of frames over which the block returns.
+        fade: number of frames over which the shift decays.
 
     Returns:
-        The moved block (B, P, D).
+        The shifted block (B, P, D).
 
     Example:
         >>> before, x = torch.zeros(1, 1, 1), torch.tensor([8.0, 8.0, 8.0, 8.0, 8.0])[None, :, None]
@@ -439,7 +439,7 @@ def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
 
 
 class DistilledGenerator(MotionGenerator):
-    """A student of `flame_mdm.training.distillation`; the guidance is built into its weights."""
+    """A student model of `flame_mdm.training.distillation`, with guidance built into its weights."""
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
         super().__init__(parts, sampler_options)
@@ -449,9 +449,9 @@ class DistilledGenerator(MotionGenerator):
         )
 
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
-        """Raises `UserError` for guidance and for motions without condition.
+        """Raises `UserError` if guidance or an unconditioned motion is requested.
 
-        A student has learned neither.
+        A student model has learned neither.
         """
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):

@@ -118,7 +118,7 @@ class MotionLosses(nn.Module):
     ):
         super().__init__()
         self.to_joints = to_joints
-        # Lists would be copied to the device in every step, for which a GPU waits.
+        # Lists would be copied to the GPU in every step, and the GPU would wait for the copies.
         self.feet, self.edges = Constant(list(feet)), Constant(list(edges))
         self.joints, self.velocity, self.foot_contact, self.bone_length = (
             joints,

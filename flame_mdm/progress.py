@@ -44,7 +44,7 @@ class ProgressBar(tqdm):
         def write(text: str) -> None:
             nonlocal end
             if text:
-                # The reader of the output may have ended, for example `head`
+                # The program that reads the output, such as `head`, may have ended
                 with suppress(BrokenPipeError):
                     file.write(end + text.rstrip())
                     file.flush()

@@ -15,9 +15,9 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Plain, Schema, read_jso
 class Value(Schema):
     """A metric's value over replications, with the number of motions it was computed from."""
 
-    # None if it cannot be computed
+    # None if the value cannot be computed
     mean: Number | None
-    # Half width of the 95 % interval over replications; None if there is one
+    # Half width of the 95 % interval over replications; None for a single replication
     ci: Number | None
     replications: Int | None
     n: Int | None  # motions per replication; None if replications have different numbers
@@ -26,7 +26,7 @@ class Value(Schema):
     # Number of real motions if the metric compares two sets; otherwise None
     n_real: Int | None = None
     unit: str = ""
-    # Bootstrap values: the metric of motions drawn with repetition from the first replication
+    # Bootstrap values: the metric of motions drawn with replacement from the first replication
     resampled: list[Number | None] = Field(default_factory=list)
 
     @property
@@ -54,9 +54,9 @@ class Value(Schema):
 def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
     """Returns the 95 % interval of a value from its bootstrap values, centered at the value.
 
-    See Efron and Tibshirani 1993, section 13.3. Values such as Fréchet distances are larger for
-    sets with repetitions (section 10.6), so the interval is shifted to the value. The interval is
-    valid for the same number of motions.
+    See Efron and Tibshirani 1993, section 13.3. Some values, such as Fréchet distances, are larger
+    for sets with repeated motions (section 10.6). The interval is therefore shifted to the value.
+    It is valid for the same number of motions.
 
     Example:
         >>> percentiles([1.0, 2.0, 3.0], 5.0)
@@ -90,7 +90,7 @@ class Data(Schema):
 
 
 class ExtractorRecord(Schema):
-    """A feature extractor and, if known, the fingerprint of the data that it was trained on."""
+    """A feature extractor and, if known, the fingerprint of its training data."""
 
     sha256: str
     path: str = ""
@@ -239,13 +239,13 @@ class AuditedMetric(ClosedSchema):
     """Properties that a metric declares about one of its values."""
 
     unit: str = ""
-    # Whether it can detect that a motion shows something other than requested
+    # Whether it can detect that a motion does not show what was requested
     sees_meaning: bool = True
-    # Whether the value sums up the metric's other values
+    # Whether the value summarizes the metric's other values
     sums_up: bool = True
     # Whether it reads attributes from the joints, without a network
     exact: bool = False
-    # Whether it is biased by the number of motions
+    # Whether its bias depends on the number of motions
     depends_on_count: bool = False
 
 
@@ -270,7 +270,7 @@ class AuditCard(ClosedSchema):
     packages: dict[str, str]
     # Whether higher values are better. None = the best values are near the values of real motions
     metrics: dict[str, bool | None]
-    # By metric; earlier versions wrote none
+    # By metric; empty in files of earlier versions
     facts: dict[str, AuditedMetric] = Field({})
     # By metric, the value of real motions and the half width of its interval
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]

@@ -35,7 +35,7 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """The key `data` of a provenance file. The key may contain other facts about the data."""
+    """The entry `data` of a provenance file, which may contain further facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
@@ -73,7 +73,7 @@ class Fault(Schema):
 
 
 def made_by(path: str | Path) -> str:
-    """Returns how to get a missing checkpoint or extractor.
+    """Returns a text that says how to obtain a missing checkpoint or extractor.
 
     The text names the command that creates the file or, if no command creates it, the page that
     says where to find it.

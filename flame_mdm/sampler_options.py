@@ -21,9 +21,9 @@ SPACINGS = (
 class SamplerOptions:
     """How motions are sampled.
 
-    An option that is None has the value of the recipe. If the recipe has no value, the sampler's
-    default applies. A sampler declares its options (`flame_mdm.processes.samplers`), and
-    `flame_mdm.processes.Process` refuses other options.
+    For an option that is None, the recipe's value is used. If the recipe has no value, the
+    sampler's default applies. A sampler declares its options (`flame_mdm.processes.samplers`), and
+    `flame_mdm.processes.Process` rejects other options.
 
     Raises:
         UserError: If a value is invalid for every model.
@@ -83,5 +83,5 @@ class SamplerOptions:
         }
 
     def over(self, defaults: Self) -> Self:
-        """Returns these options, with `defaults` for those that are None."""
+        """Returns these options, with `defaults` in place of the options that are None."""
         return replace(defaults, **self.chosen())

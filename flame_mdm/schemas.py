@@ -74,8 +74,8 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     Dataclasses need `strict` = False. The text "1" is then accepted as a number.
 
     Raises:
-        ValueError: If the content has another shape. The message contains the key, its value and
-            the expected type.
+        ValueError: If the content does not match `kind`. The message contains the key, its value
+        and the expected type.
     """
     if large := _too_large(content):
         raise ValueError(
@@ -88,9 +88,10 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
 
 def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> T:
-    """Returns content of the untrusted file at `path` as `check_shape` does, if all its values are plain.
+    """Converts the content of an untrusted file as `check_shape` does, if all its values are plain.
 
-    Raises `UserError`, also if the content is nested too deeply, or contains itself.
+    Raises `UserError` with `path` if this fails, or if the content is nested too deeply or contains
+    itself.
     """
     # checked before the shape: the check of the shape would not end for content that contains
     # itself

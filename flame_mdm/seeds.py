@@ -64,8 +64,8 @@ def _hash(x: Counters) -> Counters:
 def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
     """Returns a function `draw(count)` of uniform integers (B,), 0 <= integer < count.
 
-    `count` is an integer below 2^31 or has one integer per key (B,) int64. Each call is another
-    draw.
+    `count` is an integer below 2^31, or an array (B,) int64 with one integer per key. Each call
+    returns a new draw.
     """
     state = keys
 

@@ -57,9 +57,10 @@ def raise_received() -> None:
 
 
 class StopRequest:
-    """Notes a signal that asks training to stop at the end of a step.
+    """Records a signal that asks training to stop at the end of a step.
 
-    `signum` is its number; 0 = no signal. A second SIGINT stops immediately. A second SIGTERM
+    `signum` is the number of the signal; 0 = no signal. A second SIGINT stops immediately. A second
+    SIGTERM
     also stops immediately, unless it comes within one second: `timeout` sends two at once.
     """
 
@@ -80,7 +81,7 @@ class StopRequest:
         self.handlers = {}
 
     def note(self, signum: int, frame: FrameType | None) -> None:
-        """Notes a signal, so that training stops after the step.
+        """Records a signal, so that training stops after the step.
 
         A second Ctrl-C ends the process at once.
         """

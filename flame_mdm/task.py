@@ -52,7 +52,7 @@ class Task(Model, LightningModule):
         actions: Sequence[str] = (),
         facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe. Sizes that depend on other parts are set here.
+        """Builds the task of a recipe, and sets the sizes that depend on other parts.
 
         Args:
             config: the recipe.
@@ -115,8 +115,8 @@ class Task(Model, LightningModule):
     def report(self, values: Mapping[str, Tensor | float]) -> None:
         """Keeps values of the current training step by name, if they are logged.
 
-        `Measurements` writes them to the loggers after the step. Lightning's `log` takes the time
-        of a small network per value, and keeps the host busy in all later steps.
+        `Measurements` writes them to the loggers after the step. Lightning's `log` takes as long
+        per value as a small network, and keeps the host busy in all later steps.
         """
         if self.is_reported:
             for name, value in values.items():
@@ -183,8 +183,8 @@ class GeneratorTask(Task):
         seed: seed of all random draws in training. Draws are functions of (seed, batch number,
             rank).
         compile: compile the denoiser with torch.compile when training begins.
-        checkpoint_activations: keep less for the backward pass and compute it again, see
-            `flame_mdm.denoisers.recomputation`. Weights are the same, steps are slower.
+        checkpoint_activations: store fewer activations for the backward pass and recompute them;
+            see `flame_mdm.denoisers.recomputation`. The weights are the same, but steps are slower.
         targets: options of `TargetConditions`, for a denoiser with a target encoder. None = no
             targets.
 
@@ -273,7 +273,7 @@ class GeneratorTask(Task):
         return self.generator.describe()
 
     def setup(self, stage: str) -> None:
-        """Also stores the vocabulary of the training captions, which the text encoder gets."""
+        """Also stores the vocabulary of the training captions, and passes it to the text encoder."""
         super().setup(stage)
         data = self.data
         context = self.generator.denoiser.context_frames
@@ -380,7 +380,7 @@ class GeneratorTask(Task):
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
         """Returns the losses (B,) of clips.
 
-        A clip gets the same time, noise and target each time.
+        A clip gets the same time, noise and target in every call.
         """
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
         u, v = (draw[:, 0] for draw in uniform(keys, (1,)))

@@ -59,7 +59,7 @@ class Edited(Motion):
 
 @dataclass(frozen=True)
 class ResolvedEdit:
-    """An edit for one model, with the motion that was read.
+    """An edit for one model, with the original motion.
 
     Attributes:
         resolved: the request, with the kept part.
@@ -86,8 +86,8 @@ def edit(
 ) -> list[Edited]:
     """Resamples part of a motion and keeps the rest, without additional training.
 
-    The `joints` in the frames of `region` are resampled. The default is all joints and all
-    frames. With `strength`, the result is a variation of the motion instead of a new motion.
+    Only the `joints` in the frames of `region` are resampled. By default, all joints and all frames
+    are resampled. With `strength`, the result is a variation of the motion instead of a new motion.
 
     Args:
         model: the model, from `flame_mdm.load`.
@@ -97,14 +97,15 @@ def edit(
             unless `actions` are given.
         fps: frames per second of an array or an .npy file. For other files, it overrides the rate
             in the file.
-        cut: [begin, end] in seconds of the part of the motion to use. Default: all of it.
+        cut: [begin, end] in seconds of the part of the motion to use. Default: the entire motion.
         stages: list that receives clean estimates of the first motion, at equal intervals of the
             sampling, and then the motion itself.
-        keywords: `region` or `region_seconds`, `joints` and `strength` say what is resampled.
-            `method`, `until` and `resample` say how. All of them are described in
-            `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
+        keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
+            `method`, `until` and `resample` select how it is resampled. All of them are described
+            in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
             also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
-            changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
+            changes the kept part, usually by millimeters; `Edited.joint_error` is the size of the
+            change.
 
     Returns:
         One edited motion per sample, `samples` for each text: all samples of the first text in
@@ -207,7 +208,7 @@ def _original(
     fps: float | None,
     cut: Sequence[float] | None,
 ) -> Motion:
-    """Returns the motion to edit, or its part `cut`, with the features of a representation."""
+    """Returns the motion to edit, or its part `cut`, with features of the representation."""
     if isinstance(motion, str | Path):
         return read_motion(representation, motion, fps=fps, cut=cut)
     if not isinstance(motion, Motion):
@@ -219,9 +220,9 @@ def _original(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the number of frames of each part without seconds.
+    """Returns the number of frames of each part that states no seconds.
 
-    All parts together are as long as the motion.
+    All parts together must be as long as the motion.
     """
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)

@@ -26,7 +26,7 @@ from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 BATCH = 32
 STAGES = 10  # number of clean estimates that are shown per sampling run, as in figure 5 of MFM
 Score = Callable[[Sequence[Motion]], Sequence[float]]
-"""A function that scores motions, such as the candidates for a text. Higher is better."""
+"""A function that returns the scores of motions, such as the candidates for a text. Higher is better."""
 
 
 def generate(
@@ -48,13 +48,13 @@ def generate(
     Args:
         model: the model, from `flame_mdm.load`.
         texts: what the person does; one text or several.
-        score: function that scores the `candidates` without faults. The highest score is kept.
-            Default: the candidate with the fewest faulty frames is kept.
+        score: function that scores the `candidates` without faults. The candidate with the highest
+            score is kept. Default: the candidate with the fewest faulty frames is kept.
         edit: part of a motion of the same length to keep in every sample, with `known` and `keep`
             (1, F, D).
         stages: list that receives clean estimates of the first motion, at equal intervals of the
             sampling, and then the motion itself (MFM, figure 5).
-        keywords: number and length of the motions, and how they are sampled: `actions` (instead
+        keywords: number and length of the motions, and sampling options: `actions` (instead
             of texts), `seconds` or `frames` (default: 3 seconds), `samples` (1) per text,
             `candidates` (1) per sample, `seed` (0), `after`, `split` (True), `loop` (False),
             `targets` or `path`, `shared_noise` (False), `cleanup` (False), and `guidance_scale`,
@@ -218,7 +218,7 @@ def _sample_streams(
         features = before[-model.denoiser.context_frames :].to(model.device)
         prefix = model.representation.normalize(features)[None]
 
-    # The noise depends only on the first part, so later parts change nothing before them.
+    # The noise depends only on the first part, so later parts do not change earlier frames.
     numbers = [row.id.rpartition("#")[2] for row in rows]
     first = [row.prompt.conditions[0] for row in rows]
     ids = [f"{condition}#{number}" for condition, number in zip(first, numbers, strict=True)]
@@ -254,7 +254,7 @@ def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit 
 
 
 def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Tensor) -> Motion:
-    """Returns the motion of normalized features (F, D), after the motion that it continues."""
+    """Converts normalized features (F, D) to a motion, placed after the motion that it continues."""
     representation, prompt = model.representation, row.prompt
     features = representation.denormalize(x[: sum(prompt.frames)].float())
     if resolved.before is not None:

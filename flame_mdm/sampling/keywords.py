@@ -1,8 +1,8 @@
 # pyright: standard
 """Keywords of `flame_mdm.generate` and `flame_mdm.edit`, with their types.
 
-They are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`, which contain the
-defaults and help texts.
+The keywords are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`. These classes
+contain the defaults and help texts.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 # pyright: standard
 """Requests for motions and edits.
 
-Requests are checked without torch, so wrong input fails quickly.
+Requests are checked without torch, so that invalid input fails quickly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from flame_mdm.sampler_options import SamplerOptions
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-# Maximum number of samples per request. They are kept in memory until all are complete.
+# Maximum number of samples per request. All samples are kept in memory until the last one is
+# complete.
 MAX_SAMPLES = 10_000
 # Maximum number of characters of a text. Captions of the data sets are far shorter.
 MAX_TEXT_LENGTH = 2000
@@ -56,7 +57,7 @@ ARRIVAL = 0.2  # seconds between the last waypoint of a path and the end of the 
 
 @dataclass(frozen=True, kw_only=True)
 class EditRequest:
-    """The part of a motion to resample, and the method: keywords of `flame_mdm.edit`.
+    """The part of a motion to resample, and the editing method: keywords of `flame_mdm.edit`.
 
     Raises:
         UserError: If a value is invalid regardless of the motion.
@@ -158,10 +159,10 @@ class SamplingRequest:
 
     Motions are sampled for texts or actions. If neither is given, motions are unconditioned.
 
-    A text or action may have several parts with their seconds, "walks forward @3 | turns left |
-    sits down @2". The parts are generated together as one motion, in overlapping windows; see
-    docs/sequences.md. A single part with seconds, "walks forward @10", is also generated in
-    windows. Such a part may be longer than the motions in training.
+    A text or action may have several parts with their durations in seconds, "walks forward @3 |
+    turns left | sits down @2". The parts are generated together as one motion, in overlapping
+    windows; see docs/sequences.md. A single part with a duration, "walks forward @10", is also
+    generated in windows. Such a part may be longer than the motions in training.
 
     `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
 
@@ -248,7 +249,7 @@ class SamplingRequest:
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
             value = getattr(self, name)
-            # NumPy's arrays and numbers become lists and numbers
+            # NumPy arrays and numbers are converted to lists and numbers
             value = value.tolist() if hasattr(value, "tolist") else value
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)
@@ -332,7 +333,7 @@ class SamplingRequest:
         """Checks a request to edit a motion, or to vary all of it.
 
         Raises:
-            UserError: If the request has options for anything else.
+            UserError: If the request contains options that do not apply to edits or variations.
         """
         if self.after is not None or (not varies and (self.is_sequence or self.has_targets)):
             advice = (
@@ -371,7 +372,8 @@ class SamplingRequest:
     def is_sequence(self) -> bool:
         """Whether motions are generated in windows.
 
-        This is the case if prompts have parts or seconds, or motions loop or continue a motion.
+        This is the case if a prompt has parts or seconds, or if motions loop or continue another
+        motion.
         """
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
@@ -439,7 +441,7 @@ def is_range(value: Any) -> bool:
 
 
 def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
-    """Returns the waypoints (x, z) in meters of "x,z x,z ..." or of pairs.
+    """Returns the waypoints (x, z) in meters from a text "x,z x,z ..." or from pairs.
 
     Raises:
         UserError: If there are no waypoints, or they cannot be read.

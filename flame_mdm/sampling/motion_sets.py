@@ -55,13 +55,14 @@ WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
     "usdz": usd.write,
 }
 """Functions that write a clip, by format."""
-# Score per meter that a foot slides, relative to the score per meter of difference between poses
+# Penalty per meter that a foot slides, relative to the penalty per meter of difference between
+# poses
 SLIDING = 200.0
-# Score per degree of rotation of a planted foot
+# Penalty per degree of rotation of a planted foot
 PIVOTING = 0.1
-# Score per m/s² of acceleration of a foot
+# Penalty per m/s² of acceleration of a foot
 JOLTING = 0.1
-# Score of a frame with a fault
+# Penalty of a frame with a fault
 FAULTY = 0.2
 
 
@@ -145,7 +146,7 @@ def _check_rig(content: MotionSet, name: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class MadeSet:
-    """The clips of a set, and the reasons for motions that were left out, by name."""
+    """The clips of a set, and the reasons for omitted motions, by name."""
 
     clips: list[Clip]
     left_out: dict[str, str]
@@ -154,19 +155,18 @@ class MadeSet:
 def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **options: Any) -> MadeSet:
     """Generates the motions of a set and cuts them into clips, with a progress bar.
 
-    For each motion, the candidate with the best clips is kept: with similar poses at the cuts,
-    feet that stay in place and do not jerk, and few faults. A motion that the model cannot do is
-    left out.
+    For each motion, the candidate with the best clips is kept: similar poses at the cuts, feet that
+    neither slide nor jerk, and few faults. A motion that the model cannot generate is left out.
 
     Args:
-        model: a model of SMPL's 22 joints that samples texts in windows.
+        model: a text-conditioned model with SMPL's 22 joints that samples in windows.
         content: the set.
         seed: seed of the noise.
         options: sampling options, as in `generate`.
 
     Raises:
         UserError: If the model has another skeleton or cannot do what is requested, or if no
-            candidate shows a standing person.
+        candidate shows a standing person.
     """
     if model.representation.skeleton.joints != SMPL22.joints:
         raise UserError(
@@ -277,8 +277,8 @@ def motion_of(clip: Clip) -> Motion:
 def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
     """Returns clips in place on one skeleton, with one skin.
 
-    Rotations of all clips are computed together. Programs apply all animations of a set to the
-    skeleton of the first file, so the rest pose must be the same.
+    The rotations of all clips are computed together. Programs apply all animations of a set to the
+    skeleton of the first file, so all clips must have the same rest pose.
     """
     fps = clips[0].motion.fps
     joints, frames = gaits.with_neighbors(clips, round(SEPARATION * fps))
@@ -294,9 +294,9 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
 def write_set(
     folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh | None
 ) -> list[str]:
-    """Writes all files of a set into a folder, or none. Returns their names.
+    """Writes all files of a set into a folder, or none of them. Returns their names.
 
-    For each clip, there is a file with the path of the root, and a file in place. `set.json`
+    Each clip is written to two files: one with the root trajectory, and one in place. `set.json`
     describes the clips, and `set.png` and `player.html` show them.
     """
     in_place = rig_clips(clips.clips, content.rig, body)

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Output of the commands that sample: folders, files, and summaries of what was written."""
+"""Output of the sampling commands: folders, files, and summaries of the written files."""
 
 import hashlib
 import re
@@ -37,8 +37,8 @@ def default_folder(model: MotionGenerator, title: str, *request: object) -> Path
     """Returns `samples/<experiment>/<title>-<hash>`. The hash covers the title and `request`.
 
     Requests for different motions thus have different folders, even if the file system ignores
-    case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint has another name
-    of its experiment.
+    case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint contains a path
+    instead of an experiment name.
     """
     digest = hashlib.sha256(repr((title, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", title.lower()).strip("-")[:40].strip("-")
@@ -55,7 +55,7 @@ def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
 
 
 def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
-    """Returns one line if the features of some frames determine no rotations; otherwise []."""
+    """Returns a warning if the features of some frames determine no rotations; otherwise []."""
     degenerate = sum(motion.degenerate for motion in motions)
     if not degenerate:
         return []

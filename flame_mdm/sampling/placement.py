@@ -13,10 +13,10 @@ from flame_mdm.representations.rotation import rotate_y
 
 @dataclass(frozen=True)
 class Placement:
-    """Placement of B bodies in the world: rotations about the vertical axis and shifts over the
-    floor.
+    """Placement of B bodies in the world: a rotation about the vertical axis and a shift on the floor.
 
-    The rotation (B,) is in radians. The shift (B, 3) is in meters, with y = 0. Both are float64.
+    The rotations (B,) are in radians. The shifts (B, 3) are in meters, with y = 0. Both are
+    float64.
     """
 
     turn: Tensor
@@ -24,7 +24,7 @@ class Placement:
 
     @classmethod
     def origin(cls, count: int, device: torch.device) -> Placement:
-        """Returns the placement that moves nothing."""
+        """Returns the placement that leaves all points unchanged."""
         turn = torch.zeros(count, dtype=torch.float64, device=device)
         return cls(turn, torch.zeros(count, 3, dtype=torch.float64, device=device))
 
@@ -32,8 +32,8 @@ class Placement:
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
         """Returns the placement that moves poses `local` (B, J, 3) to `world` (B, J, 3).
 
-        The placement has the least squared error. Heights are not changed. For equal poses, the
-        error is 0 (Kabsch 1976, for a rotation about one axis).
+        The placement minimizes the squared error (Kabsch 1976, for a rotation about one axis).
+        Heights are not changed. For equal poses, the error is 0.
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])
@@ -60,8 +60,9 @@ class Placement:
 def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
     """Returns the placement of the next frame.
 
-    A frame contains the turn and the step of the root to the next frame. Therefore this placement
-    does not depend on the next frame. When the next frames are decoded, they start at this place.
+    A frame contains the turn and the step of the root to the next frame. Therefore, this placement
+    does not depend on the next frame. The next frames start at this placement when they are
+    decoded.
 
     Args:
         representation: the representation of the features.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Files of prompts, which are read without torch, so that wrong files fail quickly."""
+"""Files of prompts, which are read without torch, so that invalid files fail quickly."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from flame_mdm.sampling.motion_request import check_length, read_parts
 
 @dataclass(frozen=True)
 class PromptFile:
-    """A text file with one prompt per line. If some are refused, the others are still sampled.
+    """A text file with one prompt per line. If some prompts are refused, the others are still sampled.
 
     Attributes:
-        path: its name, as the user typed it.
+        path: the name of the file, as typed by the user.
         lines: the prompts by line number, from 1. Blank lines are left out.
         refused: reasons why prompts cannot be sampled, by line number.
     """
@@ -56,12 +56,12 @@ class PromptFile:
         }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
-        """Refuses prompts. `errors` has their errors by position among the accepted prompts."""
+        """Refuses prompts. `errors` contains their errors by position among the accepted prompts."""
         numbers = list(self.accepted)
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 
     def lengths(self, key: str, lengths: Any) -> Any:
-        """Returns the lengths of the accepted prompts, if `lengths` has one per prompt.
+        """Selects the lengths of the accepted prompts, if `lengths` has one entry per prompt.
 
         Otherwise, returns `lengths` unchanged.
         """

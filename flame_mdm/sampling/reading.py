@@ -36,8 +36,8 @@ def read_motion(
     """Reads a motion and computes the features of a model.
 
     Features of the same representation and frame rate are kept. Other motions are converted as in
-    `flame_mdm.formats.conversion` and made canonical. `notes` of the result say what was fitted,
-    with the error.
+    `flame_mdm.formats.conversion` and made canonical. If joints were fitted, the `notes` of the
+    result describe it, with the error.
 
     Args:
         representation: the representation of the model.
@@ -49,7 +49,7 @@ def read_motion(
 
     Raises:
         FileNotFoundError: If the motion does not exist.
-        UserError: If the motion is damaged or cannot be encoded, or `cut` is outside of it.
+        UserError: If the motion is damaged or cannot be encoded, or `cut` is outside the motion.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:

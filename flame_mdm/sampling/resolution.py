@@ -30,19 +30,20 @@ from flame_mdm.sampling.targets import Targets, read_targets
 
 @dataclass(frozen=True)
 class ResolvedPrompt:
-    """A text or an action in the form in which a model samples it.
+    """A text or an action in the form that a model samples.
 
     Attributes:
         text: the prompt. A sentence with several actions becomes a sequence, "walks | sits".
-        is_split: whether the prompt was such a sentence.
+        is_split: whether the original prompt was such a sentence.
         conditions: caption or action of each part, for the model.
-        texts: words of the prompt for each part.
+        texts: the words of the prompt that belong to each part.
         frames: number of frames of each part. In a continued motion, the first part includes the
-            frames that overlap with the motion before.
-        unknown: words of the text that the model has never seen in training, or does not read.
-        summary: what was understood, in one line; "" unless the model's captions have single
-            actions.
-        changes: lines about differences between the text and what is sampled.
+            frames that overlap with the previous motion.
+        unknown: words of the text that never occur in the training captions, or that the model does
+            not read.
+        summary: one line that says how the text was understood. It is "" unless each caption of the
+            model describes a single action.
+        changes: lines about differences between the text and the sampled prompt.
     """
 
     text: str
@@ -61,14 +62,14 @@ class ResolvedRequest:
 
     Attributes:
         request: the original request.
-        prompts: its texts or actions in order, without refused ones.
+        prompts: its texts or actions in order, without refused prompts.
         is_sequence: whether the motions are sampled in overlapping windows.
         before: features (F, D), in the data's units, of the motion that all motions continue.
         targets: positions and poses to reach.
         edit: part of a motion that all motions keep, with `known` and `keep` (1, F, D).
-        warnings: lines for the user: about the motion to continue (what was left out of its file,
-            or looks wrong), about differences between a text and what is sampled, and about words
-            that the model does not know or read.
+        warnings: lines for the user about the motion to continue (what was left out of its file, or
+            looks wrong), about differences between a text and what is sampled, and about words that
+            the model does not know or read.
     """
 
     request: SamplingRequest
@@ -87,13 +88,14 @@ def resolve(
     *,
     check_words: bool = True,
 ) -> ResolvedRequest:
-    """Determines what a model does for a request.
+    """Resolves a request for a model.
 
     Args:
         request: the request.
         model: the model that samples the motions.
         refused: mapping that receives the errors of prompts that the model cannot sample, by the
-            number of the prompt. Other prompts are resolved. Default: the first error is raised.
+            number of the prompt. All other prompts are resolved. Default: the first error is
+            raised.
         check_words: whether to refuse a text if the model knows none of its content words.
 
     Raises:
@@ -218,7 +220,8 @@ def _read(
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
     """Returns warnings about prompts.
 
-    The lines are about prompts that are read differently, and about unknown or unread words.
+    They concern prompts that are sampled differently from their text, and words that are unknown or
+    not read.
     """
     lines = []
     for prompt in prompts:
@@ -240,9 +243,9 @@ def _continued(
 
     The edit keeps the end of the motion.
 
-    The last frames are generated again, so that the new frames fit them. A model that continues
-    frames reads these frames and needs no edit. The notes of a motion in memory are left out,
-    because its reader has shown them.
+    The last frames are generated again, so that they connect to the new frames. A model that
+    continues frames reads these frames and needs no edit. The notes of a motion in memory are left
+    out, because they were already shown when the motion was read.
     """
     if request.after is None:
         return None, None, ()

@@ -12,14 +12,14 @@ from flame_mdm.sampling.motion_request import Part, SamplingRequest
 
 # Duration that neighboring windows share, in seconds; see docs/sequences.md
 OVERLAP = 0.5
-# Maximum length of a sequence; all its windows are denoised at the same time
+# Maximum length of a sequence, in seconds; all its windows are denoised at the same time
 MAX_SECONDS = 600
 
 
 def overlap(model: MotionGenerator) -> int:
     """Returns the number of frames that neighboring windows share.
 
-    The number is even, and 0 if the model continues frames.
+    The number is even. It is 0 for a model that continues frames.
     """
     if model.denoiser.context_frames:
         return 0
@@ -41,8 +41,8 @@ def part_frames(
         model: the model that samples the motion.
         text: the prompt, for messages.
         parts: its parts, with their seconds if the prompt states them.
-        usual: frames of a part without seconds, not rounded. Default: 3 seconds, or as many as
-            fit into one window.
+        usual: frames of a part that states no seconds, not rounded. Default: 3 seconds, or as many
+            frames as fit into one window.
         is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
         loop: whether the last frame leads to the first one.
 

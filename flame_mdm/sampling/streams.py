@@ -35,7 +35,8 @@ from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.targets import Targets
 from flame_mdm.sampling.waypoints import Route, RouteGuide
 
-# Number of blocks of a stream that can be cut, for example because a page has not shown them yet
+# Number of blocks of a stream that can still be dropped, for example because a page has not shown
+# them yet
 HELD = 4
 
 
@@ -60,8 +61,8 @@ def stream(
         block: number of frames per block. The maximum and the default are the frames that the
             model predicts at once. Shorter blocks react sooner to a new text, but cost more per
             second of motion.
-        cleanup: smooth the motions, keep bone lengths constant, and keep feet from sliding. A
-            block is returned after the next block was computed, because the two must fit
+        cleanup: smooth the motions, keep bone lengths constant, and keep feet from sliding. Each
+            block is returned only after the next one was computed, because the two must fit
             together.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:
             the model's.
@@ -70,8 +71,8 @@ def stream(
         An iterator of blocks; see `Stream`.
 
     Raises:
-        UserError: If the model does not continue frames or knows no content word of the text.
-            Also if the motion to continue cannot be read or is too short.
+        UserError: If the model does not continue frames or knows no content word of the text, or if
+        the motion to continue cannot be read or is too short.
 
     Example:
         >>> import flame_mdm
@@ -94,9 +95,9 @@ def stream(
 class Stream(Iterator[Motion]):
     """An endless motion, from `flame_mdm.stream`: an iterator of blocks. Its text may change.
 
-    Each block is a `Motion`, placed in the world after the block before. A block is computed when
-    it is requested; with `cleanup`, the block after it is computed, too. The same texts at the
-    same times and the same seed give the same motion.
+    Each block is a `Motion`, placed in the world after the previous block. A block is computed when
+    it is requested. With `cleanup`, the next block is also computed. The same seed and the same
+    texts at the same times give the same motion.
 
     Example:
         >>> import itertools, flame_mdm
@@ -124,15 +125,15 @@ class Stream(Iterator[Motion]):
     def change(self, text: str, at: float | None = None) -> None:
         """Changes the text from the next block or a given time on.
 
-        If the text changes in the middle of a block, the block ends there. Blocks that were
-        computed already do not change.
+        If the text changes in the middle of a block, the block ends there. Blocks that were already
+        computed do not change.
 
         Args:
             text: what the person does from then on.
             at: time in seconds since the start of the stream. Default: the end of the last block.
 
         Raises:
-            UserError: If the model knows no content word of the text, or the time has passed.
+            UserError: If the model knows no content word of the text, or if the time has passed.
         """
         fps = self._streams.model.representation.fps
         frame = self.frames if at is None else round(at * fps)
@@ -148,8 +149,8 @@ class Stream(Iterator[Motion]):
     def lead(self, waypoints: Sequence[Sequence[float]]) -> None:
         """Leads the person along waypoints from the next block on.
 
-        The path bends toward the next waypoint, and the text says how the person moves. A person
-        who stands does not move. After the last waypoint, the path no longer bends.
+        The path bends toward the next waypoint, and the text determines how the person moves. A
+        person who stands does not move. After the last waypoint, the path no longer bends.
 
         Args:
             waypoints: x and z in meters in the world, in order. They replace all earlier
@@ -167,17 +168,17 @@ class Stream(Iterator[Motion]):
         return list(self._streams.waypoints.reached)
 
     def go_back(self, at: float) -> None:
-        """Drops frames that were not used yet, from a time on. The next block continues there.
+        """Drops frames after a given time that were not used yet. The next block continues there.
 
-        A new text is then visible at once, although blocks were computed ahead. The result is the
-        stream whose text changes at that time. Later changes of the text are dropped, too.
-        Waypoints that were reached later are ahead again.
+        A new text is then visible at once, even if blocks were computed ahead. The result is the
+        same as if the text had been changed at that time. Later changes of the text are also
+        dropped. Waypoints that were reached later are ahead again.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
 
         Raises:
-            UserError: If the time is not in these blocks, or the stream is cleaned up.
+            UserError: If the time is not in these blocks, or if the stream uses `cleanup`.
         """
         if self._cleanup is not None:
             raise UserError(
@@ -196,11 +197,11 @@ class Stream(Iterator[Motion]):
 
 
 class OnlineCleanup:
-    """Cleanup of a motion that comes in blocks.
+    """Cleanup of a motion that arrives in blocks.
 
-    A block is cleaned twice: as the last of three blocks, and as the middle one. The first
-    version continues the previous block without a jump. The second version fits the next block.
-    The result blends from the first version to the second.
+    Each block is cleaned twice: first as the last of three blocks, then as the middle one. The
+    first version continues the previous block without a jump. The second version fits the next
+    block. The result blends from the first version to the second.
     """
 
     def __init__(self, representation: Representation):
@@ -209,7 +210,7 @@ class OnlineCleanup:
         self.version: np.ndarray | None = None  # the first version of the middle block
 
     def add(self, block: Motion) -> Motion | None:
-        """Takes the next block and returns the cleaned previous block; None at first."""
+        """Adds the next block and returns the previous block, cleaned. Returns None for the first block."""
         self.blocks = [*self.blocks[-2:], block]
         if len(self.blocks) == 1:
             return None
@@ -239,7 +240,7 @@ class OnlineCleanup:
 
 
 class PastBlock(NamedTuple):
-    """A block of a single stream that can be cut.
+    """A past block of a single stream, which can be cut.
 
     `begin` is the number of its first frame, and `number` is the number of its noise.
     """
@@ -287,7 +288,7 @@ class Schedule:
 class Streams(Iterator[list[Motion]]):
     """Several streams that are sampled in one batch.
 
-    Each stream is the same as if it was sampled alone, up to rounding.
+    Up to rounding, each stream is the same as if it were sampled alone.
 
     Args:
         model: a model that continues frames.
@@ -296,7 +297,7 @@ class Streams(Iterator[list[Motion]]):
         prefix: (B, C, D) normalized features of the frames before the streams.
         placement: placement of the first frames in the world. None = the first frame is at
             x = z = 0 and faces +z.
-        options: options of the sampler. An option that is None has the value of the model.
+        options: sampler options. For an option that is None, the model's value is used.
         kind: "text", "action", or "none" for unconditioned motions.
         seed: seed of the noise.
         block: number of frames per block. Default: as many as the model predicts at once.
@@ -401,7 +402,7 @@ class Streams(Iterator[list[Motion]]):
         self.frames = [frame]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
-        """Returns the next frames (F, D) of each stream, normalized; `lengths` = their number."""
+        """Returns the next frames (F, D) of each stream, normalized; `lengths` are their numbers."""
         ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
         parts: list[list[Tensor]] = [[] for _ in ends]
         while self.frames != ends:
@@ -492,7 +493,7 @@ class Streams(Iterator[list[Motion]]):
     def _encode(self, conditions: list[str]) -> Condition:
         """Returns the encoded conditions.
 
-        The encoded texts are computed again only if the texts have changed.
+        The texts are encoded again only if they have changed.
         """
         if self._encoded is None or self._encoded[0] != conditions:
             model, device = self.model, self.model.device
@@ -524,10 +525,7 @@ class Streams(Iterator[list[Motion]]):
 
 
 def in_world(representation: Representation, placement: Placement, x: Tensor) -> Tensor:
-    """Decodes normalized features (..., F, D) of a stream to joints in the world.
-
-    Joints are (..., F, J, 3).
-    """
+    """Decodes normalized features (..., F, D) of a stream to world joint positions (..., F, J, 3)."""
     joints = representation.to_joints(x)
     turn = placement.turn[0].to(joints).expand(joints.shape[:-1])
     return rotate_y(joints, turn) + placement.shift[0].to(joints)
@@ -567,10 +565,11 @@ def check_streams(model: MotionGenerator) -> None:
 def read_text(model: MotionGenerator, text: str) -> str:
     """Returns a text in the form that a model reads.
 
-    If the text names one action of the model's captions, it is in the words of these captions.
+    If the text names one action of the model's captions, it is rewritten in the words of these
+    captions.
 
     Raises:
-        UserError: If the text is empty or too long, or the model does not know what it says.
+        UserError: If the text is empty or too long, or if the model does not understand it.
     """
     if not isinstance(text, str) or not text.strip():
         raise UserError(

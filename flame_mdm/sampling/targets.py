@@ -36,19 +36,19 @@ OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]
 
 
 class Timed(ClosedSchema):
-    """A target at a time."""
+    """A target at a given time."""
 
     time: Annotated[float, Field(ge=0, le=1e4)]  # seconds
 
 
 class Waypoint(Timed):
-    """A position of the root over the floor."""
+    """A position of the root on the floor."""
 
     position: OnFloor
 
 
 class JointTarget(Timed):
-    """A position of a joint."""
+    """A position of a joint in the world."""
 
     position: Annotated[Sequence[Coordinate], Field(min_length=3, max_length=3)]
     joint: str
@@ -72,9 +72,9 @@ class TargetFile(ClosedSchema):
 
 
 class Goal(NamedTuple):
-    """A position (3,) in meters that a joint should have in a frame. NaN = free.
+    """A position (3,) in meters that a joint should reach in a given frame. NaN = free.
 
-    `source` is its name in messages.
+    `source` is the name of the target in messages.
     """
 
     source: str
@@ -85,13 +85,13 @@ class Goal(NamedTuple):
 
 @dataclass(frozen=True)
 class PositionGuide:
-    """A `flame_mdm.batch.Guide` that leads motions to positions in the world."""
+    """A `flame_mdm.batch.Guide` that leads joints to world positions."""
 
     # Converts normalized features (..., F, D) to joints (..., F, J, 3) in the world
     to_joints: Callable[[Tensor], Tensor]
     fps: float
     positions: Positions
-    # (3, N) frame, parent and child of the bones that keep their lengths
+    # (3, N) frame, parent and child of each bone that keeps its length
     bones: Tensor
     # (1, F, D) features that are always imposed
     poses: Tensor
@@ -99,7 +99,7 @@ class PositionGuide:
     keep: Tensor
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns a noisy motion like `x_t`, with a clean estimate nearer to the positions."""
+        """Returns `x_t`, changed so that its clean estimate is closer to the positions."""
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ class Targets:
     poses: tuple[tuple[int, Tensor], ...]
 
     def check_end(self, frames: int, fps: float) -> None:
-        """Raises `UserError` if a motion of this number of frames ends before a target."""
+        """Raises `UserError` if a motion with this number of frames ends before a target."""
         last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
         if last >= frames:
             raise UserError(
@@ -133,8 +133,8 @@ class Targets:
         """Returns the targets in a window of `frames` frames from `begin` on.
 
         Frames are counted from the beginning of the window. If the root has a target after the
-            window, the root covers part of the way within the window: it moves at a constant
-            speed from its last target in the window or, without such a target, from `here`.
+        window, it covers part of the way within the window. It moves at a constant speed from its
+        last target in the window or, if there is no such target, from `here`.
 
         Args:
             begin: first frame of the window.
@@ -184,8 +184,8 @@ class Targets:
     ) -> Edit:
         """Returns the edit (1, F, D) that leads to the targets.
 
-        Poses are imposed, and positions guide the estimates. `to_joints` maps normalized features
-        to joints in the world. By default, motions start at the origin.
+        Poses are imposed, and positions guide the clean estimates. `to_joints` maps normalized
+        features to world joint positions. By default, motions start at the origin.
         """
         imposed = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)

@@ -1,6 +1,6 @@
 """Waypoints on the floor for streams.
 
-The path of the person bends toward the waypoints, and the text says how the person moves.
+The path of the person bends toward the waypoints. The text determines how the person moves.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from flame_mdm.sampling.placement import Placement
 Point = tuple[float, float]
 """x and z in meters in the world."""
 
-# The page that samples in the browser has the same numbers and loop (tools/web/waypoints.js).
+# The web page that samples in the browser uses the same numbers and loop (tools/web/waypoints.js).
 # Distance in meters from the root at which a waypoint is reached
 NEAR = 0.3
-# Largest bend in radians per second. With faster bends, feet on the floor would visibly slide.
+# Maximum bend in radians per second. With faster bends, feet on the floor would visibly slide.
 FASTEST = 1.3
-# Least radius of a bend in meters. This radius keeps a standing person from turning.
+# Minimum radius of a bend in meters. It keeps a standing person from turning.
 TIGHTEST = 0.7
 # Size of the circle within which waypoints are too near, relative to the narrowest circle that
 # the person can walk. With 1, a runner would circle around a waypoint, because a bend begins
@@ -35,7 +35,7 @@ PATIENCE = 0.4  # time constant in seconds with which deviations disappear
 SMOOTHING = (
     0.3  # weight of a frame in the moving average of steps, which removes the sway of a walk
 )
-FARTHEST = 1e4  # largest coordinate of a waypoint in meters
+FARTHEST = 1e4  # maximum absolute coordinate of a waypoint in meters
 
 
 def bends(
@@ -169,7 +169,7 @@ class Route:
         return self.points[len(self.reached) :]
 
     def follow(self, begin: int, roots: np.ndarray) -> None:
-        """Notes which waypoints the root (F, 3) reaches; its first frame has the number `begin`."""
+        """Records which waypoints the root (F, 3) reaches; its first frame has the number `begin`."""
         for frame, (x, _, z) in enumerate(roots, begin):
             while self.left and math.dist(self.left[0], (x, z)) < NEAR:
                 self.reached.append(frame)

@@ -1,4 +1,4 @@
-"""`Body`: a motion on which claims are measured, with any frame rate, size and position."""
+"""`Body`: a motion on which claims are measured, with its frame rate, size and position normalized."""
 
 from functools import cached_property
 
@@ -20,7 +20,7 @@ FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the left and the right joint of a name: "wrist" is left_wrist and right_wrist."""
+    """Returns the left and the right joint of a name: "wrist" stands for left_wrist and right_wrist."""
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 
@@ -32,16 +32,16 @@ SHOULDERS, ELBOWS, WRISTS = (pair(name) for name in ("shoulder", "elbow", "wrist
 class Body:
     """A motion with joints (F, 22, 3), resampled, smoothed, and scaled to legs of `LEG` meters.
 
-    Its frame rate is `RATE`. All measured distances refer to the scaled body, in meters. Positions
-    "as seen by the body" have the axes left, up and forward of its heading. Their origin is the
-    point on the floor below the pelvis.
+    Its frame rate is `RATE`. All distances are measured on the scaled body, in meters. Body
+    coordinates have the axes left, up and forward, relative to the heading of the body. Their
+    origin is the point on the floor below the pelvis.
 
     Args:
         joints: (F, 22, 3) joints of SMPL in meters, y up.
         fps: frames per second.
 
     Raises:
-        UserError: If the joints have another shape or contain NaN, or the legs have no length.
+        UserError: If the joints have the wrong shape or contain NaN, or if the legs have no length.
     """
 
     def __init__(self, joints: np.ndarray, fps: float):
@@ -73,9 +73,9 @@ class Body:
 
     @cached_property
     def floor(self) -> np.ndarray:
-        """Height (F,) of the floor: the lowest joint within `FLOOR_WINDOW`.
+        """Height (F,) of the floor: the height of the lowest joint within `FLOOR_WINDOW`.
 
-        Floors may have steps, so it can change.
+        The height can change, because floors may have steps.
         """
         lowest = self.joints[..., 1].min(1)
         return minimum_filter1d(lowest, max(1, round(FLOOR_WINDOW * RATE)), mode="nearest")
@@ -87,7 +87,7 @@ class Body:
 
     @cached_property
     def forward(self) -> np.ndarray:
-        """Direction (F, 2) in x and z that the body faces, from hips and shoulders."""
+        """Direction (F, 2) in x and z that the body faces, computed from the hips and shoulders."""
         across = self.joints[:, HIPS[0]] - self.joints[:, HIPS[1]]
         across = across + self.joints[:, SHOULDERS[0]] - self.joints[:, SHOULDERS[1]]
         left = gaussian_filter1d(across[:, [0, 2]], 0.1 * RATE, axis=0, mode="nearest")
@@ -101,7 +101,7 @@ class Body:
 
     @cached_property
     def yaw(self) -> np.ndarray:
-        """Heading (F,) in degrees without jumps by a full turn.
+        """Heading (F,) in degrees, unwrapped.
 
         Turns to the left are positive.
         """
@@ -109,7 +109,7 @@ class Body:
 
     @cached_property
     def seen(self) -> np.ndarray:
-        """Joints (F, 22, 3) as seen by the body: left, up, forward."""
+        """Joints (F, 22, 3) in body coordinates: left, up, forward."""
         offset = (self.joints - self.joints[:, [PELVIS]])[..., [0, 2]]
         aside = (offset * self.left[:, None]).sum(-1)
         ahead = (offset * self.forward[:, None]).sum(-1)
@@ -140,13 +140,13 @@ class Body:
 
     @cached_property
     def hand_speed(self) -> np.ndarray:
-        """Speed (F, 2) of the wrists as seen from the chest, in m/s."""
+        """Speed (F, 2) of the wrists relative to the chest, in body coordinates and m/s."""
         hands = self.seen[:, WRISTS] - self.seen[:, [CHEST]]
         return np.linalg.norm(rate_of(hands), axis=-1)
 
     @cached_property
     def foot_speed(self) -> np.ndarray:
-        """Speed (F, 2) of the ankles as seen from the pelvis, in m/s."""
+        """Speed (F, 2) of the ankles relative to the pelvis, in body coordinates and m/s."""
         feet = self.seen[:, ANKLES] - self.seen[:, [PELVIS]]
         return np.linalg.norm(rate_of(feet), axis=-1)
 

@@ -1,4 +1,4 @@
-"""Claims: statements about a motion in a sentence that can be checked, and false variants."""
+"""Claims: checkable statements of a sentence about a motion, and their false variants."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,19 +18,20 @@ EXCLUDED = {"upright": "lie", "sit": "upright", "kneel": "upright", "lie": "upri
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a sentence that can be checked on a motion.
+    """A checkable statement of a sentence about a motion.
 
     Attributes:
         kind: what is claimed, a key of `flame_mdm.sampling.referee.kinds.KINDS`.
-        words: the part of the sentence that states it.
+        words: the part of the sentence that states the claim.
         side: "left", "right" or "both" limbs; "" = any.
         direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" =
             any.
         speed: "slow" or "fast"; "" = any.
         amount: number of repetitions or steps, or angle of a turn in degrees; None = not stated.
-        when: "start" or "end" of the motion if the claim is about it; "" = at any time.
+        when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
+            time.
         seconds: claimed duration; None = not stated.
-        parts: the two claims of an order, in this order.
+        parts: the two claims of an order, the earlier one first.
     """
 
     kind: str
@@ -65,11 +66,11 @@ class Claim:
 
 
 def falsified(claim: Claim) -> list[tuple[str, Claim]]:
-    """Returns claims that are false if `claim` is true, with the kind of change.
+    """Returns claims that are false if `claim` is true, each with the kind of change.
 
-    The changes are "side", "direction", "speed", "count" (one more, and one fewer), "duration"
-    (double and half), "start or end" (the other one), "posture" (one that excludes the claimed
-    posture at that time) and "order".
+    The kinds of change are "side", "direction", "speed", "count" (one more, and one fewer),
+    "duration" (twice and half as long), "start or end" (the other end), "posture" (a posture that
+    excludes the claimed one at that time) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]
@@ -95,9 +96,9 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
 
 
 def unique(claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims without repetitions.
+    """Returns the claims without duplicates.
 
-    Claims that differ only in their words are the same.
+    Claims that differ only in their words are duplicates.
     """
     kept: dict[Claim, Claim] = {}
     for claim in claims:

@@ -19,9 +19,9 @@ from flame_mdm.sampling.referee.sentences import read_claims
 Answer = Literal["yes", "no", "cannot tell"]
 # Minimum duration of a motion that is judged, in seconds
 SHORTEST = 0.4
-# Seconds at the start and at the end in which a posture is measured
+# Seconds at the start and at the end of a motion in which a posture is measured
 END = 0.6
-# Seconds for which the posture must be held there
+# Seconds for which the posture must be held in this time
 HELD = 0.2
 # Maximum interruption, in seconds, of a state or activity whose duration is measured
 BREAK = 0.5
@@ -35,8 +35,8 @@ class Verdict:
         claim: the claim.
         answer: "yes", "no" or "cannot tell".
         reading: the measurement.
-        band: two scores. The answer is "no" up to the first score, "yes" from the second score
-            on, and "cannot tell" in between.
+        band: two scores. The answer is "no" for scores up to the first one, "yes" for scores from
+            the second one on, and "cannot tell" in between.
     """
 
     claim: Claim
@@ -51,7 +51,7 @@ class Verdict:
 
     @property
     def evidence(self) -> str:
-        """The decisive number, unit, joint and times.
+        """The decisive number with its unit, joint and times.
 
         An example is "left wrist: 0.21 m above the head, 1.2-1.9 s".
         """
@@ -65,7 +65,7 @@ class Verdict:
         return f"{self.answer}: {self.claim}; {self.evidence}"
 
     def marks(self, fps: float, frames: int) -> list[tuple[int, int, str, str]]:
-        """Returns the time spans of the evidence for a player's time line, in frames."""
+        """Returns the time spans of the evidence, in frames, for the time line of a player."""
         marks = []
         for start, end in self.reading.spans[:3]:
             first = min(max(0, round(start * fps)), frames - 1)
@@ -89,12 +89,12 @@ class Judgment:
 
     @property
     def decided(self) -> int:
-        """Number of claims with the answer "yes" or "no"."""
+        """Number of claims that are answered with "yes" or "no"."""
         return sum(verdict.answer != "cannot tell" for verdict in self.verdicts)
 
     @property
     def true(self) -> int:
-        """Number of claims with the answer "yes"."""
+        """Number of claims that are answered with "yes"."""
         return sum(verdict.answer == "yes" for verdict in self.verdicts)
 
     @property
@@ -165,9 +165,9 @@ def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
 
 
 def claim_score(motions: Sequence[Motion]) -> list[float]:
-    """Returns the number of true claims minus false claims of each motion's own text.
+    """Returns the number of true claims minus the number of false claims of each motion's own text.
 
-    It is 0 for a text without claims.
+    The score of a text without claims is 0.
     """
     judged = [try_judge(motion) for motion in motions]
     return [0.0 if one is None else float(2 * one.true - one.decided) for one in judged]
@@ -205,10 +205,10 @@ def decide(body: Body, claim: Claim) -> Verdict:
 
 
 def _order(body: Body, claim: Claim) -> Reading:
-    """Measures how much later the second part of an order begins than the first one, in seconds.
+    """Measures how many seconds the second part of an order begins after the first part.
 
-    If a part happens several times, the times with the largest difference count. An order is
-    undecided if a part is not true, or if the reverse order happens, too.
+    If a part happens several times, the pair of times with the largest difference counts. An order
+    is undecided if a part is not true, or if the reverse order also happens.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]
@@ -251,10 +251,10 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 
 
 def _duration(body: Body, claim: Claim) -> Reading:
-    """Measures how long a claim is true, without an interruption of more than `BREAK` seconds.
+    """Measures how long a claim is true, with interruptions of at most `BREAK` seconds.
 
-    The score is minus the difference from the claimed seconds, in doublings. It is undecided if
-    the claim without its duration is not true.
+    The score is the negative absolute binary logarithm of the ratio between measured and claimed
+    seconds. It is undecided if the claim without its duration is not true.
     """
     verdict = decide(body, replace(claim, seconds=None))
     reading = verdict.reading

@@ -1,9 +1,9 @@
 """All kinds of claims: their measurements, groups and thresholds.
 
-A kind is one function in `postures.py` or `movements.py`, one row of `KINDS`, and a pattern in
-`sentences.yaml`. `tools/referee.py` writes the thresholds in `thresholds.yaml` from captioned
-motions. If there are no thresholds, or too few motions of a kind, the `no` and `yes` of its row
-are used.
+Each kind consists of a function in `postures.py` or `movements.py`, a row of `KINDS`, and a pattern
+in `sentences.yaml`. `tools/referee.py` calibrates the thresholds in `thresholds.yaml` on captioned
+motions. If a kind has no thresholds or too few motions, the values `no` and `yes` of its row are
+used.
 """
 
 from collections.abc import Callable
@@ -41,13 +41,13 @@ class Kind:
     """A kind of claims.
 
     Attributes:
-        group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration,
-            a side, a direction or a speed is in that group instead.
-        measure: function of a body and the claim.
-        no, yes: scores that were set by hand. A claim is false up to `no`, and true from `yes`
-            on. In between, a claim is undecided.
-        is_timed: whether the spans of the reading say when the claimed event happens. An order
-            can then be read from them.
+        group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration, a
+            side, a direction or a speed belongs to that group instead.
+        measure: function of a body and a claim.
+        no, yes: scores that were set by hand. A claim is false for scores up to `no`, and true from
+            `yes` on. In between, the claim is undecided.
+        is_timed: whether the spans of the reading show when the claimed event happens, so that an
+            order can be read from them.
     """
 
     group: str
@@ -143,8 +143,8 @@ def group_of(claim: Claim) -> str:
 def threshold_key(claim: Claim) -> str:
     """Returns the name of the thresholds of a claim.
 
-    The name consists of the kind and the stated speed. Without a speed, it says whether the claim
-    states a side or a direction.
+    The name consists of the kind and the stated speed. Without a speed, it states whether the claim
+    has a side or a direction.
     """
     if claim.parts:
         return ORDER
@@ -157,14 +157,14 @@ def threshold_key(claim: Claim) -> str:
 
 @cache
 def thresholds() -> dict[str, Any]:
-    """Returns the calibrated thresholds by `threshold_key`: "no", "yes" and number of motions."""
+    """Returns the calibrated thresholds by `threshold_key`: "no", "yes" and the number of motions."""
     return read_package_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns two scores: a claim is false up to the first, and true from the second on.
+    """Returns two scores: a claim is false up to the first one, and true from the second one on.
 
-    Claims about a start or an end have the band of the kind at any time.
+    A claim about a start or an end has the same band as the kind at any time.
     """
     if claim.seconds is not None:
         return DURATION

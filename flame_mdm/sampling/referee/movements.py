@@ -35,7 +35,7 @@ SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backwa
 
 
 def travel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled in a direction as seen by the body; default: any direction."""
+    """Measures the distance traveled in a direction relative to the body; default: any direction."""
     speed = body.speed
     if claim.direction:
         toward = body.velocity @ np.array(SEEN[claim.direction])
@@ -52,7 +52,12 @@ def travel(body: Body, claim: Claim) -> Reading:
 
 
 def veer(body: Body, claim: Claim) -> Reading:
-    """Measures how much farther the body moves to one side of its start than to the other."""
+    """Measures the largest displacement to the claimed side, in meters.
+
+    Measured are the displacement from the start, to the side of the initial heading, and the sum of
+    the sideways steps relative to the current heading. The larger of the two counts. The reading is
+    unclear if the displacement to the other side is more than half as large.
+    """
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0
     start = body.forward[: max(1, round(0.3 * RATE))].mean(0)
@@ -72,9 +77,10 @@ def veer(body: Body, claim: Claim) -> Reading:
 
 
 def turn(body: Body, claim: Claim) -> Reading:
-    """Measures the largest turn in a direction, by default in any, in degrees.
+    """Measures the largest turn in degrees, in the claimed direction if there is one.
 
-    A direction is unclear if the body turns nearly as far to the other side.
+    With a claimed direction, the reading is unclear if the largest turn in the other direction
+    exceeds 60 % of the turn.
     """
     left, right = _turn(body.yaw, "left"), _turn(-body.yaw, "right")
     if not claim.direction:
@@ -87,7 +93,7 @@ def turn(body: Body, claim: Claim) -> Reading:
 
 
 def turn_amount(body: Body, claim: Claim) -> Reading:
-    """Measures the relative difference between the largest turn and the claimed angle."""
+    """Measures the relative error of the largest turn, compared with the claimed angle."""
     reading = turn(body, claim)
     claimed = claim.amount or 180
     score = -abs(reading.number - claimed) / claimed
@@ -95,9 +101,9 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 
 
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
-    """Measures the largest rise of an angle (F,).
+    """Measures the largest rise of an angle (F,) in degrees.
 
-    The reading has the times of the main part of the rise.
+    The span of the reading is the time in which the angle rises from 10 % to 90 % of this rise.
     """
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())
@@ -111,7 +117,7 @@ def _turn(yaw: np.ndarray, direction: str) -> Reading:
 
 
 def circle(body: Body, claim: Claim) -> Reading:
-    """Measures the turn of the direction of travel while the body travels, in degrees."""
+    """Measures how far the direction of travel turns while the body travels, in degrees."""
     moving = body.speed > MOVING
     if moving.sum() < 0.5 * RATE:
         return Reading(0.0, 0.0, "degrees", "path")
@@ -140,7 +146,7 @@ def run(body: Body, claim: Claim) -> Reading:
 
 
 def walk(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled below the speed of a run, 2.2 m/s."""
+    """Measures the distance traveled at less than running speed, 2.2 m/s."""
     is_walk = (body.speed > MOVING) & (body.speed < 2.2)
     distance = float(body.speed[is_walk].sum() / RATE)
     spans = spans_of(is_walk, 0.3)
@@ -159,7 +165,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures how much slower the travel is in the last 0.3 seconds than at its fastest."""
+    """Measures how much slower the travel is in the last 0.3 seconds than at its fastest, as a fraction."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan
@@ -169,8 +175,8 @@ def stop(body: Body, claim: Claim) -> Reading:
 def steps(body: Body, claim: Claim) -> Reading:
     """Counts steps.
 
-    In a step, the distance between the ankles along the heading changes its sign and grows to
-    15 cm.
+    In a step, the distance between the ankles along the heading changes its sign and grows to 15
+    cm.
     """
     ahead = body.seen[:, ANKLES, 2]
     stride = ahead[:, 0] - ahead[:, 1]
@@ -188,7 +194,7 @@ def steps(body: Body, claim: Claim) -> Reading:
 
 
 def flight(body: Body) -> np.ndarray:
-    """Returns the height (F,) of the lower foot above the floor that it left."""
+    """Returns the height (F,) of the lower foot above the floor."""
     feet = np.minimum(body.joints[:, TOES, 1], body.joints[:, ANKLES, 1] - 0.06)
     return feet.min(1) - body.floor
 
@@ -247,7 +253,7 @@ def count_kicks(body: Body, claim: Claim) -> Reading:
 
 
 def count_punches(body: Body, claim: Claim) -> Reading:
-    """Counts how often a wrist moves away from its shoulder, as seen by the body."""
+    """Counts how often a wrist moves away from its shoulder, in body coordinates."""
     away = np.linalg.norm(body.seen[:, WRISTS] - body.seen[:, SHOULDERS], axis=-1) / body.reach
     if claim.side in SIDES:
         signal = away[:, SIDES.index(claim.side)]
@@ -276,7 +282,7 @@ def count_raises(body: Body, claim: Claim) -> Reading:
 
 
 def count_spins(body: Body, claim: Claim) -> Reading:
-    """Counts the full turns in the largest turn, to whichever side it is."""
+    """Counts the full turns of the largest turn, in either direction."""
     reading = turn(body, claim)
     turns = reading.number / 360
     claimed = claim.amount or 1
@@ -284,7 +290,7 @@ def count_spins(body: Body, claim: Claim) -> Reading:
 
 
 def kick(body: Body, claim: Claim) -> Reading:
-    """Measures the speed of an ankle relative to the pelvis while its foot is the higher one."""
+    """Measures the speed of an ankle relative to the pelvis while its foot is higher than the other foot."""
     higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
     speed = np.where(higher > 0.12, body.foot_speed, 0.0)
     readings = [existence(speed[:, side], "m/s", f"{SIDES[side]} foot", 0.06) for side in (0, 1)]
@@ -300,7 +306,7 @@ def strike(body: Body, claim: Claim) -> Reading:
 
 
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
-    """Returns a reading of how much more a limb moves than the other limb.
+    """Compares how much a limb moves with how much the other limb moves.
 
     The score is the binary logarithm of the ratio.
     """
@@ -317,14 +323,14 @@ def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> R
 
 
 def use_hand(body: Body, claim: Claim) -> Reading:
-    """Compares the mean speeds of the wrists relative to the chest. Raised hands count more."""
+    """Compares the mean speeds of the wrists relative to the chest. Raised hands have a larger weight."""
     raised = body.joints[:, WRISTS, 1] - body.joints[:, [PELVIS], 1]
     weight = np.clip(raised / 0.3, 0.1, 1.0)
     return _dominance(body.hand_speed * weight, claim, "hand", 0.05)
 
 
 def use_foot(body: Body, claim: Claim) -> Reading:
-    """Compares the mean speeds of the ankles above the floor, relative to the pelvis."""
+    """Compares the mean speeds of the raised ankles relative to the pelvis."""
     weight = np.clip((body.height[:, ANKLES] - 0.12) / 0.2, 0.02, 1.0)
     return _dominance(body.foot_speed * weight, claim, "foot", 0.05)
 

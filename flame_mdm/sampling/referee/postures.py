@@ -39,7 +39,7 @@ def upright(body: Body, claim: Claim) -> Reading:
 
 
 def sit(body: Body, claim: Claim) -> Reading:
-    """Measures how much lower the pelvis is than in standing.
+    """Measures how far the pelvis is below its standing height.
 
     The thighs must be raised, and the trunk must be upright.
     """
@@ -49,27 +49,27 @@ def sit(body: Body, claim: Claim) -> Reading:
 
 
 def kneel(body: Body, claim: Claim) -> Reading:
-    """Measures how near a knee is to the floor, with the pelvis above it."""
+    """Measures the distance between a knee and the floor, with the pelvis above the knee."""
     is_up = body.height[:, PELVIS] > 0.25
     knee = body.height[:, KNEES].min(1)
     return existence(np.where(is_up, -knee, -0.5), "m above the floor", "knee", 0.2)
 
 
 def lie(body: Body, claim: Claim) -> Reading:
-    """Measures how low pelvis and neck are at the same time."""
+    """Measures the height of the pelvis and the neck above the floor; the higher one counts."""
     top = np.maximum(body.height[:, PELVIS], body.height[:, NECK])
     return existence(-top, "m above the floor", "trunk", 0.2)
 
 
 def all_fours(body: Body, claim: Claim) -> Reading:
-    """Measures how low the hands are while the trunk is level and the pelvis is off the floor."""
+    """Measures the height of the hands while the trunk is level and the pelvis is off the floor."""
     is_level = (body.tilt > 40) & (body.height[:, PELVIS] > 0.2)
     hands = body.height[:, WRISTS].max(1)
     return existence(np.where(is_level, -hands, -1.0), "m above the floor", "hands", 0.2)
 
 
 def crouch(body: Body, claim: Claim) -> Reading:
-    """Measures how much lower the pelvis is than in standing."""
+    """Measures how far the pelvis is below its standing height."""
     return existence(STANDING - body.height[:, PELVIS], "m lower", "pelvis", 0.15)
 
 
@@ -85,7 +85,7 @@ def head_down(body: Body, claim: Claim) -> Reading:
 
 
 def hand_down(body: Body, claim: Claim) -> Reading:
-    """Measures how near a hand is to the floor."""
+    """Measures the height of a hand above the floor."""
     hands = body.height[:, WRISTS]
     readings = [
         existence(-hands[:, side], "m above the floor", f"{SIDES[side]} hand", 0.1)
@@ -105,7 +105,7 @@ def get_down(body: Body, claim: Claim) -> Reading:
 
 
 def _change(signal: np.ndarray) -> Reading:
-    """Returns a reading of the largest rise of a signal (F,) in meters, with start and end."""
+    """Returns a reading of the largest rise of a signal (F,) in meters, with its start and end."""
     lowest = np.minimum.accumulate(signal)
     end = int((signal - lowest).argmax())
     start = int(signal[: end + 1].argmin())
@@ -126,7 +126,7 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 
 
 def return_pose(body: Body, claim: Claim) -> Reading:
-    """Measures how far a joint moves from start to end, as seen by the body.
+    """Measures how far a joint moves between start and end, in body coordinates.
 
     The joint with the largest distance counts.
     """
@@ -140,7 +140,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the final distance from the start, relative to the largest one."""
+    """Measures the final distance from the start, relative to the largest distance from the start."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])
@@ -151,7 +151,7 @@ def return_place(body: Body, claim: Claim) -> Reading:
 
 
 def last_part(body: Body) -> tuple[float, float]:
-    """Returns first and last second of the end of a motion."""
+    """Returns the first and last second of the final part of a motion."""
     return max(0.0, body.seconds - 0.3), body.seconds
 
 
@@ -210,7 +210,7 @@ def arms_out(body: Body, claim: Claim) -> Reading:
 
 
 def arms_crossed(body: Body, claim: Claim) -> Reading:
-    """Measures how far each wrist is on the other side of the trunk."""
+    """Measures how far each wrist reaches across the trunk to the other side."""
     aside = body.seen[:, WRISTS, 0]
     crossed = aside[:, 1] - aside[:, 0]
     is_front = body.seen[:, WRISTS, 2].min(1) > 0.05
@@ -229,7 +229,7 @@ def raise_foot(body: Body, claim: Claim) -> Reading:
 
 
 def one_leg(body: Body, claim: Claim) -> Reading:
-    """Measures how long one foot stands on the floor and the other is in the air, in seconds."""
+    """Measures how long one foot is on the floor while the other foot is in the air, in seconds."""
     toes = body.height[:, TOES]
     readings = []
     for side in (0, 1):

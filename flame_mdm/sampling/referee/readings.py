@@ -18,16 +18,16 @@ class Reading:
     """The measurement for a claim.
 
     Attributes:
-        score: number that is compared with the thresholds of the kind. A higher score supports
-            the claim. NaN is undecided.
-        number, unit: the measured value, in a unit for people.
+        score: number that is compared with the thresholds of the kind. A higher score supports the
+            claim. NaN = undecided.
+        number, unit: the measured value, in a readable unit.
         joint: joint or part of the body.
-        spans: first and last second of each time at which the claim is true, or nearly true.
+        spans: first and last second of each time span in which the claim is true, or nearly true.
         unclear: reason why a high score does not make the claim true; "" = none.
         signal: values (F,) that show for each frame whether the claim is true; None if single
             frames do not show it.
-        level: minimum value of `signal` at which the claim is true; None = the middle of the band
-            of the kind.
+        level: minimum value of `signal` at which the claim is true; None = the middle of the kind's
+            band.
     """
 
     score: float
@@ -54,7 +54,7 @@ def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
 
 
 def held(signal: np.ndarray, seconds: float) -> float:
-    """Returns the highest value that a signal (F,) reaches for some seconds in total."""
+    """Returns the highest value that a signal (F,) reaches for `seconds` seconds in total."""
     count = min(len(signal), max(1, round(seconds * RATE)))
     return float(np.sort(signal)[-count])
 
@@ -64,8 +64,8 @@ def existence(
 ) -> Reading:
     """Returns a reading of the value that a signal (F,) reaches for `seconds`.
 
-    The spans are the frames above a level. The level is at the fraction `share` between the
-    median and the highest value. For a short signal, the lowest value replaces the median.
+    The spans are the frames above a level. The level lies between the median and the highest value,
+    at the fraction `share`. For a short signal, the lowest value replaces the median.
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))
@@ -76,11 +76,11 @@ def existence(
 
 
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
-    """Returns the reading of a limb, from the readings of the left and the right limb.
+    """Returns the reading of a limb, given the readings of the left and the right limb.
 
-    For "both", the lower reading counts. For "", the higher reading counts. A left or right limb
-    is unclear if the other limb shows the same, that is, if their difference is less than
-    `margin`.
+    For "both", the lower reading counts. For "", the higher reading counts. The reading of a left
+    or right limb is unclear if the readings differ by less than `margin`, because the other limb
+    then does the same.
     """
     left, right = readings
     if side == "both":
@@ -101,8 +101,8 @@ def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
 def cycles(signal: np.ndarray, depth: float) -> list[int]:
     """Returns the frames of the peaks of a signal (F,).
 
-    A peak is `depth` above the valleys on both sides. If a signal begins or ends high, there is a
-    valley only if the signal returns to a low value within the motion.
+    A peak is `depth` above the valleys on both sides. If a signal begins or ends high, the outer
+    valley exists only if the signal returns to a low value within the motion.
     """
     peaks: list[int] = []
     low, high, at = signal[0], -np.inf, 0
@@ -126,9 +126,9 @@ def counted(
 ) -> Reading:
     """Returns a reading of the number of repetitions, which are peaks of a signal.
 
-    Peaks are counted with a lower and a higher depth. The score is 0 if both counts are the
-    claimed count, and -0.5 if the claimed count is between them. Otherwise, the score is minus
-    the distance between the claimed count and the nearest count, at most -1.
+    Peaks are counted with a lower and a higher depth. The score is 0 if both counts equal the
+    claimed count, and -0.5 if the claimed count is between them. Otherwise, the score is the
+    negative distance between the claimed count and the nearest count, at most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))
@@ -145,9 +145,9 @@ def counted(
 
 
 def _is_cut(signal: np.ndarray, depth: float) -> bool:
-    """Returns whether a signal (F,) begins in a repetition.
+    """Returns whether a signal (F,) begins in the middle of a repetition.
 
-    It then falls by `depth` before it rises by `depth`.
+    In this case, the signal falls by `depth` before it rises by `depth`.
     """
     falls = np.flatnonzero(signal < signal[0] - depth)
     rises = np.flatnonzero(signal > signal[0] + depth)

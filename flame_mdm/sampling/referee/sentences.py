@@ -1,8 +1,9 @@
-"""Claims of a sentence, found by rules. Parts that are not understood are left out.
+"""Reads the claims of a sentence by rules. Parts that are not understood are left out.
 
-The rules are precise rather than complete. Patterns are in `sentences.yaml`, and forms of verbs
-in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or several people
-are left out. So are comparisons ("like a zombie") and everything that matches no pattern.
+The rules are precise rather than complete. The patterns are in `sentences.yaml`, and the verb forms
+are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or several people
+are left out. Comparisons ("like a zombie") and everything that matches no pattern are also left
+out.
 """
 
 import re
@@ -54,17 +55,17 @@ POSTURES = {
 LASTING = {"walk", "run", "stand still", *POSTURES}
 """Kinds of claims that may state seconds."""
 AT_AN_END = {"walk", "run", "jump", "hop", "kick", "strike", *POSTURES}
-"""Kinds of claims that may be about the start or the end."""
+"""Kinds of claims that may refer to the start or the end."""
 DIRECTIONS = {
     "forward": "forwards?|forewards?|ahead|straight ahead",
     "backward": "backwards?|backwords?",
 }
-"""Words for a direction of travel. "Walks back" may mean to return."""
+"""Words for a direction of travel. "Walks back" is not listed, because it may mean to return."""
 
 
 @dataclass(frozen=True)
 class Clause:
-    """A clause, and whether it happens after the clause before it."""
+    """A clause, and whether it happens after the previous clause."""
 
     text: str
     is_later: bool
@@ -106,7 +107,7 @@ def read_claims(text: str) -> list[Claim]:
 
 
 def _plain(text: str) -> str:
-    """Returns a text in lower case, without hyphens and apostrophes.
+    """Converts a text to lower case, and removes hyphens and apostrophes.
 
     Joined phrases become one word.
     """
@@ -172,12 +173,12 @@ def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
 
 
 def _has(text: str, words: str) -> bool:
-    """Returns whether a clause has words of `ends` in `sentences.yaml`."""
+    """Returns whether a clause contains words of the entry `ends` in `sentences.yaml`."""
     return re.search(rf"\b(?:{_content()['ends'][words]})\b", text) is not None
 
 
 def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims of a clause with its seconds, as in "stands still for three seconds"."""
+    """Returns the claims of a clause with its duration, as in "stands still for three seconds"."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)
@@ -317,9 +318,9 @@ def _amount(text: str, kind: str) -> int | None:
 
 
 def _speed(text: str) -> str:
-    """Returns slow or fast if a clause states one of them.
+    """Returns "slow" or "fast" if a clause states one of them.
 
-    "normal", or slow and fast together, state none.
+    Returns "" if it states neither or both, or "normal".
     """
     words = text.split()
     values = {value for word, value in word_values("speed").items() if word in words}
@@ -345,7 +346,8 @@ def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
     """Removes the claims that the rest of the sentence makes doubtful.
 
     A body that also travels does not stand still all the time. A person who stands up after a bow
-    was standing before. If both sides are named, neither moves more.
+    was already standing. If a sentence names both sides, it does not claim that one side moves
+    more.
     """
     doubtful: set[str] = set()
     kinds = {claim.kind for claim in claims}
@@ -370,7 +372,7 @@ def _content() -> dict[str, Any]:
 
 @cache
 def _sided_words() -> str:
-    """Returns the alternatives of words that have a side, as in "left hand"."""
+    """Returns a pattern with the words that have a side, as in "left hand"."""
     return "|".join(phrases()["sides_of"].split())
 
 

@@ -75,7 +75,7 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
     Raises:
         ValueError: If the content does not match `kind`. The message contains the key, its value
-        and the expected type.
+            and the expected type.
     """
     if large := _too_large(content):
         raise ValueError(

@@ -1,19 +1,17 @@
-"""Adapters: small changes of a model's weights, learned from a few clips.
+"""Adapters: small changes to a model's weights, learned from a few clips.
 
-A weight W (out, in) of attention or feed-forward becomes W + strength * up down, with `up` (out,
-rank) and
-`down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, the row of each
-  new word gets
-an additional vector. In training, `torch.nn.utils.parametrize` computes the weights. This also
-works for code that reads a weight without calling its layer, as cross-attention does.
+A weight W (out, in) of attention or feed-forward layers becomes W + strength * up down, with `up`
+(out, rank) and `down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, the
+row of each new word gets an additional vector. In training, `torch.nn.utils.parametrize` computes
+the weights. This also works for code that reads a weight without calling its layer, such as
+cross-attention.
 
-All layers are trained, but a style keeps only the changes in the second half of them: the first
-half would learn that the clips show few actions, and the model would no longer follow the
-requested action.
+All layers are trained, but a style keeps only the changes in the second half of them. The first
+half would learn that the clips show few actions, and the model would no longer follow the requested
+action.
 
-An adapter file (.safetensors) has these parts of a weight NAME as NAME.up, NAME.down and
-NAME.vectors, and
-`About` as JSON in its metadata.
+An adapter file (.safetensors) contains the parts of the change to a weight NAME as NAME.up,
+NAME.down and NAME.vectors. Its metadata contains `About` as JSON.
 """
 
 from __future__ import annotations
@@ -71,9 +69,9 @@ class About(TypedDict):
 
 
 class Change(nn.Module):
-    """A change of a weight in training (see `changed`).
+    """A change to a weight during training; see `changed`.
 
-    If `kept` is True, adapter files contain it.
+    Adapter files contain the change only if `kept` is True.
     """
 
     def __init__(self, rows: Sequence[int] = (), *, is_kept: bool = True, **parts: Tensor):
@@ -98,18 +96,16 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns one of the two table rows of each word,
-    if possible a row that no vocabulary word uses.
-    """
+    """Returns one of the two table rows of each word, if possible a row that no vocabulary word uses."""
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]
 
 
 def attach(model: MotionGenerator, about: About) -> None:
-    """Freezes a model and adds changes, which start at 0.
+    """Freezes a model and attaches changes, which are initially 0.
 
-    Raises `UserError` if the denoiser of the model has no transformer.
+    Raises `UserError` if the model's denoiser has no transformer.
     """
     model.requires_grad_(False)
     layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]
@@ -129,7 +125,7 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
-    """Copies the weights of a base to a model, which may have attached changes.
+    """Copies the weights of a base model to a model, which may have attached changes.
 
     `base` is a path or name, as in `find`.
     """
@@ -150,8 +146,8 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
     The statistics of the features are not copied, since they belong to the data.
 
     Args:
-        model: receives the weights; its other weights stay as they are.
-        source: a path or name, as `find` takes it.
+        model: model that receives the weights. All other weights are unchanged.
+        source: a path or name, as in `find`.
 
     Returns:
         Number of copied tensors, and number of trained tensors of the model.
@@ -190,7 +186,7 @@ def write_adapter(path: Path, trained: Path) -> None:
 def read_merged(
     path: Path, adapter: Paths = (), strength: float | Sequence[float] = 1.0
 ) -> dict[str, Any]:
-    """Reads a checkpoint or model file, with adapters merged into its weights; see `flame_mdm.load`."""
+    """Reads a checkpoint or model file and merges adapters into its weights; see `flame_mdm.load`."""
     paths = [adapter] if isinstance(adapter, str | Path) else list(adapter)
     strengths = [strength] * len(paths) if isinstance(strength, int | float) else list(strength)
     if len(strengths) != len(paths) or not all(math.isfinite(value) for value in strengths):

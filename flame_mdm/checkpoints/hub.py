@@ -27,9 +27,9 @@ from flame_mdm.safe_io import (
 CARD = Path(__file__).with_name("card.md")
 MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
-"""Files that `push` writes next to the model, and the text by which it recognizes each.
+"""Files that `push` writes next to the model, each with a text by which `push` recognizes it.
 
-The card also has the hash of the model file.
+The model card also contains the hash of the model file.
 """
 OTHERS = "not overwritten, since it was not written by push. Choose another folder with out=..."
 
@@ -40,9 +40,9 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
     Args:
         source: the model, as in `flame_mdm.load`.
         out: path of the file.
-        half: whether weight matrices are stored in half precision. Vectors, such as the
-            statistics of the
-            features, keep single precision, and loaded models always compute in single precision.
+        half: whether weight matrices are stored in half precision. Vectors, such as the statistics
+            of the features, keep single precision. Loaded models always compute in single
+            precision.
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises the errors of `flame_mdm.load`.
@@ -67,7 +67,7 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
 def push(
     source: str | Path, repository: str, folder: str | Path, *, upload: bool, private: bool
 ) -> Path:
-    """Writes a folder with model file, recipe and card, and uploads it to the hub as "user/name".
+    """Writes a folder with the model file, recipe and model card, and uploads it to the hub as "user/name".
 
     See `export` for the arguments.
     """
@@ -96,7 +96,7 @@ def push(
 
 
 def _check_written(folder: Path) -> None:
-    """Raises `UserError` if a folder has a file that `push` would overwrite but did not write."""
+    """Raises `UserError` if a folder contains a file that `push` would overwrite but did not write."""
     for name, mark in WRITTEN.items():
         path = folder / name
         if path.exists() and mark not in read_text(path):
@@ -109,7 +109,7 @@ def _check_written(folder: Path) -> None:
 
 
 def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
-    """Returns the model card for the content of a model file and the hash of the file."""
+    """Returns the model card, given the content of a model file and the hash of the file."""
     from jinja2 import Template
 
     config, facts = model["config"], model["facts"]

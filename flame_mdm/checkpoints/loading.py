@@ -1,5 +1,5 @@
 # pyright: standard
-"""Loading of models: builds the parts and loads the weights."""
+"""Model loading: builds the parts of a model and loads their weights."""
 
 from __future__ import annotations
 
@@ -76,9 +76,9 @@ def load(
 
     Raises:
         FileNotFoundError: If there is no such file or checkpoint.
-        UserError: If the file is damaged or holds no motion generator, if its weights do not
+        UserError: If the file is damaged or contains no motion generator, if its weights do not
             match its recipe, if the model cannot be downloaded, if an adapter belongs to another
-            model, or if the machine has no such device.
+            model, or if the device does not exist.
 
     Example:
         >>> import flame_mdm
@@ -96,17 +96,17 @@ def load_task(
 ) -> Trained:
     """Loads the task of a .ckpt or .safetensors file in evaluation mode.
 
-    The weights are averaged weights if the recipe averages weights.
+    The model has averaged weights if its recipe averages weights.
 
     Args:
         path: the file.
         kind: the expected class of the task.
         device: device of the weights.
-        adapted: the keywords `adapter` and `strength` of `load`.
+        adapted: the keyword arguments `adapter` and `strength` of `load`.
 
     Raises:
-        UserError: If the file is damaged or holds another kind of task, if its weights do not
-            match its recipe, or if the machine has no such device.
+        UserError: If the file is damaged or contains another kind of task, if its weights do not
+            match its recipe, or if the device does not exist.
     """
     check_device(device)
     regular_file(path)
@@ -114,7 +114,7 @@ def load_task(
     checkpoint = read_merged(path, **adapted)
     try:
         model = _build(checkpoint, kind).eval().to(device)
-    except Exception as error:  # a nonsensical recipe may fail anywhere
+    except Exception as error:  # an invalid recipe may fail anywhere
         # The missing file belongs to a text encoder
         if isinstance(error, FileNotFoundError):
             raise
@@ -129,7 +129,7 @@ def load_task(
 
 
 def check_device(device: str | torch.device) -> None:
-    """Raises `UserError` if this machine has no such device."""
+    """Raises `UserError` if this machine does not have the device."""
     try:
         if torch.device(device).type == "meta":
             raise RuntimeError("the device meta computes nothing")
@@ -145,7 +145,7 @@ def check_device(device: str | torch.device) -> None:
 
 
 def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
-    """Builds the model of a checkpoint with its weights.
+    """Builds the model of a checkpoint and loads its weights.
 
     This project's networks are built on the meta device, so that a recipe does not take more
     memory than the weights in the file. Other classes, which the user must trust, are built as in
@@ -156,7 +156,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     trust(parts)
     classes: dict[str, Any] = dict(GENERATORS) if kind is MotionGenerator else {}
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
-    # modules are imported first, since tensors that they create must not be on the meta device
+    # modules are imported first, because tensors that they create must not be on the meta device
     classes |= {target: get_class(target) for target in targets if target not in classes}
     model_class = classes[config["task"]["_target_"]]
     if kind is MotionGenerator:  # the user's own class
@@ -184,9 +184,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
 
 
 class _CallLimit(TorchFunctionMode):
-    """Refuses more than `limit` calls of torch functions,
-    so that a recipe of a million layers fails soon.
-    """
+    """Allows at most `limit` calls of torch functions, so that a recipe with a million layers fails early."""
 
     def __init__(self, limit: int):
         super().__init__()
@@ -196,8 +194,8 @@ class _CallLimit(TorchFunctionMode):
         self.left -= 1
         if self.left < 0:
             raise UserError("its recipe describes a larger model than the weights saved with it")
-        # On the meta device, drawing numbers would import torch's compiler, which takes longer
-        # than building the model
+        # On the meta device, random draws would import torch's compiler, which takes longer than
+        # building the model
         if func is torch.nn.init.normal_:
             return kwargs["tensor"] if kwargs else args[0]
         func = torch.empty if func is torch.randn else func

@@ -1,6 +1,6 @@
 """File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
 
-A model file holds the (averaged) weights, including the statistics of the features. Its metadata
+A model file contains the (averaged) weights, including the statistics of the features. Its metadata
 has two keys. `flame_mdm` is JSON with the recipe, the metadata of the data set and the origin of
 the weights. `sha256` is the hash of this JSON text and the weights. A model file contains no
 code.
@@ -26,7 +26,7 @@ from flame_mdm.schemas import Number, check_plain
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Format of checkpoints and model files: 2 since version 0.2.0
+# Format of checkpoints and model files. Version 0.2.0 introduced format 2.
 FORMAT = 2
 # Key of the format in a checkpoint
 FORMAT_KEY = "flame_mdm_format"
@@ -70,9 +70,7 @@ def read_model_file(path: Path) -> dict[str, Any]:
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Returns the metadata and the tensors of a .safetensors file;
-    raises `UserError` if it is damaged.
-    """
+    """Returns the metadata and the tensors of a .safetensors file. Raises `UserError` if it is damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -158,10 +156,9 @@ class _Metadata(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Checks that a checkpoint or model file holds a recipe
-    of plain values, metadata and weights.
+    """Returns the content of a checkpoint or model file after checking it.
 
-    Returns the content.
+    The content must have a recipe of plain values, metadata and weights.
     """
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
@@ -181,7 +178,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
 
 
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
-    """Raises `UserError` unless weights are dense real tensors by name.
+    """Raises `UserError` unless `weights` maps names to dense tensors of real numbers.
 
     Together, they must not be larger than the file at `path`.
     """
@@ -255,16 +252,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the sha256 of the weights in a file,
-    which is equal for a checkpoint and its model file.
-    """
+    """Returns the SHA-256 of the weights in a file, which is equal for a checkpoint and its model file."""
     return state_sha256(read_checkpoint(path)["state_dict"])
 
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a recipe with default paths of data and run,
-    instead of absolute paths on this machine.
-    """
+    """Returns a recipe in which default paths replace the absolute paths of data and run on this machine."""
     defaults = {
         config.get("data_root"): "data",
         config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",

@@ -35,11 +35,11 @@ from flame_mdm.safe_io import atomic_folder, sha256, write_json
 from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
-# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest
-# output. Float32 arithmetic in another order of operations differs by about 1e-6.
+# Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output.
+# In float32, another order of operations changes results by about 1e-6.
 TOLERANCE = 1e-4
-# The ONNX graphs of these networks need a fixed number of frames, so motions are padded to the
-# longest one.
+# The ONNX graphs of these networks require a fixed number of frames, so motions are padded to the
+# longest length.
 FIXED_LENGTH = (
     MDMGRU,
     MDMUNet,
@@ -48,20 +48,20 @@ TINY = 1e-6  # an input of `to_x0` that is too small for clipping of the clean e
 
 
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes a model as a folder of ONNX graphs that only need numpy and onnxruntime.
+    """Writes a model as a folder of ONNX graphs that need only numpy and onnxruntime.
 
     The folder contains `runner.py`, which samples from the graphs. docs/export.md describes the
     files.
 
     Args:
-        source: what `flame_mdm.load` takes.
+        source: the model, as in `flame_mdm.load`.
         out: the folder.
         half: whether weight matrices are stored in half precision.
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if the outputs of
-            a graph differ from PyTorch's.
+        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if the outputs of a
+            graph differ from the outputs of PyTorch.
     """
     try:
         import onnxruntime  # noqa: F401
@@ -162,7 +162,7 @@ def root_units(representation: HumanML) -> list[list[float]]:
 class Probe:
     """Records how a sampler combines noise and clean estimates.
 
-    The probe takes the place of the denoiser, the noise and the `Guide`. `variance` is the
+    The probe replaces the denoiser, the noise and the `Guide`. `variance` is the
     network's output for a learned variance.
     """
 
@@ -178,9 +178,7 @@ class Probe:
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1) that stands for one draw of noise or one
-        clean estimate.
-        """
+        """Returns the unit vector (1, 1, 2 * calls + 1) of one draw of noise or one clean estimate."""
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
@@ -189,9 +187,7 @@ class Probe:
         return self.unit(draw)
 
     def denoise(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Returns a constant instead of the denoiser's output,
-        and stores the time of the call.
-        """
+        """Returns a constant instead of the denoiser's output, and records the time of the call."""
         self.time = float(t[0])
         return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
 
@@ -213,9 +209,7 @@ class Probe:
 
 
 def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
-    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d),
-    one per call of the denoiser.
-
+    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one per denoiser call.
     The denoiser is called at time t and returns y. The clean estimate is x0 = p x + q y. The next
     noisy motion is a x + b x0 + c x0' + d noise, where x0' is the clean estimate of the previous
     call. Raises `UserError` for samplers without this form.
@@ -243,9 +237,8 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
     rows = []
     for number, (x_t, draws, row) in enumerate(probe.records):
         after, drawn, _ = (*probe.records, (end, probe.draws, []))[number + 1]
-        # The step must be a combination of four vectors: noisy motion, clean estimate, previous
-        # clean estimate, and fresh noise. A vector that the step does not have is a column of
-        # zeros.
+        # Each step must be a combination of four vectors: noisy motion, clean estimate, previous
+        # clean estimate, and fresh noise. If a step does not use a vector, its column is zero.
         nothing = torch.zeros_like(x_t)
         columns = [
             x_t,
@@ -280,9 +273,7 @@ class Graph(NamedTuple):
 
 
 class Call(nn.Module):
-    """One call of a model's denoiser with condition encoder and guidance,
-    without a learned variance.
-
+    """One call of a model's denoiser with condition encoder and guidance, without a learned variance.
     Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
     condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)
     int64 and `counts` (B,), the number of tokens of each caption. `ContinuingCall` also reads the
@@ -346,7 +337,7 @@ class Call(nn.Module):
 
 
 class ContinuingCall(Call):
-    """One call of a denoiser that continues frames; these frames are a further input."""
+    """One call of a denoiser that continues frames. These frames are an additional input."""
 
     def forward(
         self,
@@ -376,8 +367,7 @@ class Function(nn.Module):
 
 
 def graphs(model: MotionGenerator) -> list[Graph]:
-    """Returns the graphs of a model:
-    the guided denoiser, and the decoders to joints and rotations.
+    """Returns the graphs of a model: the guided denoiser, and the decoders to joints and rotations.
 
     Only SMPL's skeleton has rotations.
     """
@@ -428,9 +418,7 @@ def graphs(model: MotionGenerator) -> list[Graph]:
 
 
 def traced(graph: Graph) -> torch.export.ExportedProgram:
-    """Returns the traced operations of a graph's module,
-    for inputs of any size along the named axes.
-    """
+    """Returns the traced operations of a graph's module, for inputs of any size along the named axes."""
     dimensions = [graph.dimensions.get(name) for name in graph.examples]
     return torch.export.export(
         graph.module.eval(),
@@ -443,7 +431,8 @@ def traced(graph: Graph) -> torch.export.ExportedProgram:
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
     """Writes a graph.
 
-    Raises `UserError` if its outputs differ from PyTorch's for a batch of two motions, or of one.
+    Raises `UserError` if its outputs differ from the outputs of PyTorch for a batch of one or two
+    motions.
     """
     import onnxruntime
 
@@ -491,9 +480,7 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
 
 
 def _shrink(path: Path, half: bool) -> None:
-    """Removes the descriptions of the nodes;
-    `half` also stores matrices in half precision, with a cast.
-    """
+    """Removes the descriptions of the nodes. With `half`, also stores matrices in half precision, with a cast."""
     import onnx
     from onnx import numpy_helper
 

@@ -33,7 +33,8 @@ NETWORKS = {
 }
 """Architectures of MDM, by the authors' names.
 
-Each has our network, the authors' name of the transformer, and the names in a layer.
+Each entry contains the project's network, the authors' name of the transformer, and the layer
+names.
 """
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
@@ -44,7 +45,7 @@ POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
 
 
 class Released(NamedTuple):
-    """A released network, and its weights under our names."""
+    """A released network, and its weights under the project's names."""
 
     network: type[Denoiser]
     features: tuple[int, int, int]  # in_features, out_features, cond_features
@@ -54,9 +55,7 @@ class Released(NamedTuple):
     action_embedding: Tensor | None = None
 
     def checked(self) -> Self:
-        """Returns this object; raises `UserError`
-        unless the network has exactly these weights.
-        """
+        """Returns this object. Raises `UserError` unless the network has exactly these weights."""
         with torch.device("meta"):
             network = self.network(*self.features, **self.options)
         theirs.load_strictly(network, self.state, "released weights", assign=True)
@@ -123,9 +122,7 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
 
 
 def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Returns the options of the target encoder whose weights
-    are in a state dict, under our names.
-    """
+    """Returns the options of the target encoder, given its weights under the project's names."""
     layers = sum(key.startswith("target.network.") and key.endswith(".weight") for key in ours) - 1
     if layers >= 0:
         return {"target_encoder": "single", "target_layers": layers}
@@ -311,7 +308,7 @@ def import_released(
             model = _model(released, *_mdm_recipe(kind, released, options), stats, table)
     except (OSError, MemoryError):
         raise
-    except Exception as error:  # nonsensical weights and options may fail anywhere
+    except Exception as error:  # invalid weights and options may fail anywhere
         kind_of_error = (
             ""
             if isinstance(error, ValueError)
@@ -334,7 +331,7 @@ def _model(
 ) -> MotionGenerator:
     """Builds a model from a recipe, its weights and the statistics in a folder.
 
-    `extra` are weights of other parts than the network.
+    `extra` contains the weights of all parts except the network.
     """
     plain(config, "the options of the released model")
     representation = instantiate(config["representation"])

@@ -67,7 +67,8 @@ def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
     options = {} if path is None else read_yaml(path)  # JSON is YAML
     if not isinstance(options, dict):
         raise UserError(f"{path}: not a mapping of options")
-    # In a composed configuration of MFM, options of network and training are one level down.
+    # In MFM's composed configuration, the options of the network and of training are one level
+    # down.
     groups = [name for name in ("model", "training") if isinstance(options.get(name), dict)]
     top = {name: value for name, value in options.items() if name not in groups}
     flat = {
@@ -89,7 +90,7 @@ def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
 
 
 def _check_prefix(options: Options) -> None:
-    """Raises `ValueError` if options of a network that continues clean frames (DiP) do not fit its other options."""
+    """Raises `ValueError` if options of a network that continues clean frames (DiP) contradict its other options."""
     decoder = options.arch == "trans_dec" and options.text_encoder_type == "bert"
     for name, value in (("context_len", options.context_len), ("emb_policy", options.emb_policy)):
         if value not in (0, "add") and not decoder:
@@ -107,16 +108,14 @@ def _check_prefix(options: Options) -> None:
 
 
 def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
-    """Raises `ValueError` for an unknown hyperparameter in a checkpoint of FLAME's code."""
+    """Raises `ValueError` if a checkpoint of FLAME's code contains an unknown hyperparameter."""
     options = checkpoint.get("hyper_parameters")
     if isinstance(options, Mapping):
         _check_known(options, (), NAMES["options"][kind], "hyper_parameters.")
 
 
 def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: str = "") -> None:
-    """Raises `ValueError` for an unknown option,
-    or for an option whose effect our model lacks.
-    """
+    """Raises `ValueError` for an unknown option, or for an option whose effect the project's model lacks."""
     for name, value in options.items():
         shown = f"{prefix}{shortened(str(name), 40)}={shortened(str(value), 40)}"
         if name in table["neutral"]:

@@ -15,7 +15,7 @@ from flame_mdm.safe_io import read_package_yaml
 Network = TypeVar("Network", bound=nn.Module)
 
 NAMES: dict[str, Any] = read_package_yaml(Path(__file__).with_name("released.yaml"))
-"""The authors' names, and ours."""
+"""The authors' names, and the project's names."""
 ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 
 
@@ -23,10 +23,10 @@ def read_released(
     path: Path, *, run_code: bool = False, advice: str = "Save only its state dict"
 ) -> Mapping[str, Any]:
     """Reads a released file.
-    `run_code` also reads pickles of other objects, which runs any code in them.
+    With `run_code`, pickles of other objects are also read, which runs any code in them.
 
-    Raises `UserError` if the file is damaged, or if it holds such objects; `advice` is the end of
-    this message.
+    Raises `UserError` if the file is damaged, or if it contains such objects. `advice` is the end
+    of the error message.
     """
     try:
         check_torch(path)
@@ -76,8 +76,8 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
     """Returns the network's state dict in the content of a released file.
 
     The content is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with
-    `--use_ema`) or FLAME's Lightning checkpoint with "state_dict". `ema`: whether to take
-    averaged weights if the file has them, as in the authors' evaluation.
+    `--use_ema`) or FLAME's Lightning checkpoint with "state_dict". `ema` selects averaged weights
+    if the file contains them, as in the authors' evaluation.
     """
     prefixes = ("ema_model.model.", "net.") if ema else ("net.",)
     if "model_avg" in checkpoint:
@@ -99,9 +99,7 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def layer_names(
     state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
 ) -> tuple[dict[str, str], int]:
-    """Returns the number of layers,
-    and a mapping from prefixes of torch's layers to prefixes of ours.
-    """
+    """Returns the number of layers, and a mapping from prefixes of torch's layers to the project's prefixes."""
     count = sum(
         key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
     )
@@ -110,7 +108,7 @@ def layer_names(
 
 
 def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[str, Tensor]:
-    """Replaces the prefix of every name; raises `ValueError` if a name has no known prefix."""
+    """Replaces the prefix of every name. Raises `ValueError` if a name has no known prefix."""
     result, unknown = {}, []
     for key, value in state.items():
         theirs = next((prefix for prefix in prefixes if key.startswith(prefix)), None)
@@ -128,7 +126,7 @@ def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[st
 def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
     """Returns the shape of a weight.
 
-    Raises `ValueError` if the weight is missing, or has another number of dimensions.
+    Raises `ValueError` if the weight is missing, or if its number of dimensions is not `ndim`.
     """
     if key not in state:
         raise ValueError(

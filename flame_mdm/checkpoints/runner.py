@@ -1,5 +1,4 @@
-"""Samples from a folder of `flame-mdm export CKPT OUT format=onnx`,
-with only numpy and onnxruntime.
+"""Samples from a folder of `flame-mdm export CKPT OUT format=onnx`, with only numpy and onnxruntime.
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
@@ -55,7 +54,7 @@ MAX_GRAPH = 2**31
 EXTERNAL_DATA = re.compile(rb"(?:\x08|\x88\x80*\x00)location")
 """Pattern of the key that names a file of external data, after its length.
 
-protobuf may write the length with more bytes than needed.
+protobuf may write the length with more bytes than necessary.
 """
 
 
@@ -129,12 +128,12 @@ TYPES: dict[str, type | tuple[type, ...]] = {
 
 
 def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
-    """Returns the dotted names of the values that a JSON schema refuses.
+    """Returns the dotted names of the values that a JSON schema rejects.
 
     An item of a list is reported by the name of the list.
 
-    The schema has types, bounds for numbers and for the number of items, patterns for whole
-    texts, and required keys. Objects may have keys that are not in the schema.
+    The schema contains types, bounds for numbers and for the number of items, patterns for entire
+    texts, and required keys. Objects may contain keys that are not in the schema.
     """
     kind = schema["type"]
     if not _has_type(value, kind):
@@ -169,9 +168,7 @@ def _has_type(value: Any, kind: str) -> bool:
 
 
 def check(content: Any) -> None:
-    """Raises `ValueError` if `model.json` is damaged, changed,
-    or not within the limits of `SCHEMA`.
-    """
+    """Raises `ValueError` if `model.json` is damaged, changed, or not within the limits of `SCHEMA`."""
     if not isinstance(content, dict):
         raise ValueError("model.json is damaged")
     if content.get("format") != FORMAT:
@@ -195,9 +192,7 @@ def check(content: Any) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Returns the content of a regular file of up to `most` bytes;
-    otherwise raises `ValueError` or `OSError`.
-    """
+    """Returns the content of a regular file of up to `most` bytes; otherwise raises `ValueError` or `OSError`."""
     if path.exists() and not path.is_file():
         raise ValueError(f"{path.name} is a folder, a pipe or a device")
     with path.open("rb") as file:
@@ -271,7 +266,7 @@ class Sampler:
     def unknown(self, text: str) -> list[str]:
         """Returns the content words of a text that the model does not know.
 
-        Raises `ValueError` if it knows no content word.
+        Raises `ValueError` if the model knows no content word of the text.
         """
         seen, skipped = set(self.content["vocabulary"]), set(self.content["function_words"])
         content = [word for word in dict.fromkeys(words(text)) if seen and word not in skipped]
@@ -285,9 +280,10 @@ class Sampler:
     ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action.
 
-        For an unconditional model, the prompt is "". `sample` numbers the motions of one text.
-        The default of `seconds` is up to 3; for a model that continues frames, the maximum is
-        600. Raises `ValueError` for an unknown length or action, and if the result is not finite.
+        For an unconditional model, the prompt is "". `sample` is the number of the motion among the
+        motions for one text. `seconds` is 3 by default, or less if the model's maximum is lower.
+        For a model that continues frames, the maximum is 600. Raises `ValueError` for an invalid
+        length or an unknown action, or if the result is not finite.
         """
         content = self.content
         fps = content["fps"]
@@ -321,9 +317,7 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Returns normalized features (F, D) of frames that are sampled together;
-        `key` determines the noise.
-        """
+        """Returns normalized features (F, D) of frames that are sampled together; `number` seeds the noise."""
         content = self.content
         x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
@@ -343,12 +337,12 @@ class Sampler:
         return x
 
     def decode(self, x: np.ndarray) -> np.ndarray:
-        """Returns the joints (F, J, 3) in meters, y up, of normalized features (F, D)."""
+        """Converts normalized features (F, D) to joints (F, J, 3) in meters, y up."""
         shape = (1, len(x), len(self.content["skeleton"]["joints"]), 3)
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rest pose and the local rotations, only for SMPL's 22 joints.
+        """Returns the rest pose and the local rotations. Only for SMPL's 22 joints.
 
         Offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
         are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y, z); the quaternion of
@@ -366,7 +360,7 @@ class Sampler:
     ) -> list[np.ndarray]:
         """Returns the outputs of a graph.
 
-        Raises `ValueError` if it cannot run, or if its outputs have other shapes.
+        Raises `ValueError` if the graph cannot run, or if its outputs have unexpected shapes.
         """
         session = getattr(self, name)
         try:

@@ -11,7 +11,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import ZIP_ERRORS, naming, opened_zip, regular_file
 
 LARGEST_KEY = 2**60
-"""Integer keys must be smaller than this: any number of larger integers may share one hash."""
+"""Integer keys must be smaller than this. Any number of larger integers may share one hash."""
 # files of PyTorch before 1.6, which are not archives, begin with this number of pickles
 LEGACY_PICKLES = 5
 # Names of the codec with which PyTorch writes bytes. Other codecs may take quadratic time.
@@ -19,9 +19,7 @@ CODECS = ("latin1", "latin-1")
 
 
 def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file of `torch.save`,
-    without executing code in the file.
-    """
+    """Returns the plain values and tensors in a file of `torch.save`, without executing code in the file."""
     import torch
 
     check_torch(path)
@@ -31,9 +29,7 @@ def read_torch(path: Path) -> Any:
 
 
 def check_torch(path: Path) -> None:
-    """Checks the sizes and checksums of an archive of `torch.save`,
-    since `torch.load` does not check them.
-    """
+    """Checks the sizes and checksums of an archive of `torch.save`, which `torch.load` does not check."""
     size = regular_file(path)
     if not _is_archive(path):
         return
@@ -57,9 +53,9 @@ def check_keys(path: Path) -> None:
     """Raises `UserError` if keys in a file may share one hash.
 
     A dictionary of such keys takes quadratic time in `torch.load(weights_only=True)`: hours for a
-    file of a megabyte. Text has random hashes, and small whole numbers have different hashes. If
-    the pickle names an object that PyTorch refuses, the check ends without an error there,
-    because PyTorch stops at the same place and names the object.
+    file of one megabyte. Text has random hashes, and small integers have different hashes. If the
+    pickle names an object that PyTorch refuses, the check stops there without an error, because
+    PyTorch stops at the same place and names the object.
     """
     regular_file(path)
     damage = naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: ")
@@ -100,9 +96,7 @@ PLAIN = (*CONTAINERS, "_codecs.encode", "builtins.bytearray", "builtins.complex"
 
 
 class _KeyCheck(pickle._Unpickler):
-    """Reads a pickle like PyTorch's restricted reader,
-    without keeping the content of containers.
-    """
+    """Reads a pickle like PyTorch's restricted reader, without keeping the content of containers."""
 
     stack: list[Any]
     append: Callable[[Any], None]
@@ -120,7 +114,7 @@ class _KeyCheck(pickle._Unpickler):
         return True
 
     def find_class(self, module_name: str, global_name: str, /) -> _Named:
-        # PyTorch writes Python 2's names, as protocol 2 demands, and maps them in the same way
+        # PyTorch writes Python 2's names, as required by protocol 2, and maps them in the same way
         if (module_name, global_name) in NAME_MAPPING:
             module_name, global_name = NAME_MAPPING[module_name, global_name]
         name = f"{IMPORT_MAPPING.get(module_name, module_name)}.{global_name}"
@@ -168,8 +162,8 @@ class _KeyCheck(pickle._Unpickler):
     def _load_set(self) -> None:
         self.append(_Named("builtins.set"))
 
-    # Exactly the instructions of PyTorch's own reader, so that a file that passes here does not
-    # fail there.
+    # These are exactly the instructions of PyTorch's own reader, so that a file that passes here
+    # does not fail there.
     dispatch = {  # pyright: ignore[reportAssignmentType]
         code[0]: pickle._Unpickler.dispatch[code[0]]
         for code in (
@@ -215,7 +209,7 @@ class _KeyCheck(pickle._Unpickler):
 def _check_container(name: str, arguments: Sequence[Any]) -> None:
     """Checks the keys with which a container is created.
 
-    Such as OrderedDict([(key, value), ...]) or set([key, ...]).
+    Examples are OrderedDict([(key, value), ...]) and set([key, ...]).
     """
     for content in arguments:
         if name == "collections.Counter" and not isinstance(content, dict):

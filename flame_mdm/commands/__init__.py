@@ -1,6 +1,6 @@
-"""Commands, with one file per command; `flame_mdm.__main__` lists them.
+"""Commands, one file per command; `flame_mdm.__main__` lists them.
 
-This module has the keys that several commands share.
+This module contains the keys that several commands share.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ STORE = "store.json"
 
 
 def usual_data_root() -> str:
-    """Returns the folder of prepared data sets: FLAME_MDM_DATA, by default `data`."""
+    """Returns the folder of the prepared data sets: FLAME_MDM_DATA, by default `data`."""
     return os.environ.get("FLAME_MDM_DATA", "data")
 
 
@@ -43,8 +43,9 @@ def existing(key: str, source: str) -> None:
 
 
 def motion_file(key: str, source: str) -> None:
-    """Checks that a motion file exists and has a supported extension; `dataset:id` is checked
-    when it is read.
+    """Checks that a motion file exists and that its extension is supported.
+
+    `dataset:id` is checked when the clip is read.
     """
     if Path(source).suffix.lower() in ENDINGS:
         existing(key, source)
@@ -133,7 +134,7 @@ class AdaptedSettings(ModelSettings):
     )
 
     def adapters(self) -> dict[str, Any]:
-        """Returns the keywords of `flame_mdm.load` for adapters."""
+        """Returns the keyword arguments of `flame_mdm.load` that describe the adapters."""
         return {"adapter": self.adapter or (), "strength": self.adapter_strength}
 
 
@@ -159,7 +160,7 @@ class FileSettings:
 def read_motions(
     source: str, settings: FileSettings, failures: list[str]
 ) -> tuple[str, int, Iterator[Motion]]:
-    """Returns the name, the number and the motions of a file or folder.
+    """Returns the name of a file or folder, the number of its motions, and the motions.
 
     Errors of files in a folder are added to `failures`.
     """
@@ -198,7 +199,7 @@ class BodySettings:
     )
 
     def read_body(self) -> Mesh | None:
-        """Reads `body`; None = the mannequin, which is drawn by default."""
+        """Reads `body`; None = the default body, the mannequin."""
         if self.body == "mannequin":
             return None
         from flame_mdm.formats.people import load_body
@@ -228,7 +229,7 @@ class WritingSettings:
     def read_character(self) -> Character | BvhCharacter | None:
         """Reads `character`.
 
-        If names of its joints are unknown, prints a file for the user to complete.
+        If it contains joints with unknown names, prints a file that the user can complete.
         """
         from flame_mdm.formats import characters
 
@@ -280,9 +281,9 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         return names + (["unconditioned"] if self.unconditioned else [])
 
     def request(self, **values: Any) -> SamplingRequest:
-        """Returns the request to the model; `values` replace values of these keys.
+        """Returns the request to the model; `values` replace the values of these keys.
 
-        Raises `UserError` if more than one condition is requested, or a value is invalid.
+        Raises `UserError` if more than one condition is requested, or if a value is invalid.
         """
         if len(conditions := self.conditions()) > 1:
             raise UserError(f"{' and '.join(conditions)} exclude each other. Give only one of them")
@@ -311,7 +312,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     def load(self) -> LoadedModel:
         """Loads the model and the body.
 
-        If no key determines the content of the motions, raises a `UserError` with examples.
+        Raises a `UserError` with examples if no key determines the content of the motions.
         """
         file = find(self.ckpt, self.which)  # before PyTorch is imported
         import torch
@@ -347,7 +348,7 @@ class DataSettings:
 
     def __post_init__(self) -> None:
         if self.data is not None:
-            _ = self.nodes  # composed now, to report errors before any work
+            _ = self.nodes  # composed here, so that errors are reported before any work
         elif self.composed:
             raise UserError(
                 f"{self.composed[0]} belongs to a data set, but no data set is named. Add data=NAME"

@@ -50,7 +50,7 @@ def main(settings: BrowseSettings) -> None:
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
-        info = Store(data.folder).info  # the user's own data is shown as it was prepared
+        info = Store(data.folder).info  # the user's own data is shown as prepared
         data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)
         if settings.source is not None:
             say(

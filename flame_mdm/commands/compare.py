@@ -162,9 +162,7 @@ def _motions(
 
 
 def _texts(prompts: PromptFile) -> list[str]:
-    """Returns the prompts of a file;
-    raises the error of the first prompt that no model can sample.
-    """
+    """Returns the prompts of a file. Raises the error of the first prompt that no model can sample."""
     for number in sorted(prompts.refused):
         raise prompts.refused[number]
     return list(prompts.lines.values())
@@ -177,9 +175,9 @@ def _sampled(
 
     Args:
         entry: the run.
-        prompts: the prompts, with the length of each motion in seconds. Either all motions have a
-            length, or none; None = the default of sampling. Lengths above the model's maximum are
-            shortened.
+        prompts: the prompts, with the length of each motion in seconds. Lengths are given either
+            for all motions or for none; None = the default length. Lengths above the model's
+            maximum are shortened.
         seed: seed of the noise. If a prompt is listed twice, its motions have different noise.
     """
     import torch

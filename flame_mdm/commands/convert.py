@@ -119,7 +119,7 @@ def _convert(
                 out, settings.rest_pose, settings.rig, character, body, settings.root_motion
             )
         )
-    except UserError as error:  # an error that does not name the output is an error of the input
+    except UserError as error:  # an error that does not name the output concerns the input
         if str(out) in str(error):
             raise
         raise UserError(f"{path}: {error}") from error

@@ -18,9 +18,9 @@ from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.safe_io.paths import check_tree
 
 RECIPE = "student.yaml"
-"""Name of the student's recipe in its run directory.
+"""File name of the student's recipe in its run directory.
 
-Training starts from this file, also in the jobs of a launcher.
+Training starts from this file, including jobs that a launcher starts.
 """
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 
@@ -50,7 +50,7 @@ def main(settings: DistillSettings) -> None:
     folder = Path(recipe["run"]["dir"])
     path, new = folder / RECIPE, not folder.exists()
     check_tree(folder)
-    save(recipe, path)  # processes on other nodes read this file, too
+    save(recipe, path)  # processes on other nodes also read this file
     code = run_recipe(train, USAGE, [str(path), *settings.composed])
     if code and new and not any(folder.rglob("config.yaml")):  # no training started
         shutil.rmtree(folder, ignore_errors=True)
@@ -59,7 +59,7 @@ def main(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
-    """Returns the recipe of a student. It is the recipe of the teacher, changed for distillation.
+    """Returns the recipe of a student: the teacher's recipe, with changes for distillation.
 
     Raises `UserError` if the model was not trained by this framework.
     """

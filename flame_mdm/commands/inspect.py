@@ -59,8 +59,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
             Path(name).suffix or Path(name).exists() or "/" in name
         ):  # not a file, so the name of a data set
             is_prepared = any(Path(self.data_root).glob(f"{escape(name)}-*/{STORE}"))
-            # If no recipe has the name of a prepared data set, the data set was made from the
-            # user's folder.
+            # If no recipe has this name, the data set was prepared from the user's folder.
             if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():
                 object.__setattr__(self, "data", "folder")
                 object.__setattr__(self, "composed", (*self.composed, f"data.name={name}"))

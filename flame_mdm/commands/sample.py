@@ -90,12 +90,12 @@ class SampleSettings(OutputSettings, WritingSettings):
 
     @property
     def file(self) -> Path | None:
-        """The motion file to write; None = a folder."""
+        """The motion file to write; None if a folder is written."""
         path = Path(self.out or "")
         return path if path.suffix.lower() in WRITTEN and not path.is_dir() else None
 
     def check_output(self) -> None:
-        """Raises `UserError` for keys that do not fit the kind of output."""
+        """Raises `UserError` for keys that do not match the kind of output."""
         if self.set is not None:
             of_sets = {
                 "out",
@@ -156,12 +156,12 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
-        """Returns the keys that request motions, including a file of prompts and a set."""
+        """Returns the keys that determine the motions, including a file of prompts and a set."""
         sources = [key for key in ("prompts", "set") if getattr(self, key) is not None]
         return [*super().conditions(), *sources]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
-        """Returns the request to the model; with a file of prompts, for its accepted prompts."""
+        """Returns the request to the model. With a file of prompts, it contains the accepted prompts."""
         default = 3 if self.file is None else 1
         samples = default if self.samples is None else self.samples
         if prompts is None:
@@ -300,9 +300,7 @@ def _write_files(
     body: Mesh | None,
     facts: dict[str, Any],
 ) -> None:
-    """Writes the first motion as `file`,
-    and further motions with numbers: walk_2.fbx, walk_3.fbx.
-    """
+    """Writes the first motion as `file`, and further motions with numbers: walk_2.fbx, walk_3.fbx."""
     for number, motion in enumerate(motions, 1):
         path = file if number == 1 else file.with_stem(f"{file.stem}_{number}")
         written = settings.at_rate(motion)
@@ -312,7 +310,7 @@ def _write_files(
 def _score(source: str, model: MotionGenerator) -> Score:
     """Returns the function that scores candidates, by claims or by a motion-CLIP.
 
-    Raises `UserError` if it cannot read the model's motions.
+    Raises `UserError` if the scorer cannot read the model's motions.
     """
     if source == CLAIMS:
         return claims_score(model)
@@ -329,7 +327,7 @@ def _score(source: str, model: MotionGenerator) -> Score:
 def claims_score(model: MotionGenerator) -> Score:
     """Returns the function that scores candidates by the claims of their texts.
 
-    Raises `UserError` for motions of another skeleton.
+    Raises `UserError` if the motions have a skeleton that the referee does not support.
     """
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.sampling.referee.judging import claim_score
@@ -349,9 +347,9 @@ def _folders(
     model: MotionGenerator,
     motions: Sequence[Motion],
 ) -> dict[Path, list[Motion]]:
-    """Returns the folders to write with their motions.
+    """Returns the folders to write, with the motions of each folder.
 
-    A prompt that is listed twice has one folder.
+    A prompt that is listed twice has a single folder.
     """
     from flame_mdm.sampling.output import default_folder
 
@@ -385,9 +383,7 @@ def _distance(targets: Targets, motions: Sequence[Motion]) -> str:
 
 
 def _gallery(prompts: PromptFile, folders: Mapping[Path, list[Motion]], body: Mesh | None) -> str:
-    """Writes the page that shows the first motion of each prompt;
-    returns a message with its path.
-    """
+    """Writes the page that shows the first motion of each prompt, and returns a message with its path."""
     from flame_mdm.visualize import write_player
 
     page = next(iter(folders)).with_name(f"{Path(prompts.path).stem}.html")

@@ -1,6 +1,4 @@
-"""`flame-mdm tables [NAME ...]`:
-renders tables and figures from results; evaluates missing results.
-"""
+"""`flame-mdm tables [NAME ...]`: renders tables and figures from results, and evaluates missing results."""
 
 import os
 from collections.abc import Mapping, Set
@@ -90,7 +88,7 @@ def main(settings: TablesSettings) -> None:
 def evaluate_missing(
     specs: Mapping[str, Config], results: Path, settings: TablesSettings
 ) -> list[str]:
-    """Runs evaluations with missing or outdated results, and counts lengths.
+    """Runs the evaluations whose results are missing or outdated, and counts motion lengths.
 
     Returns one line per failure.
     """
@@ -137,9 +135,7 @@ def evaluate_missing(
 
 
 def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
-    """Whether `values` need several motions per prompt,
-    which take most of the time of an evaluation.
-    """
+    """Whether `values` need several motions per prompt, which take most of the evaluation time."""
     from evaluators.protocol import protocol_config
 
     several = protocol_config(evaluation.keys["protocol"]).get("multimodality") or {"metrics": {}}

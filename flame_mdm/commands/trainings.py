@@ -1,4 +1,4 @@
-"""Trainings of a benchmark, in processes of their own, one after another or side by side."""
+"""Trainings of a benchmark, each in its own process, sequentially or in parallel."""
 
 import os
 import subprocess
@@ -15,9 +15,9 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import open_in_place
 
 GIB_PER_JOB = 2.0
-"""Free memory in GiB that must be left to start another training beside running ones."""
+"""Free memory in GiB that is required to start another training in parallel."""
 POLL = 0.2
-"""Seconds between two looks at running trainings."""
+"""Seconds between two checks of running trainings."""
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Training:
     Attributes:
         words: arguments of `flame-mdm train`.
         folder: the run directory.
-        needs: numbers of the trainings whose runs this one reads.
+        needs: numbers of the trainings whose runs this training reads.
     """
 
     words: Sequence[str]
@@ -41,7 +41,7 @@ class Training:
 
 
 def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
-    """Returns the trainings of a benchmark. One that names the run of an earlier one needs it."""
+    """Returns the trainings of a benchmark. A training that names an earlier run depends on that run."""
     root = [f"data_root={data_root}"] if data_root else []
     trainings: list[Training] = []
     for name, *overrides in entries:
@@ -61,12 +61,12 @@ def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
 def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
     """Runs trainings, up to `jobs` at the same time.
 
-    With several jobs, each has its share of the cores, and writes its output to a file in `logs`.
-    A training starts beside others only if `GIB_PER_JOB` of memory are free. Its batches and
-    random draws do not depend on other trainings.
+    With several jobs, each training gets an equal share of the cores and writes its output to a
+    file in `logs`. Another training starts in parallel only if `GIB_PER_JOB` of memory is free. The
+    batches and random draws of a training do not depend on other trainings.
 
     Raises:
-        UserError: If a training failed. The others are stopped, and can be resumed.
+        UserError: If a training failed. The other trainings are stopped and can be resumed.
         SystemExit: If a training was interrupted.
     """
     environment = dict(os.environ)

@@ -166,7 +166,7 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
 
     Raises:
         UserError: If the model has another skeleton or cannot do what is requested, or if no
-        candidate shows a standing person.
+            candidate shows a standing person.
     """
     if model.representation.skeleton.joints != SMPL22.joints:
         raise UserError(

@@ -72,7 +72,7 @@ def stream(
 
     Raises:
         UserError: If the model does not continue frames or knows no content word of the text, or if
-        the motion to continue cannot be read or is too short.
+            the motion to continue cannot be read or is too short.
 
     Example:
         >>> import flame_mdm

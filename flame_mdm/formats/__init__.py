@@ -16,7 +16,7 @@ ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
 TREES = (".bvh", ".amc")
 # Universal Scene Description
 USD = (".usda", ".usdc", ".usdz")
-# Endings of files that can have the skeleton of another program
+# Endings of files that can be written with the skeleton of another program
 RIGGED = (".bvh", ".glb", ".fbx", *USD)
 # Endings of the files that `Motion.save` writes
 WRITTEN = (
@@ -42,12 +42,12 @@ ADVICE = {
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
 """Suffixes of AMASS files that contain a body shape and no motion."""
-# The array of joints that only motions in JSON have
+# Name of the array of joints, which only motions in JSON contain
 JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 
 
 def unread(path: Path) -> UserError:
-    """Returns the error for a file whose ending is not an ending of motion files."""
+    """Returns the error for a file whose ending is not supported as a motion file."""
     advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
     return UserError(
         f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}"
@@ -57,8 +57,8 @@ def unread(path: Path) -> UserError:
 def motions_in(folder: Path) -> list[Path]:
     """Returns the motion files in a folder and its subfolders, sorted.
 
-    Hidden files, which macOS and editors create, folders, and files of AMASS without motion are
-    left out. A JSON file is a motion only if it has an array of joints.
+    Hidden files (created by macOS and editors), folders, and AMASS files without motion are left
+    out. A JSON file is a motion only if it contains an array of joints.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 
@@ -86,9 +86,9 @@ def _is_motion(file: Path, folder: Path) -> bool:
 
 
 def _has_joints(file: Path) -> bool:
-    """Returns whether a JSON file has an array of joints.
+    """Returns whether a JSON file contains an array of joints.
 
-    Also returns True for a file that cannot be read: its reader reports the fault.
+    Also returns True for a file that cannot be read, so that its reader reports the error.
     """
     tail = b""
     try:

@@ -1,7 +1,7 @@
 """Animated node hierarchies of FBX and GLB files: the positions of all nodes in each frame.
 
-Only positions are used, from which the rotations of the motion are computed. Therefore the rest
-pose need not be a T-pose, and the local axes, which differ between programs, do not matter.
+Only the positions are used, and the rotations of the motion are computed from them. Therefore, the
+rest pose need not be a T-pose, and the local axes, which differ between programs, do not matter.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ class AnimatedNodes:
         positions: (F, N, 3) in the world, in meters, y up.
         fps: frames per second.
         animation: the name of the animation.
-        humanoid: index of a node by the joint of SMPL, if the file says which nodes are a human
-            body; otherwise empty.
-        unit: meters per unit of length, as the file declares it.
+        humanoid: index of a node by SMPL joint, if the file says which nodes form a human body;
+            otherwise empty.
+        unit: meters per unit of length, as declared in the file.
     """
 
     names: tuple[str, ...]
@@ -95,9 +95,9 @@ def parents_first(parents: Sequence[int]) -> list[int]:
 
 
 def world_matrices(parents: Sequence[int], local: np.ndarray) -> np.ndarray:
-    """Converts matrices to the parents to matrices to the world, (F, N, 4, 4) each.
+    """Converts matrices relative to the parents to world matrices, (F, N, 4, 4) each.
 
-    Parents precede their children.
+    Parents must precede their children.
     """
     worlds = local.copy()
     for node, parent in enumerate(parents):

@@ -1,4 +1,4 @@
-"""Motion files of arrays (`.npz`, `.npy`, `.json`), with joints or SMPL's rotations."""
+"""Motion files that contain arrays (`.npz`, `.npy`, `.json`), with joints or SMPL's rotations."""
 
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.smpl import AXIS_ANGLES, read_pose
 from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
 
-# Maximum size of a `.json` motion in bytes. Parsed, it takes many times as much memory.
+# Maximum size of a `.json` motion in bytes. Parsed, it takes several times as much memory.
 JSON_LIMIT = 128 * MEBIBYTE
 RATES = (
     "fps",
     "mocap_framerate",
     "mocap_frame_rate",
 )  # names under which files store the frame rate
-# Names of parts of `poses` in AMASS's SMPL-X files
+# Names of the parts of `poses` in AMASS's SMPL-X files
 BODY = ("root_orient", "pose_body")
 NEEDED = {
     "joints",
@@ -33,9 +33,9 @@ NEEDED = {
     "features",
     "representation",
 }
-"""Arrays of an .npz file that are read.
+"""Arrays that are read from an .npz file.
 
-Other arrays may contain pickled objects; they are never opened.
+Other arrays may contain pickled objects; they are never loaded.
 """
 LENGTHS = {
     "m": 1.0,
@@ -46,16 +46,16 @@ LENGTHS = {
     "centimetre": 0.01,
     "mm": 0.001,
 }
-"""Names of units in `.json` files, in meters."""
+"""Names of units in `.json` files -> meters."""
 NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion.
 
-    Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text,
-    features and representation if the file has them, and up, unit and names of `.json` files.
-    `ours` says whether this project wrote the file.
+    Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text, features
+    and representation if the file contains them, and up, unit and names for `.json` files. `ours`
+    is True if this project wrote the file.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -119,9 +119,9 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
-    """Returns axis-angle vectors (F, 72) of SMPL's joints.
+    """Returns the axis-angle vectors (F, 72) of SMPL's joints.
 
-    If there are no hands, theirs are 0.
+    Without hands in the file, the vectors of the hands are 0.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
@@ -141,7 +141,7 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     """Checks the numbers of an array (F, ...).
 
     Raises:
-        UserError: If there are too many frames or none, or if a number is not real or not below a
+        UserError: If there are no frames or too many, or if a number is not real or not below a
             million.
     """
     if not is_real(values):

@@ -1,10 +1,9 @@
-"""ASF/AMC motion capture files of Acclaim and the CMU database: one file per skeleton and motion.
+"""ASF/AMC motion capture files of Acclaim and the CMU database, with one file per skeleton and per motion.
 
 An ASF file lists the bones of a subject. Each bone has a direction and length in the world in the
-rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file
-contains the angles of these degrees of freedom per frame. If M is the rotation of the angles, the
-bone turns by C M C^-1 relative to its parent. Orders such as XYZ mean that x is applied first: C
-= Rz Ry Rx.
+rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file contains
+the angles of these degrees of freedom for each frame. If M is the rotation of the angles, the bone
+turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ class Bone(NamedTuple):
 def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints.
 
-    Each bone gives a joint of the same name at its start. AMC files do not contain `fps`: it is
-    120 for most of CMU's recordings.
+    Each bone becomes a joint of the same name at its start. AMC files do not contain `fps`, which
+    is 120 for most of CMU's recordings.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
@@ -85,7 +84,7 @@ def read(path: Path, fps: float | None) -> Bvh:
 def skeleton_of(path: Path) -> Path:
     """Returns the ASF file of an AMC file, in the same folder.
 
-    The ASF file has the name of the AMC file or of its subject (02.asf), or is the only one in
+    The ASF file has the name of the AMC file or of its subject (02.asf), or is the only ASF file in
     the folder.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Moving bodies: rotations of their joints, and meshes fitted to their bone lengths."""
+"""Moving bodies: joint rotations, and meshes fitted to bone lengths."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh, mannequin
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
-"""How much the width of the trunk follows the shoulders, by joint; the rest follows the hips."""
+"""Share of the shoulders in the width of the trunk, by joint; the rest follows the hips."""
 # Limits of the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
 # positions must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)
-# Limits of a limb's length, relative to the mesh's length
+# Limits of a limb's length, relative to the limb's length in the mesh
 LONGER = (0.4, 2.5)
-# Limits of the scale of the other parts' lengths, relative to the scale of the limbs
+# Limits of the length scale of all other parts, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
 ORTHONORMAL = 0.1  # maximum error of the dot products between rows of a rotation matrix
 LIMBS = tuple(
@@ -33,7 +33,7 @@ LIMBS = tuple(
 
 @dataclass(eq=False, repr=False)
 class PosedFigure(Figure):
-    """Moving joints with rotations that bodies and characters can follow.
+    """Moving joints with rotations that can drive bodies and characters.
 
     Attributes:
         poses: rotations of SMPL's joints, if they are known.
@@ -50,7 +50,7 @@ class PosedFigure(Figure):
             return self.poses
         joints = torch.from_numpy(self.joints)
         if self.skeleton.name == "smpl24":
-            joints = joints[:, : len(SMPL22)]  # the last two are the hands
+            joints = joints[:, : len(SMPL22)]  # the last two joints are the hands
         return solve(joints, self.fps)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
@@ -67,15 +67,16 @@ class PosedFigure(Figure):
 def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     """Fits a body to a clip and computes the rotations of its bones.
 
-    The joints of the body are the joints of the motion, raised by the thickness of the sole.
+    The joints of the body coincide with the joints of the motion, raised by the thickness of the
+    sole.
 
     Args:
         motion: the clip. Missing rotations are computed and completed.
         body: the mesh; None = the mannequin.
 
     Raises:
-        UserError: If the skeleton is not SMPL's, a limb is much longer or shorter than a
-            person's, or a matrix is not a rotation.
+        UserError: If the skeleton is not SMPL's, if a limb is much longer or shorter than a
+            person's, or if a matrix is not a rotation.
     """
     poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
@@ -86,7 +87,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     if motion.poses is None:
         neutral, world, offsets = complete(joints, offsets, world)
     _check_rotations(world)
-    # Feet are stretched so that the sole is as far below the ankle as the floor in the clip.
+    # Feet are stretched so that the sole is as far below the ankle as the floor is in the clip.
     lift = wide * body.sole
     for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
@@ -109,7 +110,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 def local_rotations(body: FittedBody) -> np.ndarray:
     """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents.
 
-    Toes are bent.
+    The toes are bent.
     """
     count = len(SMPL22)
     world = body.turns[:, :count] @ body.mesh.turns[:count] @ body.neutral.mT
@@ -120,9 +121,9 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the linear map (22, 3, 3) of each part of a body, and the scale of its widths.
+    """Returns the linear map (22, 3, 3) of each part of a body, and the scale of the body's width.
 
-    With these maps, the body has a clip's `offsets` (22, 3) at rest.
+    With these maps, the body has the `offsets` (22, 3) of a clip in its rest pose.
     """
     # The limbs determine the size of the body. Hips and shoulders follow the clip's own widths.
     # The trunk blends both widths from bottom to top. Limbs are stretched only along their bones.
@@ -171,8 +172,8 @@ def _check_rotations(world: np.ndarray) -> None:
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Appends the rotations of the helper bones to the rotations of the joints (F, 22, 3, 3)."""
-    # Skin that follows a twisting bone collapses at the joint. A helper bone takes a part of the
-    # twist about the limb, so that the twist is spread along the limb as under real skin.
+    # Skin that follows a twisting bone collapses at the joint. A helper bone takes part of the
+    # twist about the limb, so that the twist is distributed along the limb, as under real skin.
     helpers = []
     for joint, share in HELPERS:
         child = SMPL22.parents.index(joint)

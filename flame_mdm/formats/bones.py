@@ -1,10 +1,10 @@
 """Rotations of SMPL's joints from the bones of a BVH or AMC file.
 
 Joint positions do not show how a forearm or a head turns about its own axis, but the bones of a
-file do. A joint of SMPL turns as its bone has turned since the rest pose. Three rest poses are
-tried, in this order: the pose of the file without rotations, a rest pose in front of the motion,
-and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose, its arms and legs
-are turned to SMPL's directions by the smallest rotation.
+file do. Each SMPL joint is turned in the same way as its bone has turned from the rest pose. Three
+rest poses are tried, in this order: the pose of the file without rotations, a rest pose in front of
+the motion, and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose, its arms
+and legs are turned to SMPL's directions by the smallest rotation.
 """
 
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
-# Rotations agree with positions up to this mean distance of joints, in meters
+# Rotations agree with positions up to this mean distance between joints, in meters
 APART = 0.03
-# Maximum angle between a limb of a known skeleton in its T-pose and SMPL's limb, as a cosine
+# Maximum angle, as a cosine, between a limb of a known skeleton in its T-pose and SMPL's limb
 ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 """Possible directions of the trunk in a rest pose.
@@ -43,12 +43,12 @@ def bone_poses(
 ) -> BoneRotations:
     """Returns the rotations of SMPL's joints in a file.
 
-    The rotations cannot be used if the rest pose is not known, or if they do not move the joints
-    to their positions, as in files that move each joint by position channels.
+    The rotations are unusable if the rest pose is unknown, or if they do not move the joints to
+    their positions, as in files that move each joint by position channels.
 
     Args:
         tree: the file.
-        layout: its skeleton.
+        layout: the skeleton of the file.
         joints: (F, 22, 3), SMPL's joints in meters, y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
         in_front: (J, 3, 3), rotations relative to the parents in a rest pose in front of the
@@ -107,7 +107,7 @@ def _rest(
 
 
 def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
-    """Returns the rotations (22, 3, 3) of bones in a pose, turned to y up and +z ahead.
+    """Returns the rotations (22, 3, 3) of bones in a pose, turned so that y is up and +z is ahead.
 
     Returns None if the pose (22, 3) leans.
     """
@@ -144,7 +144,7 @@ def _aligned(rest: np.ndarray, turned: np.ndarray, steps: np.ndarray) -> np.ndar
 
 
 def _local(turned: np.ndarray, steps: np.ndarray, start: int, end: int) -> np.ndarray:
-    """Returns the mean position (3,) of the end of a bone in the bone's frame of reference."""
+    """Returns the mean position (3,) of the end of a bone, in the bone's coordinates."""
     return np.einsum("fji,fj->fi", turned[:, start], steps[:, end]).mean(0)
 
 
@@ -154,7 +154,7 @@ def _unit(vector: ArrayLike) -> np.ndarray:
 
 
 def _assembled(turned: np.ndarray, root: np.ndarray, steps: np.ndarray) -> Poses:
-    """Returns the poses of joints with rotations (F, 22, 3, 3) in the world.
+    """Returns the poses of joints with world rotations (F, 22, 3, 3).
 
     The body has the bones of the file.
     """

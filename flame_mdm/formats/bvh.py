@@ -1,6 +1,7 @@
 """BVH motion capture files: reading, forward kinematics, resampling, writing.
 
-A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one
+A BVH file contains a tree of joints with offsets, and a table of numbers with one row per frame and
+one
 column per channel. The rotation channels of a joint are intrinsic Euler angles in degrees, in the
 listed order: `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position
 channels replace the joint's offset.
@@ -27,7 +28,7 @@ from flame_mdm.safe_io import TEXT_LIMIT, naming, regular_file, write_text
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 # Maximum number of joints and end sites of a file
 MAX_JOINTS = 4096
-# Maximum number that is read, and maximum sum of the numbers in a line
+# Maximum absolute value of a number, and maximum sum of the numbers in a line
 LARGEST = 1e9
 
 
@@ -35,23 +36,23 @@ LARGEST = 1e9
 class Bvh:
     """A skeleton and its motion, with J joints, F frames and C channels.
 
-    Lengths have the file's unit.
+    Lengths are in the unit of the file.
     """
 
     # J names. The end site of a joint is a joint without channels, called `NAME.end`.
     joints: tuple[str, ...]
-    # Index of each joint's parent, smaller than its own; -1 for a root
+    # Index of each joint's parent, smaller than the joint's own index; -1 for a root
     parents: tuple[int, ...]
     # (J, 3) float64, rest position of each joint in its parent's frame
     offsets: np.ndarray
-    # For each joint, the names of its channels (see `CHANNELS`), in the order of the columns
+    # For each joint, the names of its channels (see `CHANNELS`) in the order of the columns
     channels: tuple[tuple[str, ...], ...]
     # (F, C) float64, the channels of all joints in joint order; angles in degrees
     frames: np.ndarray
     fps: float  # frames per second
 
     def columns(self) -> list[slice]:
-        """Returns the columns of `frames` with each joint's channels."""
+        """Returns the columns of `frames` that contain each joint's channels."""
         ends = list(itertools.accumulate(map(len, self.channels)))
         return [
             slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)
@@ -71,7 +72,7 @@ class Bvh:
     def translations(self) -> np.ndarray:
         """Returns the position (F, J, 3) of each joint in its parent's frame.
 
-        The position comes from the position channels or the offset.
+        Positions are read from the position channels. Without them, the offset is used.
         """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
@@ -81,15 +82,15 @@ class Bvh:
         return translations
 
     def positions(self) -> np.ndarray:
-        """Returns the position (F, J, 3) of each joint in the world."""
+        """Returns the world position (F, J, 3) of each joint."""
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
     def resample(self, fps: float, cubic: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Resamples to times 0, 1/fps, ... up to the last frame.
 
         Returns rotations (F', J, 3, 3) and translations (F', J, 3). Rotations are interpolated on
-        the sphere (slerp), so bones keep their length. Translations are interpolated linearly, or
-        with `cubic` splines.
+        the sphere (slerp), so that bones keep their length. Translations are interpolated linearly
+        or, with `cubic`, by splines.
         """
         before, after, share = frame_pairs(
             len(self.frames), self.fps, fps, len(self.joints), slack=0
@@ -112,7 +113,7 @@ class Bvh:
 def forward_kinematics(
     parents: Sequence[int], rotations: np.ndarray, translations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions (F, J, 3) and rotations (F, J, 3, 3) in the world.
+    """Returns world positions (F, J, 3) and world rotations (F, J, 3, 3).
 
     G_j = G_p R_j and p_j = p_p + G_p t_j, where p is the parent of j.
 
@@ -139,7 +140,7 @@ def read_lines(path: str | Path) -> Lines:
 def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
-    Raises `UserError`, with file and line, if it is incomplete or invalid.
+    Raises `UserError`, with file and line, if the file is incomplete or invalid.
     """
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
@@ -185,14 +186,14 @@ def read(path: str | Path) -> Bvh:
         source.fail("MOTION before the end of the hierarchy, or before the end of its line")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
-    # Few digits are allowed, because Python needs quadratic time for long numbers.
+    # The number of digits is limited, because Python needs quadratic time to parse long numbers.
     pattern = r"Frame Time:\s*((?:\d{1,9}(?:\.\d{1,30})?|\.\d{1,30})(?:E[-+]?\d{1,3})?)"
     seconds = source.labeled(pattern, "Frame Time: and a number of seconds")
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:
         source.fail(f"the frame time must be between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
-    # A rounded time (0.0333333 for 1/30) means an integer rate. Otherwise, resampling could move
-    # the last frame past the end.
+    # A rounded time (0.0333333 for 1/30) stands for an integer rate. Otherwise, resampling could
+    # move the last frame past the end.
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     width = sum(len(node.channels) for node in nodes)
@@ -244,7 +245,7 @@ class Lines:
             for number, line in enumerate(lines, 1)
             if not line.startswith("#")
         )
-        # Words of the current line that are not read yet, in reverse order
+        # Words of the current line that have not been read yet, in reverse order
         self.pending: list[str] = []
 
     def __iter__(self) -> Iterator[list[str]]:

@@ -54,7 +54,7 @@ def character_clip(character: Character, motion: PosedFigure, name: str) -> Rigg
 
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the names. A number is appended to a repeated name."""
+    """Returns the names. A number is appended to each repeated name."""
     counts: dict[str, int] = {}
     distinct = []
     for name in names:
@@ -151,7 +151,7 @@ def _normals(
 ) -> np.ndarray:
     """Returns the normals (V, 3) of a mesh.
 
-    If no normals are stored, these are the mean normals of the adjacent triangles.
+    If the file stores no normals, the mean normals of the adjacent triangles are used.
     """
     if "NORMAL" in attributes:
         return glb.numbers(file, attributes["NORMAL"], "VEC3")
@@ -179,7 +179,7 @@ def _material(file: glb.Glb, number: int) -> Material:
 def _image(file: glb.Glb, number: int | None) -> bytes:
     """Returns an image in the file as PNG or JPEG.
 
-    Returns b"" if the image is outside of the file, or of another kind.
+    Returns b"" if the image is outside the file, or is of another type.
     """
     if number is None:
         return b""

@@ -1,12 +1,12 @@
-"""Motions on a user's character: a skinned .glb file, or the skeleton of a .bvh file.
+"""Motions on a user's character, which is a skinned .glb file or the skeleton of a .bvh file.
 
 The proportions, units, axes, names and rest pose of a character may differ from SMPL's body. The
 rest pose must be upright with flat feet.
 
 Arms and legs take the directions of the motion's bones. Trunk, head, hands and feet are turned as
-in the motion, starting from the rest pose. The path of the hips is scaled by the leg length. Then
-the legs are bent so that the toes reach the motion's toe positions, which are scaled in the same
-way. The toes are at the character's own height.
+in the motion, relative to the rest pose. The path of the hips is scaled by the leg length. Then the
+legs are bent so that the toes reach the motion's toe positions, which are scaled in the same way.
+The height of the toes is the character's own toe height.
 """
 
 import copy
@@ -33,14 +33,14 @@ from flame_mdm.safe_io import read_yaml
 
 @dataclass(frozen=True, eq=False)
 class Character(RestPose):
-    """A character with a skin and its .glb file."""
+    """A character with a skin, and its .glb file."""
 
     file: glb.Glb
 
 
 @dataclass(frozen=True, eq=False)
 class BvhCharacter(RestPose):
-    """A character without meshes and its .bvh file."""
+    """A character without meshes, and its .bvh file."""
 
     file: bvh.Bvh
 
@@ -48,13 +48,13 @@ class BvhCharacter(RestPose):
 def read(path: str | Path) -> Character | BvhCharacter:
     """Reads a character.
 
-    Its joints must have the names of a known skeleton, or the names in a `.yaml` file with the
-    same name as the character's file.
+    The names of its joints must be the names of a known skeleton, or the names in a `.yaml` file
+    with the same name as the character's file.
 
     Raises:
-        UserError: If the file is damaged, a .glb file has no skin, or there is no usable rest
-            pose.
-        UnknownJoints: If joints are not known.
+        UserError: If the file is damaged, if a .glb file contains no skin, or if there is no usable
+            rest pose.
+        UnknownJoints: If joints cannot be identified.
     """
     path = Path(path)
     return _read_bvh(path) if path.suffix.lower() == ".bvh" else read_skinned(path)
@@ -63,7 +63,7 @@ def read(path: str | Path) -> Character | BvhCharacter:
 def _read_bvh(path: Path) -> BvhCharacter:
     """Reads the skeleton of a BVH file.
 
-    The rest pose is the pose without rotations or, if that is not usable, the first frame.
+    The rest pose is the pose without rotations or, if this pose is not usable, the first frame.
     """
     file = bvh.read(path)
     joints = identify(
@@ -92,7 +92,7 @@ def _read_bvh(path: Path) -> BvhCharacter:
                 path, file.joints, file.parents, positions, turned, joints, positions, up
             )
             return BvhCharacter(pose.rig, pose.map, pose.floor, file)
-        except UserError as error:  # many files are upright only in their first frame
+        except UserError as error:  # in many files, only the first frame is upright
             problem = problem or error
     raise problem or AssertionError
 
@@ -159,10 +159,10 @@ def read_skinned(path: Path) -> Character:
 
 
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the pose in which the skin was bound, and corners around its meshes.
+    """Returns the pose in which the skin was bound, and the corners of a box around its meshes.
 
-    The pose is matrices (N, 4, 4) of nodes. If the nodes are stored in another pose, the pelvis,
-    which is nearly upright, shows how the frame of the skin is turned.
+    The pose consists of matrices (N, 4, 4) of the nodes. If the nodes are stored in another pose,
+    the pelvis, which is nearly upright, determines how the coordinates of the skin are turned.
     """
     # If the file is stored in the bind pose, joint matrix times inverse bind matrix is the same
     # for all joints. Otherwise, this product of the pelvis, with its rotation rounded to quarter
@@ -191,7 +191,7 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndarray, Rig]:
-    """Moves a character like a motion; see `follow`."""
+    """Applies a motion to a character; see `follow`."""
     body = fit_body(motion)
     joints = motion.joints[:, : len(SMPL22)]
     world = world_rotations(local_rotations(body)) @ body.neutral
@@ -199,9 +199,9 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 
 
 class UnknownJoints(UserError):
-    """The error for joints that could not be identified.
+    """Error for joints that cannot be identified.
 
-    `template` contains the lines of a file of names that the user can complete.
+    `template` contains the lines of a file of names, which the user can complete.
     """
 
     def __init__(self, message: str, template: list[str]):
@@ -210,12 +210,12 @@ class UnknownJoints(UserError):
 
 
 def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
-    """Returns the number of the character's joint for each joint of SMPL.
+    """Returns the number of the character's joint for each SMPL joint.
 
-    `names` are the names of the character's joints by number.
+    `names` contains the names of the character's joints by number.
 
     Raises:
-        UnknownJoints: If joints are missing.
+        UnknownJoints: If a joint cannot be identified.
     """
     listed = path.with_suffix(".yaml")
     chosen = read_yaml(listed) if listed.exists() else None
@@ -266,7 +266,7 @@ def _listed(
 
 @cache
 def known_skeletons() -> list[dict[str, str]]:
-    """Returns, for each supported skeleton, the SMPL joint by spelling of a bone's name."""
+    """Returns a mapping from bone names to SMPL joints for each supported skeleton."""
     skeletons = []
     for layout in LAYOUTS.values():
         joints = {name: joint for joint, name in layout.bones.items()}
@@ -328,7 +328,7 @@ def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
         )
     file, (world, positions, rig) = character.file, moved(character, motion)
     local, offsets, hips = rig.local(world), rig.offsets(), rig.hips
-    # The joint that moves the body is the hips, or a root above them.
+    # The joint that moves the body is the hips joint, or a root above it.
     mover = next(joint for joint, names in _above(file, hips).items() if _moves(names))
     carried = rig.within(rig.positions[mover] + positions[:, hips] - rig.positions[hips], mover)
 

@@ -1,15 +1,15 @@
-"""Checks of motions on SMPL's joints: size, feet, the axis up, flipped legs, and rest poses."""
+"""Checks of motions on SMPL's joints: body size, feet, up axis, flipped legs, and rest poses."""
 
 import numpy as np
 
 from flame_mdm.formats.layouts import UP, Layout, check_feet, check_size
 from flame_mdm.representations.skeleton import SMPL22
 
-# A body lies if the mean vertical component of its trunk direction is smaller than this.
+# A body lies if the mean vertical component of its trunk direction is smaller than this
 LYING = 0.3
 # With another axis up, a body stands if the component is larger than this
 STANDING = 0.7
-# Maximum speed of the pelvis in m/s; faster files are damaged, sprinters reach 12
+# Maximum speed of the pelvis in m/s. Sprinters reach 12; files with higher speeds are damaged.
 FASTEST = 15.0
 # Seconds over which the speed of the pelvis is averaged
 AVERAGED = 0.05
@@ -23,8 +23,8 @@ UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is report
 BLEND = 0.04
 # Number of subsequent frames with which the first steps are compared
 CALM = 8
-# Minimum length in meters of the step from a rest pose to the motion, and minimum ratio to the
-# following steps
+# Minimum length in meters of the step from a rest pose to the motion, and minimum ratio of this
+# step to the following steps
 JUMP = (
     0.15,
     3.0,
@@ -40,14 +40,14 @@ _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 
 
 def check_body(joints: np.ndarray, layout: Layout) -> None:
-    """Checks that joints (F, 22, 3) are a person.
+    """Checks that joints (F, 22, 3) form a human body.
 
-    The `layout` of the file contains its unit, its axis that points up, and whether the body may
-    be a child's. If the size is wrong and the body lies, the message names both the unit and the
-    axis, so that one correction of the file is enough.
+    The `layout` of the file contains its unit, its up axis, and whether the body may be a child's.
+    If the size is wrong and the body lies, the message names both the unit and the axis, so that
+    the file needs only one correction.
 
     Raises:
-        UserError: If the size is wrong, a foot has no length, or the feet point backwards.
+        UserError: If the size is wrong, if a foot has no length, or if the feet point backwards.
     """
     doubt = lying(joints, layout.up, np.array(UP[layout.up], float))
     check_size(joints, layout.unit, layout.children, doubt)
@@ -55,18 +55,18 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
 
 
 def uprightness(joints: np.ndarray) -> float:
-    """Returns the mean vertical component of the direction of the trunk, -1 to 1.
+    """Returns the mean vertical component of the trunk direction, from -1 to 1.
 
-    `joints` (F, 22, 3) are y up.
+    `joints` (F, 22, 3) have y up.
     """
     return float(_trunk(joints)[:, 1].mean())
 
 
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
-    """Returns a line if the body lies in most frames, with the axis that would make it stand.
+    """Returns a message if the body lies in most frames, with the axis that would make it stand.
 
-    Returns "" otherwise. `joints` (F, 22, 3) are y up. The joints were turned by `axes` (3, 3)
-    from the axes of the file. In the file, `up` was the axis that points up.
+    Returns "" otherwise. `joints` (F, 22, 3) have y up. They were converted from the axes of the
+    file by `axes` (3, 3). `up` is the up axis of the file.
     """
     if uprightness(joints) >= LYING:
         return ""
@@ -81,12 +81,12 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
 
 
 def jump(joints: np.ndarray, fps: float) -> str:
-    """Returns a line if the pelvis or a leg moves faster than people do; otherwise "".
+    """Returns a message if the pelvis or a leg moves faster than people do; otherwise "".
 
     `joints` are (F, 22, 3).
     """
     ankles = joints[:, [_NUMBER["left_ankle"], _NUMBER["right_ankle"]]] - joints[:, :1]
-    # A body that shakes for a frame does not jump, but a leg can flip within a frame.
+    # A body that shakes for one frame does not jump, but a leg can flip within a frame.
     apart = max(1, round(fps * AVERAGED))
     for verb, points, frames, fastest in (
         ("the body jumps", joints[:, :1], apart, FASTEST),
@@ -104,9 +104,9 @@ def jump(joints: np.ndarray, fps: float) -> str:
 
 
 def below_floor(joints: np.ndarray) -> str:
-    """Returns a line if a body with the bones of an adult is below the floor; otherwise "".
+    """Returns a message if a body with the bones of an adult is below the floor; otherwise "".
 
-    This happens if the body in the file is smaller.
+    This happens if the body in the file is smaller than an adult.
     """
     lowest = float(np.median(joints[..., 1].min(1)))
     if lowest > -UNDER:
@@ -116,10 +116,10 @@ def below_floor(joints: np.ndarray) -> str:
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:
-    """Returns the number of frames in front of a motion that show a rest pose or lead from it.
+    """Returns the number of frames in front of a motion that show a rest pose, or lead from it to the motion.
 
-    Several programs write a T-pose or A-pose as the first frame. If a recorded motion begins with
-    a rest pose instead, its first step is not longer than the following steps.
+    Several programs write a T-pose or A-pose as the first frame. In a recorded motion that begins
+    with a rest pose, the first step is not longer than the following steps.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0
@@ -133,7 +133,7 @@ def rest_frames(joints: np.ndarray, fps: float) -> int:
 
 
 def _is_rest_pose(pose: np.ndarray) -> bool:
-    """Returns whether joints (22, 3) stand with straight legs and straight arms.
+    """Returns whether joints (22, 3) show a person who stands with straight legs and straight arms.
 
     Both arms must be raised equally.
     """
@@ -146,7 +146,7 @@ def _is_rest_pose(pose: np.ndarray) -> bool:
             if upper @ lower < STRAIGHT:
                 return False
             raised.append(-upper @ trunk)
-    # cosines of the angles to the direction down the trunk
+    # Cosines of the angles to the downward direction of the trunk
     left_arm, left_leg, right_arm, right_leg = raised
     legs_hang = min(left_leg, right_leg) > STRAIGHT
     return bool(

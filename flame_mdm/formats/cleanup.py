@@ -1,6 +1,6 @@
 """Cleanup of generated motion.
 
-Cleanup smooths joints, makes bone lengths constant, keeps feet in place, and moves hands out of
+Cleanup smooths the joints, makes bone lengths constant, keeps feet in place, and moves hands out of
 the body.
 """
 
@@ -18,10 +18,10 @@ from flame_mdm.formats.poses import BoneRotations
 from flame_mdm.representations.skeleton import Skeleton
 
 # Weight of the squared third differences of a joint's path, relative to the squared change of the
-# path. Third differences are changes of acceleration, so steady accelerations of fast motions are
-# kept.
+# path. Third differences are changes of acceleration, so the steady accelerations of fast motions
+# are preserved.
 SMOOTHNESS = 0.034
-# Distance in meters from the smooth path at which a position has half its weight
+# Distance in meters from the smooth path at which the weight of a position is halved
 OUTLIER = 0.03
 # Height in meters above which a toe counts as off the floor
 LOW = 0.07
@@ -39,22 +39,22 @@ DRIFT = 0.2
 
 Above 1.5 times this speed, the body follows its feet entirely.
 """
-# A hand starts to avoid the body this many seconds before it would be inside
+# A hand begins to avoid the body this many seconds before it would enter the body
 CLEAR = 0.15
-# Maximum distance from hip to ankle, relative to the straight leg, unless it was longer before
+# Maximum distance from hip to ankle, relative to the straight leg, unless it was already longer
 REACH = 0.999
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
     """Returns a motion with smooth joints, constant bone lengths and feet that do not slide.
 
-    `cleanup` describes the changes of the joints. The result has no features, rotations and
+    `cleanup` describes the changes of the joints. The result has no features, rotations or
     contacts, because they would no longer match the joints.
 
     Args:
         motion: the motion.
-        contacts: (F, N) probabilities that each of `skeleton.feet` stands on the floor. None =
-            they are estimated.
+        contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor. Default:
+            estimated from the joints.
 
     Example:
         >>> motion = Motion(joints=np.zeros((3, 22, 3)), fps=20)
@@ -78,23 +78,23 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 def cleanup(
     joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None
 ) -> np.ndarray:
-    """Removes pops, changes of bone lengths, sliding feet and hands inside the body.
+    """Removes pops, changes of bone lengths, foot sliding, and hands inside the body.
 
     Args:
         joints: (F, J, 3) in meters, y up. Motions of fewer than 4 frames are returned unchanged.
         fps: frames per second.
         skeleton: skeleton of the joints.
-        contacts: (F, N), probabilities that each of `skeleton.feet` stands on the floor until the
-            next frame. For some representations, models predict these probabilities. None = they
-            are estimated from height and speed of the toes.
+        contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor until the next
+            frame. With some representations, models predict these probabilities. None = they are
+            estimated from the height and speed of the toes.
 
     Returns:
         Joints (F, J, 3) float32.
     """
-    # Joints get smooth paths, and bones get their median lengths. Then the body moves over the
-    # ground so that its feet in contact stand still on average. The rest of the sliding is
-    # corrected by two-bone inverse kinematics: legs keep each toe in place during its contacts,
-    # and arms leave trunk and thighs.
+    # Joints get smooth paths, and bones get their median lengths. Then the body is moved over the
+    # ground so that its feet in contact stand still on average. The remaining sliding is corrected
+    # by two-bone inverse kinematics: the legs keep each toe in place during its contacts. Inverse
+    # kinematics also moves the arms out of the trunk and thighs.
     if len(joints) < 4:
         return np.array(joints, np.float32)
     smooth = _smooth(np.asarray(joints, float))
@@ -148,11 +148,11 @@ def _least_squares(
 def _smooth(motion: np.ndarray) -> np.ndarray:
     """Returns smooth paths of the joints (Whittaker 1923).
 
-    Positions that jump for a few frames hardly influence them.
+    Positions that jump for a few frames have little influence on the paths.
     """
-    # After each fit, positions far from the path lose weight, as in iteratively reweighted least
-    # squares. A pop of a few frames is cut off instead of being spread over its neighbors. Four
-    # fits are enough.
+    # After each fit, positions far from the path get a lower weight, as in iteratively reweighted
+    # least squares. A pop of a few frames is thus cut off instead of being spread over its
+    # neighbors. Four fits are sufficient.
     smooth = motion.copy()
     for joint in range(motion.shape[1]):
         path, weight = motion[:, joint], np.ones(len(motion))
@@ -163,7 +163,7 @@ def _smooth(motion: np.ndarray) -> np.ndarray:
 
 
 def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Returns the motion with bones in the same directions, but with their median lengths."""
+    """Returns the motion with the same bone directions and with median bone lengths."""
     out = motion.copy()
     for parent, joint in skeleton.edges:
         bone = motion[:, joint] - motion[:, parent]
@@ -173,10 +173,11 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
-    """Bends limbs whose foot or hand has become lower because bones got their median lengths.
+    """Bends limbs whose foot or hand is lower because bones got their median lengths.
 
     Between two very different poses of a sequence, for example from a crawl to a walk, the poses
-    are means of both and have short bones. With full lengths, they would reach through the floor.
+    are averages of both and have short bones. With full lengths, they would reach through the
+    floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):
@@ -189,7 +190,7 @@ def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) ->
 
 
 def _arm(skeleton: Skeleton, side: str) -> list[int]:
-    """Returns shoulder, elbow, wrist and, if the skeleton has one, hand of a side."""
+    """Returns shoulder, elbow, wrist and, if the skeleton has one, hand of one side."""
     arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
     return arm + [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
 
@@ -197,7 +198,7 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
     """Returns the confidence (F - 1, 2) in [0, 1] that each toe stays on the floor.
 
-    The confidence of a frame is for the time until the next frame. `toes` are (F, 2, 3).
+    The confidence of a frame refers to the time until the next frame. `toes` are (F, 2, 3).
     """
     # A toe is on the floor if it is both low and slow. The faster the body travels, the faster a
     # toe may slide, because feet of generated motions are carried along with the body.
@@ -213,12 +214,13 @@ def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> n
 def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     """Moves the body over the ground so that its feet in contact stand still on average."""
     # The drift of the body is the mean sliding of the feet in contact. It is smooth in time, and
-    # almost 0 while no foot is in contact. These feet stand still after the drift is subtracted
-    # from the path of the root.
+    # almost 0 while no foot is in contact. Once the drift is subtracted from the root trajectory,
+    # these feet stand still.
     slides = np.diff(motion[:, toes], axis=0)[..., [0, 2]]
     contact = weights = _contacts(motion[:, toes], motion[:, 0], fps, SHARE)
     drift = np.zeros((len(slides), 2))
-    # Feet that move differently from the mean lose weight, until one foot determines the drift.
+    # Feet that move differently from the mean get a lower weight, until one foot determines the
+    # drift.
     for _ in range(10):
         mean = (weights[..., None] * slides).sum(1) / np.maximum(weights.sum(1), 1e-9)[:, None]
         drift = _least_squares(
@@ -235,14 +237,14 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
 
 
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
-    """Moves a wrist away from the axis of trunk or thigh until wrist and hand are not inside."""
+    """Moves a wrist away from the axis of the trunk or thigh until wrist and hand are outside the body."""
     arm = _arm(skeleton, side)
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
-    # A hand near the axis goes to its own side
+    # A hand near the axis is moved to its own side
     aside = unit(motion[:, arm[0]] - motion[:, other])
-    # Each pass moves the wrist out of the deepest point. The shift rises and fades within `CLEAR`
-    # seconds, so the hand avoids the body and does not jump out of it.
+    # Each pass moves the wrist out of its deepest point. The shift fades in and out within `CLEAR`
+    # seconds, so that the hand avoids the body instead of jumping out of it.
     for _ in range(4):
         depth, away = (values[:, 1:] for values in depths(motion, skeleton.joints, side))
         deepest = depth.argmax(1)[:, None]
@@ -258,9 +260,9 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 
 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
-    """Moves the foot of a leg by `shift` (F, 3). Hands of arms work in the same way.
+    """Moves the foot of a leg by `shift` (F, 3). Hands are moved in the same way.
 
-    `leg` is hip, knee, ankle and other joints of the foot.
+    `leg` contains hip, knee, ankle and other joints of the foot.
     """
     # This is two-bone inverse kinematics. The new ankle is on the line from the hip to the
     # requested position, as far as the leg can reach. Thigh, shin and this line are a triangle,

@@ -1,4 +1,4 @@
-"""Conversion of motions to joints or SMPL's rotations, which representations encode."""
+"""Conversion of motions to joints or SMPL rotations, the input of representations."""
 
 from dataclasses import dataclass
 
@@ -17,13 +17,13 @@ from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL
 
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-"""Rotation from the camera coordinates of the action data sets, y down, to y up.
+"""Rotation from the camera coordinates of the action data sets (y down) to y up.
 
 It is its own inverse.
 """
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
-"""SMPL joint at the same point of the body, for KIT-ML joints with other names."""
+"""SMPL joint at the same location of the body, for KIT-ML joints with other names."""
 LEGS = tuple(
     SMPL22.joints.index(f"{side}_{name}")
     for side in ("left", "right")
@@ -33,13 +33,14 @@ LEGS = tuple(
 
 @dataclass(frozen=True, eq=False)
 class RawMotion:
-    """A motion that `Representation.encode` takes.
+    """A motion in the form that `Representation.encode` accepts.
 
     Attributes:
-        values: joints (F, J, 3) in meters, y up, or rotations of SMPL (F, 75) as in
+        values: joints (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
-        note: a line for the user if a body with other proportions was used, with the error; ""
-            otherwise. The line says whether the rotations come from the file or were fitted to
+        note: a line for the user if a body with other proportions was used, with the error;
+            otherwise "". The line says whether the rotations come from the file or were fitted to
+            the joints.
             joints.
         error: mean distance in meters between the joints of this body and of the motion.
     """
@@ -50,20 +51,20 @@ class RawMotion:
 
 
 def needs_rotations(representation: Representation) -> bool:
-    """Returns whether a representation encodes SMPL's rotations instead of joint positions."""
+    """Returns whether a representation encodes SMPL rotations instead of joint positions."""
     return isinstance(representation, SMPL | Rot6D | Motion272)
 
 
 def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
-    """Returns a motion in the form and at the frame rate of a representation.
+    """Converts a motion to the form and frame rate of a representation.
 
     Joints are resampled with cubic splines, and rotations on the sphere. KIT-ML's 21 joints are
-    taken from SMPL's joints. If rotations of SMPL are not known, they are taken from the bones of
-    the file or, without bones, fitted to the joints. The body then has the bones of an adult, and
-    its path is scaled by the length of the legs.
+    computed from SMPL's joints. If SMPL rotations are not known, they are computed from the bones
+    of the file or, without bones, fitted to the joints. The body then has the bones of an adult,
+    and its path is scaled by the leg length.
 
     Raises:
-        UserError: If the skeleton of the motion does not fit the representation.
+        UserError: If the representation cannot encode the skeleton of the motion.
     """
     if needs_rotations(representation):
         axes = CAMERA_AXES if isinstance(representation, Rot6D) else AMASS_AXES
@@ -80,7 +81,7 @@ def kit_joints(joints: np.ndarray) -> np.ndarray:
     """Converts joints (F, 22 or more, 3) of SMPL to the 21 joints (F, 21, 3) of KIT-ML.
 
     The result is mirrored, like KIT-ML. The middle of a foot in KIT-ML is placed halfway between
-    ankle and toes.
+    the ankle and the toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     feet = {
@@ -93,7 +94,7 @@ def kit_joints(joints: np.ndarray) -> np.ndarray:
 
 
 def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
-    """Returns rotations of SMPL in coordinates that `axes` (3, 3) converts to y up."""
+    """Returns SMPL rotations in coordinates that `axes` (3, 3) converts to y up."""
     if motion.skeleton.joints[: len(SMPL22)] != SMPL22.joints:
         raise UserError(
             f"the model needs rotations of SMPL's joints, but {motion.skeleton.name} does not determine them. Give a "
@@ -125,11 +126,11 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
 
 
 def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
-    """Puts a motion on the body of an adult. The path is scaled by the length of the legs.
+    """Transfers a motion to the body of an adult. The path is scaled by the leg length.
 
     Args:
         body: the motion on the bones of its own body.
-        joints: (F, 22, 3), its joints in meters.
+        joints: (F, 22, 3), joints of the motion in meters.
 
     Returns:
         The poses, and the distances (F, 22) in meters of their joints from the scaled `joints`.

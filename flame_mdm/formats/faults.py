@@ -9,11 +9,11 @@ from scipy.ndimage import binary_opening
 
 from flame_mdm.formats.motion import Motion
 
-# Height in meters above the floor, y = 0, below which a toe joint touches it. Foot skating uses
-# the same height.
+# Height in meters above the floor, y = 0, below which a toe joint is in contact. The foot skating
+# metric uses the same height.
 LOW = 0.05
-# A body in the air whose root is slower than this, in m/s, floats and does not jump. A jump is
-# also slower at its top, but only for 0.04 s.
+# A body in the air floats instead of jumping if its root is slower than this, in m/s. In a jump,
+# the root is also slow at the top, but only for 0.04 s.
 STANDSTILL = 0.2
 LIMITS = {
     "skating": (
@@ -53,8 +53,8 @@ LIMITS = {
 
 docs/motion-faults.md reports the share of real clips with each fault.
 """
-# Distance from the wrist to the middle of the hand, relative to the forearm. The hand is assumed
-# to continue the direction of the forearm.
+# Distance from the wrist to the middle of the hand, relative to the length of the forearm. The hand
+# is assumed to continue in the direction of the forearm.
 PALM = 0.3
 # Radius of the trunk from front to back, relative to its length from pelvis to neck
 TRUNK = 0.18
@@ -97,11 +97,12 @@ def find_faults(motion: Motion) -> list[Fault]:
     low = joints[:, toes, 1] < LOW
     travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
     slides[:-1, toes] = travel * (low[1:] & low[:-1])
-    # This is an acceleration: the distance of a joint from the middle between its neighbors in
+    # This is an acceleration: the distance of a joint from the midpoint between its neighbors in
     # time.
     jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
-    # Opening a flag in time keeps only runs that are at least as long as the window.
+    # An opening (morphology) of a flag in time keeps only runs that are at least as long as the
+    # window.
     floats = [
         binary_opening(flag, np.ones((math.ceil(s * fps), 1)))
         for s, flag in ((0.8, aloft), (0.3, aloft & slow))
@@ -128,8 +129,8 @@ def _runs(
 ) -> list[Fault]:
     """Returns the runs of at least `frames` frames.
 
-    A frame belongs to a run if its flag (F, J) is set or, without flags, if its value (F, J) is
-    above the limit.
+    A frame belongs to a run if its flag (F, J) is set or, without flags, if its value (F, J)
+    exceeds the limit.
     """
     runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
     for joint in np.flatnonzero(flags.any(0)).tolist():
@@ -157,7 +158,7 @@ def _stretched(
 
 
 def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Returns how deep elbows and wrists are in the body. The hand counts as the wrist."""
+    """Returns how deep elbows and wrists are inside the body. The hand counts as the wrist."""
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
@@ -188,8 +189,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
                 toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
                 tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
-                # The front is undefined if the foot points straight down, so such frames do not
-                # count.
+                # The front is undefined if the foot points straight down, so such frames are
+                # ignored.
                 forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])
@@ -197,9 +198,10 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures how deep an arm is in the body.
+    """Measures how deep an arm is inside the body.
 
-    The body consists of capsules for the trunk and the thighs, whose sizes follow from the bones.
+    The body consists of capsules for the trunk and the thighs, whose sizes are derived from the
+    bones.
 
     Args:
         joints: (F, J, 3) in meters.
@@ -207,9 +209,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        Depth (F, 3) in meters of elbow, wrist and middle of the hand, negative outside. Also unit
-            vectors (F, 3, 3) to the points, from the axis of the part in which each point is
-            deepest.
+        Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand; negative outside
+        the body. Also unit vectors (F, 3, 3) to these points, from the axis of the part in which
+        each point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
@@ -219,8 +221,8 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         (joints[:, 0], at["neck"]),
         *((at[f"{leg}_hip"], at[f"{leg}_knee"]) for leg in ("left", "right")),
     ]
-    # The trunk is wider than deep. Sideways distances from its axis are shortened, so that the
-    # same capsule can be used in all directions.
+    # The trunk is wider than it is deep. Sideways distances from its axis are shortened, so that
+    # the same capsule can be used in all directions.
     away = [_away(points, start, end) for start, end in bones]
     lateral = (away[0] * across[:, None]).sum(-1, keepdims=True) * across[:, None]
     away[0] = away[0] - (1 - 1 / WIDTH) * lateral
@@ -247,5 +249,5 @@ def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Returns vectors (..., 3) scaled to norm 1. A vector without length becomes 0."""
+    """Returns vectors (..., 3) scaled to norm 1. Zero vectors remain 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

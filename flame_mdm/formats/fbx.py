@@ -2,10 +2,10 @@
 
 `fbx_scene` reads motions from these trees, and `fbx_writer` writes motions as such trees.
 
-Autodesk does not publish the format. The layout of records, arrays and the end of the file
+Autodesk does not publish the format. The layout of the records, the arrays and the end of the file
 follows the description of the Blender Foundation
-(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files of Autodesk's
-own SDK. A record has a name, properties and nested records. Numbers are little-endian.
+(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files of Autodesk's own
+SDK. A record has a name, properties and nested records. Numbers are little-endian.
 """
 
 import struct
@@ -74,7 +74,7 @@ class Record:
             integers.
         children: nested records.
         block: whether a terminator follows the children even if there are none. Some readers
-            need it.
+            require it.
     """
 
     name: str
@@ -89,15 +89,15 @@ class Record:
         return record
 
     def all(self, name: str) -> Iterator["Record"]:
-        """Yields the nested records with a name."""
+        """Yields the nested records with the given name."""
         return (record for record in self.children if record.name == name)
 
     def first(self, name: str) -> "Record | None":
-        """Returns the first nested record with a name, or None."""
+        """Returns the first nested record with the given name, or None."""
         return next(self.all(name), None)
 
     def value(self, name: str, default: Any = None) -> Any:
-        """Returns the first property of the first nested record with a name, or `default`."""
+        """Returns the first property of the first nested record with the given name, or `default`."""
         record = self.first(name)
         if record is None or not record.properties:
             return default
@@ -141,7 +141,7 @@ def read(path: Path) -> Record:
 
 
 class _Reader:
-    """Parses the records of a file and counts their size."""
+    """Parses the records of a file and limits their total size."""
 
     def __init__(self, content: bytes, version: int) -> None:
         self.content = content
@@ -216,7 +216,7 @@ class _Reader:
             raise ValueError(f"its arrays have more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
-            # One byte more than declared is unpacked, to detect arrays that are too long.
+            # One more byte than declared is decompressed, to detect arrays that are too long.
             packed = unpacker.decompress(packed, size + 1)
         elif encoding != 0:
             raise ValueError(f"an array has the unknown encoding {encoding}")

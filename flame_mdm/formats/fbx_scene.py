@@ -59,9 +59,9 @@ TIME_MODES = {
 
 # Bits of `KeyAttrFlags`; without them, interpolation is linear
 CONSTANT, CUBIC = 0x2, 0x8
-# Bit of a constant segment that has the value of the key after it
+# Bit of a constant segment with the value of the key after it
 NEXT_VALUE = 0x100
-# A frame takes the value of a key that is up to this many seconds later
+# A frame takes the value of a key that is up to this many seconds after the frame
 UNSTEPPED = 1e-6
 
 ZERO, ONE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -75,7 +75,7 @@ class Curve:
         times: (K,) in seconds, increasing.
         values: (K,).
         flags: (K,), interpolation from each key to the next.
-        slopes: (K, 2), change per second after each key and before the next one, for cubic
+        slopes: (K, 2), change per second after each key and before the next key, for cubic
             segments.
     """
 
@@ -87,7 +87,7 @@ class Curve:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F,) at times (F,) in seconds.
 
-        Before the first and after the last key, the value of the key is held.
+        Before the first key and after the last key, the value of this key is held.
         """
         if len(self.times) == 1:
             return np.full(len(times), self.values[0])
@@ -182,12 +182,11 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the take, or its number, counted from 1. None = the first one with
-            keys.
+        animation: name of the take, or its number, counted from 1. None = the first take with keys.
 
     Raises:
-        UserError: If the file is damaged, has no animation, or has several animation layers with
-            keys.
+        UserError: If the file is damaged, contains no animation, or contains several animation
+            layers with keys.
     """
     root = fbx.read(path)
     try:
@@ -327,7 +326,7 @@ class _Scene:
         return CENTIMETER * (scale if 0 < scale < LARGEST else 1)
 
     def _axes(self) -> np.ndarray:
-        """Returns the rotation (3, 3) from the axes of the file to x left, y up, z ahead."""
+        """Returns the rotation (3, 3) from the axes of the file to x left, y up and z ahead."""
         axes = np.zeros((3, 3))
         for row, name, usual in ((0, "Coord", 0), (1, "Up", 1), (2, "Front", 2)):
             axis = int(self._setting(f"{name}Axis", usual))
@@ -347,7 +346,7 @@ def _is_object(record: fbx.Record) -> bool:
 def _name(record: fbx.Record) -> str:
     """Returns the name of an object.
 
-    The file stores the name together with the class of the object.
+    The file stores the name together with the object's class.
     """
     name = record.properties[1]
     return str(name).partition("\x00")[0] or record.name

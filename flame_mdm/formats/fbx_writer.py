@@ -1,9 +1,9 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files of Autodesk's FBX SDK. Programs need different details.
+The structure of the scene follows files of Autodesk's FBX SDK. Programs require different details.
 If a reader fails without a detail, a comment names this reader. The bones are at the top level,
 because Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in
-`PreRotation`, so rotations of 0 are the rest pose in every program.
+`PreRotation`, so that rotations of 0 are the rest pose in every program.
 """
 
 from collections import Counter
@@ -24,7 +24,7 @@ from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 PER_METER = 100
 # `TimeMode` of a rate in `CustomFrameRate`
 CUSTOM_RATE = 14
-# A fixed time, so that equal motions give equal files. Readers compare it with `FileId`.
+# A fixed time, so that identical motions give identical files. Readers compare it with `FileId`.
 CREATED = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
 # R = Rz Ry Rx, the order that FBX calls eEulerXYZ

@@ -63,16 +63,16 @@ class _Writer:
         for skin in clip.skins:
             poses |= self._mesh(skin, bones, materials)
         if poses and clip.root >= 0:
-            # three.js takes the position of the root from the bind pose. Therefore the root is
-            # also moved there.
+            # three.js takes the position of the root from the bind pose, so the root is moved there
+            # as well.
             poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK
         if poses:
             self._bind_pose(poses)
         self._animation(bones, duration)
 
-        # A file has this order: header, settings, documents, definitions, objects, connections,
-        # takes. Objects are a flat list. Connections by id form a tree whose root, id 0, is the
-        # scene.
+        # A file contains, in this order: header, settings, documents, definitions, objects,
+        # connections, takes. The objects form a flat list. Connections between ids form a tree
+        # whose root is the scene, with id 0.
         root = Record("")
         _header(root)
         root.children.append(_settings(clip.fps, duration))
@@ -111,7 +111,7 @@ class _Writer:
     def _lifted(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
         """Returns the offsets (J, 3) and the moves of the clip in centimeters.
 
-        The person stands on its soles. A root on the floor is moved back by `ROOT_BACK`, and the
+        The person stands on the soles. A root on the floor is moved back by `ROOT_BACK`, and the
         hips are moved forward by the same distance.
         """
         clip = self.clip
@@ -128,8 +128,9 @@ class _Writer:
 
     def _skeleton(self) -> list[int]:
         """Adds the bones in the rest pose and returns their ids."""
-        # Each bone is a Model, which has the transform, and a NodeAttribute, which marks it as a
-        # bone. The rest pose is the PreRotation, so that the animated rotation is 0 at rest.
+        # Each bone is a Model, which contains the transform, and a NodeAttribute, which marks it as
+        # a bone. The rest pose is stored as PreRotation, so that the animated rotation is 0 at
+        # rest.
         clip, bones = self.clip, []
         before = _degrees(clip.rest[None])[0]
         for joint, name in enumerate(clip.joints):
@@ -151,11 +152,11 @@ class _Writer:
     ) -> dict[int, np.ndarray]:
         """Adds a mesh in its bind pose, with its materials and its skin.
 
-        `materials` contains the ids of the materials that the file has so far. Returns the matrix
-        (4, 4) of each object in the bind pose, by id.
+        `materials` contains the ids of the materials written so far. Returns the matrix (4, 4) of
+        each object in the bind pose, by id.
         """
-        # A Geometry has the vertices, and a Model places it. A Skin deforms the geometry with one
-        # Cluster per bone. A cluster contains its vertices, their weights, and the matrices of
+        # A Geometry contains the vertices, and a Model places it. A Skin deforms the geometry with
+        # one Cluster per bone. A cluster contains its vertices, their weights, and the matrices of
         # mesh and bone in the bind pose.
         geometry, record = self._object("Geometry", skin.name, "Mesh")
         _geometry(record, skin)
@@ -235,7 +236,7 @@ class _Writer:
         """Adds one key per frame for all rotations, and for the positions of moving bones."""
         clip = self.clip
         stack, record = self._object("AnimationStack", clip.name, "", "AnimStack")
-        record.block = True  # without a block, assimp finds no animation
+        record.block = True  # without a block, assimp does not find the animation
         properties = record.add("Properties70")
         for name, value in (("LocalStop", duration), ("ReferenceStop", duration)):
             properties.add("P", name, "KTime", "Time", "", value)
@@ -249,7 +250,7 @@ class _Writer:
             self._curves(layer, bone, "Lcl Rotation", "R", times, angles[:, joint])
         for joint, moved in self.moves.items():
             self._curves(layer, bones[joint], "Lcl Translation", "T", times, moved)
-        # Unreal imports such properties of a bone as curves.
+        # Unreal imports bone properties of this kind as curves.
         for name, (changes, planted) in clip.contact_changes().items():
             values = planted[:, None].astype(float)
             self._curves(layer, bones[0], name, name, times[changes], values, (name,), HELD_KEY)
@@ -267,7 +268,7 @@ class _Writer:
     ) -> None:
         """Adds a curve for each axis of a property; `values` are (F, axes)."""
         # An animated property is a CurveNode that is connected to the property of the bone. Each
-        # of its axes has a curve with times, values and flags. One flag applies to all keys.
+        # axis has a curve with times, values and flags. One flag applies to all keys.
         node, record = self._object("AnimationCurveNode", label, "", "AnimCurveNode")
         properties = record.add("Properties70")
         self._connect(node, layer)
@@ -286,10 +287,7 @@ class _Writer:
 
 
 def _degrees(turns: np.ndarray) -> np.ndarray:
-    """Converts rotations (F, J, 3, 3) to angles (F, J, 3) about x, y and z in degrees.
-
-    The angles have no jumps.
-    """
+    """Converts rotations (F, J, 3, 3) to angles (F, J, 3) about x, y and z in degrees, without jumps."""
     angles = continuous_euler(torch.from_numpy(turns), [EULER] * turns.shape[1])
     return np.degrees(angles.flip(-1).numpy())
 

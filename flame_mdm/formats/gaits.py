@@ -1,8 +1,8 @@
 """Clips for game engines, cut from longer motions: loops, starts, stops and turns.
 
-The ends of the clips fit together. A gait is cut at two frames that are one cycle apart. The
-start is before them, the loop between them, and the stop after them. Then the ends of the clips
-are changed to shared poses: the first pose of the loop, and the pose in which the person stands.
+The ends of the clips fit together. A gait is cut at two frames that are one cycle apart. The start
+is before these frames, the loop between them, and the stop after them. Then the ends of the clips
+are changed to shared poses: the first pose of the loop, and the standing pose.
 """
 
 from collections.abc import Sequence
@@ -28,26 +28,26 @@ Kind = Literal["loop", "start", "stop", "turn"]
 CYCLE = (0.5, 1.8)
 # A gait is steady above this fraction of its full speed
 STEADY = 0.85
-# Seconds over which the speed is averaged, because side steps stop and go
+# Seconds over which the speed is averaged, because the speed of side steps varies between 0 and its
+# maximum
 EVEN = 0.2
 # Minimum speed of a gait in m/s
 SLOWEST = 0.2
 # Maximum angle in degrees between the gait and the requested direction
 ASIDE = 35.0
-# Weight, in seconds, of velocities beside positions when poses are compared
+# Weight of velocities relative to positions, in seconds, when poses are compared
 VELOCITY = 0.1
-# A body stands if no joint is faster than this relative to the root, in m/s
+# A body stands if no joint moves faster than this relative to the root, in m/s
 SETTLED = 0.12
 # Seconds of standing that are kept before a start and after a stop
 MARGIN = 0.15
-# Seconds in which the first or the last pose of a clip changes into the motion
+# Seconds in which the first or last pose of a clip is blended into the motion
 FADE = 0.5
 # Minimum and maximum angle of a turn, relative to the requested angle
 OVERSHOOT = (0.6, 1.6)
 # Minimum length of a start or stop in seconds
 PART = 0.5
-# Meters and degrees from one repetition of a loop to the next. A loop that moves less stays in
-# place.
+# Meters and degrees between repetitions of a loop. A loop that moves less stays in place.
 STILL = (
     0.1,
     10.0,
@@ -61,9 +61,9 @@ class Clip:
 
     Attributes:
         name: name, without the name of the set.
-        kind: loop (the last pose is the first one), start, stop or turn.
+        kind: loop (the last pose equals the first pose), start, stop or turn.
         motion: the joints and the path of the root.
-        text: text that the model was given.
+        text: the text from which the motion was generated.
     """
 
     name: str
@@ -76,8 +76,8 @@ class Clip:
 class Cycle:
     """A cycle of a gait in a motion.
 
-    The fields are the first frame, the frame with the same pose one cycle later, and the
-    difference between both poses.
+    The fields are the first frame, the frame with the same pose one cycle later, and the difference
+    between the two poses.
     """
 
     first: int
@@ -91,9 +91,9 @@ def direction(degrees: float) -> np.ndarray:
 
 
 def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the velocities (F,) of the root along a direction, and to the left of it.
+    """Returns the velocities (F,) of the root along a direction, and to the left of this direction.
 
-    The direction is relative to the facing of the root.
+    The direction is relative to the heading of the root.
     """
     cosine, sine = np.cos(motion.heading), np.sin(motion.heading)
     dx, dz = (
@@ -110,12 +110,12 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     """Returns the cycle of a gait in a direction with the smallest difference between its ends.
 
-    Returns None if there is no cycle. Cycles that begin when the left foot lands are preferred,
-    so that the loops of a set begin with the same foot.
+    Returns None if there is no cycle. Cycles that begin with a landing of the left foot are
+    preferred, so that the loops of a set begin with the same foot.
     """
-    # A cycle is in the longest part with a steady speed in the requested direction. All pairs of
-    # frames that are a plausible cycle apart are compared, by the differences of joints and
-    # velocities.
+    # The cycle lies in the longest part that has a steady speed in the requested direction. All
+    # pairs of frames at the distance of a plausible cycle are compared, by the differences between
+    # joints and between velocities.
     along, aside = progress(motion, degrees)
     even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")
     full = np.percentile(even, 90)
@@ -158,12 +158,12 @@ def gait(
     Args:
         motion: a person who stands, moves in a direction, and stands again.
         cycle: the cycle that becomes the loop.
-        degrees: the direction, relative to the facing of the person.
+        degrees: the direction, relative to the heading of the person.
         stand: (22, 3), the first pose of the start and the last pose of the stop.
     """
     # All three parts come from one motion, so they nearly fit. The loop is closed first. Then the
-    # ends of start and stop are changed to its first pose and to the standing pose, and toes are
-    # planted again.
+    # ends of the start and the stop are changed to the loop's first pose and to the standing pose,
+    # and the toes are planted again.
     straight = straightened(motion, degrees)
     loop = closed(straight.cut(cycle.first, cycle.last))
     along = direction(degrees)
@@ -192,9 +192,9 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
-    """Returns a cycle with equal first and last poses.
+    """Returns a cycle whose first and last poses are equal.
 
-    The difference of these poses is spread evenly over the cycle.
+    The difference between these poses is distributed evenly over the cycle.
     """
     # The first half of the cycle takes one half of the difference, and the second half takes the
     # other, so the pose in the middle does not change.
@@ -218,9 +218,9 @@ def moving(motion: GroundedMotion) -> tuple[int, int]:
 
 
 def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedMotion | None:
-    """Returns a turn on the spot by an angle. `stand` (22, 3) is the first and the last pose.
+    """Returns a turn in place by an angle. `stand` (22, 3) is the first and the last pose.
 
-    Returns None if the motion turns much less or more, or to the other side.
+    Returns None if the motion turns by a very different angle, or to the other side.
     """
     # The model turns by about the requested angle. The root gets exactly this angle, and the pose
     # turns along.
@@ -239,8 +239,8 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 def loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns the middle repetition of a loop that was generated three times in a row.
 
-    If the loop travels, the root follows a straight line at a constant speed. Otherwise, it stays
-    in place.
+    If the loop travels, the root follows a straight line at a constant speed. Otherwise, the root
+    stays in place.
     """
     count = (len(motion) - 1) // 3
     cycle = closed(motion.cut(count, 2 * count))
@@ -252,10 +252,10 @@ def loop(motion: GroundedMotion) -> GroundedMotion:
 
 
 def passing(motion: GroundedMotion) -> list[float | None]:
-    """Returns when the planted left and right toes pass the root of a loop, in seconds.
+    """Returns the times in seconds at which the planted left and right toes pass the root of a loop.
 
-    None = the toes never pass the root. Two gaits are best blended at these moments, because then
-    both have the foot at the same place.
+    None = the toes never pass the root. Two gaits are best blended at these times, because both
+    then have the foot at the same place.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)
@@ -277,8 +277,8 @@ def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list
     """Returns the joints of all clips in one array, and the frames of each clip.
 
     The joints are relative to the root. Each clip has `frames` neighbors before and after it, so
-    that filters over time do not mix the clips. The neighbors of a loop are the loop again. The
-    neighbors of other clips are their first and last poses.
+    that filters over time do not mix the clips. The neighbors of a loop are repetitions of the
+    loop. The neighbors of all other clips are their first and last poses.
     """
     parts, slices, position = [], [], 0
     for clip in clips:

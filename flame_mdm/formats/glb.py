@@ -22,7 +22,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-# For each type of integers, the integer that means 1 if the accessor is normalized
+# For each integer type, the integer that stands for 1 if the accessor is normalized
 WHOLE = {
     5120: 127,
     UNSIGNED_BYTE: 255,
@@ -41,9 +41,9 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 # Maximum size of a file that is read
 LIMIT = 512 * MEBIBYTE
-# Maximum size of the JSON part in bytes. Parsed, it takes many times as much memory.
+# Maximum size of the JSON part in bytes. Parsed, it takes several times as much memory.
 DOCUMENT_LIMIT = 16 * MEBIBYTE
-# Maximum number of nodes, and of all other items of one list
+# Maximum number of nodes, and of the items of any other list
 MAX_NODES, MAX_ITEMS = 4096, 65_536
 # Largest coordinate or matrix entry that is read
 LARGEST = 1e9
@@ -62,7 +62,7 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 class _Object(BaseModel):
     """A part of the document that is read.
 
-    Types are strict. Other keys are ignored and copied unchanged.
+    Types are strict. All other keys are ignored and copied unchanged.
     """
 
     model_config = ConfigDict(strict=True)
@@ -200,7 +200,7 @@ def read(path: Path) -> Glb:
     """Reads a .glb file.
 
     Raises:
-        UserError: If the file is too large or damaged, or is not glTF 2.0 in one file.
+        UserError: If the file is too large or damaged, or is not glTF 2.0 in a single file.
     """
     regular_file(path, LIMIT)
     content = path.read_bytes()
@@ -312,12 +312,12 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
 def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
     """Returns the numbers (N, C) of an accessor as float64.
 
-    Normalized integers become numbers up to 1.
+    Normalized integers are scaled to a maximum of 1.
 
     Args:
         file: the file.
         accessor: index of the accessor in the document.
-        kind: type that the accessor must have, such as "VEC3".
+        kind: required type of the accessor, such as "VEC3".
 
     Raises:
         ValueError: If the file does not contain such numbers.
@@ -359,7 +359,7 @@ class Binary:
     ) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor.
 
-        If `normalized`, bytes mean 0 to 1.
+        If `normalized`, bytes stand for numbers from 0 to 1.
         """
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]
@@ -381,7 +381,7 @@ class Binary:
     ) -> dict[str, Any]:
         """Appends an animation of nodes and returns it.
 
-        A curve is property, node, and values (F, K) by frame.
+        A curve consists of a property, a node, and values (F, K) per frame.
         """
         times = self.add(
             np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True
@@ -416,7 +416,7 @@ class Binary:
 def quaternions(matrices: np.ndarray) -> np.ndarray:
     """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w.
 
-    Signs do not change between frames.
+    Successive quaternions have no sign flips.
     """
     turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
     return turns[..., [1, 2, 3, 0]].float().numpy()

@@ -22,9 +22,9 @@ from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 # Maximum number of frames times nodes
 MAX_CELLS = 4_000_000
-# Keys at a lower rate than this were placed by hand. Sampled motions have denser keys.
+# Keys at a lower rate than this were set by hand. Sampled motions have denser keys.
 SPARSE_RATE = 24.0
-# Rate at which motions with keys placed by hand are sampled
+# Rate at which motions with hand-set keys are sampled
 USUAL_RATE = 30.0
 # Numbers per key, for the properties that move nodes
 WIDTHS = {
@@ -33,7 +33,7 @@ WIDTHS = {
     "scale": 3,
 }
 
-# Joints of SMPL for the bones of VRM's humanoid
+# SMPL joints of the bones of VRM's humanoid
 HUMANOID = {
     "hips": "pelvis",
     "spine": "spine1",
@@ -104,9 +104,9 @@ class Track:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F, C) at times (F,). Rotations are not normalized.
 
-        Before the first and after the last key, the value of the key is held.
+        Before the first key and after the last key, the value of this key is held.
         """
-        # Each time is in a segment between two keys. CUBICSPLINE stores slopes per second. They
+        # Each time lies in a segment between two keys. CUBICSPLINE stores slopes per second, which
         # are converted to slopes per segment.
         if len(self.times) == 1:
             return np.tile(self.values[0], (len(times), 1))
@@ -131,7 +131,7 @@ class Track:
 def slerp(begin: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Interpolates unit quaternions (F, 4) on the sphere, along the shorter arc.
 
-    `share` (F, 1) is from 0 to 1.
+    `share` (F, 1) is between 0 and 1.
     """
     # q and -q are the same rotation. The one that is closer to `begin` is on the shorter arc. For
     # nearly equal rotations, sin(angle) is 0, and linear interpolation is exact enough.
@@ -150,8 +150,8 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the animation, or its number, counted from 1. None = the first one that
-            moves nodes.
+        animation: name of the animation, or its number, counted from 1. None = the first animation
+            that moves nodes.
 
     Raises:
         UserError: If the file is damaged, or has no such animation.
@@ -196,10 +196,7 @@ def _motion(file: glb.Glb, animation: str | int | None) -> AnimatedNodes:
 
 
 def world_matrices_of(path: Path) -> np.ndarray:
-    """Returns the matrices from nodes to the world in the first animation of a valid file.
-
-    The matrices are (F, N, 4, 4).
-    """
+    """Returns the world matrices (F, N, 4, 4) of the nodes in the first animation of a valid file."""
     file = glb.read(path)
     candidates = _animations(file)
     return _worlds(file, candidates[0][1], candidates)[0]
@@ -208,10 +205,7 @@ def world_matrices_of(path: Path) -> np.ndarray:
 def _worlds(
     file: glb.Glb, chosen: _Animation, candidates: Sequence[tuple[str, _Animation]]
 ) -> tuple[np.ndarray, float]:
-    """Returns the matrices from nodes to the world in each frame, and the frame rate.
-
-    Matrices are (F, N, 4, 4).
-    """
+    """Returns the world matrices (F, N, 4, 4) of the nodes in each frame, and the frame rate."""
     tracks = _tracks(file, chosen)
     fps = _rate(file, [item for _, item in candidates])
     last = max(track.times[-1] for properties in tracks.values() for track in properties.values())
@@ -229,7 +223,7 @@ def _worlds(
 
 
 def _animated(node: dict[str, Any], tracks: dict[str, Track], times: np.ndarray) -> np.ndarray:
-    """Returns the matrix (F, 4, 4) of a node to the coordinates of its parent."""
+    """Returns the matrix (F, 4, 4) from the coordinates of a node to the coordinates of its parent."""
     rest = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
     values = {}
     for name, usual in rest.items():
@@ -281,12 +275,12 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
 def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     """Returns the frame rate.
 
-    The frame rate is the rate that the writer stored in `asset.extras.fps`, or follows from the
-    distance of keys.
+    The frame rate is read from `asset.extras.fps` if the writer stored it there. Otherwise, it is
+    computed from the distances between keys.
     """
-    # glTF has keys, but no frame rate. In a sampled animation, the median distance of keys gives
-    # the frame rate. Times have single precision, so the rate is rounded to a nearly equal whole
-    # number.
+    # glTF stores keys, but no frame rate. In a sampled animation, the median distance between keys
+    # gives the frame rate. Times have single precision, so the rate is rounded to a nearly equal
+    # integer.
     extras = file.document["asset"].get("extras")
     noted = extras.get("fps") if isinstance(extras, dict) else None
     if isinstance(noted, int | float) and RATES[0] <= noted <= RATES[1]:
@@ -304,7 +298,7 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
 
 
 def humanoid(file: glb.Glb) -> dict[str, int]:
-    """Returns the node of each SMPL joint, if the file declares the bones of VRM's humanoid.
+    """Returns the node of each SMPL joint, if the file declares the bones of a VRM humanoid.
 
     Otherwise, returns {}.
     """

@@ -1,12 +1,12 @@
 """Motions relative to a root on the floor, and feet that stay where they are planted.
 
 Game engines move a character by a root on the floor, and play the rest of the motion relative to
-this root. Cuts of a motion are changed in this view, so that the last pose of one clip can be the
-first pose of the next. Then the path of the root is added again, and inverse kinematics keeps
-each foot in place during its contacts.
+this root. Motions are cut in this representation, so that the last pose of one clip can be the
+first pose of the next. Then the path of the root is added again, and inverse kinematics keeps each
+foot in place during its contacts.
 
-Arrays have F frames and the 22 joints of SMPL, in meters, y up. Angles are in radians. Positive
-angles turn to the left.
+Arrays have F frames and the 22 SMPL joints, in meters, y up. Angles are in radians. Positive angles
+turn to the left.
 """
 
 from dataclasses import dataclass, replace
@@ -17,18 +17,18 @@ from scipy.ndimage import binary_closing, binary_opening, gaussian_filter1d, max
 from flame_mdm.formats.cleanup import REACH, bend
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
-# Seconds over which the path of the root is smoothed, so that it does not follow single steps
+# Seconds over which the path of the root is smoothed, so that it does not follow individual steps
 SMOOTHNESS = 0.15
-# A toe touches the floor up to this height in meters above its lowest position
+# A toe is in contact up to this height in meters above its lowest position
 LOW = 0.05
-# Maximum speed of a planted toe over the floor in m/s
+# Maximum horizontal speed of a planted toe in m/s
 SLOW = 0.25
-# Seconds; shorter contacts, and shorter gaps between contacts, are ignored
+# Contacts, and gaps between contacts, that are shorter than this are ignored; in seconds
 SHORT = 0.1
 # Seconds in which the body is lowered for a leg that is too short
 LOWERING = 0.2
-# Number of repetitions of a loop in which toes are planted together. The middle one has neighbors
-# on both sides.
+# Number of repetitions of a loop in which toes are planted together. The middle repetition has
+# neighbors on both sides.
 COPIES = 3
 FEET = tuple(
     tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot"))
@@ -59,13 +59,13 @@ class GroundedMotion:
         return len(self.local)
 
     def world(self) -> np.ndarray:
-        """Returns the joints (F, 22, 3) in the world."""
+        """Returns the world joint positions (F, 22, 3)."""
         joints = turned(self.local, self.heading[:, None])
         joints[..., [0, 2]] += self.path[:, None]
         return joints
 
     def with_world(self, joints: np.ndarray) -> "GroundedMotion":
-        """Returns this motion with other joints (F, 22, 3) in the world, above the same root."""
+        """Returns this motion with other world joint positions (F, 22, 3) above the same root."""
         local = joints.copy()
         local[..., [0, 2]] -= self.path[:, None]
         return replace(self, local=turned(local, -self.heading[:, None]))
@@ -97,7 +97,7 @@ def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
 
 
 def facing(joints: np.ndarray) -> np.ndarray:
-    """Returns the direction (F,) that hips and shoulders face, without jumps by a full turn."""
+    """Returns the unwrapped direction (F,) that the hips and shoulders face."""
     right_hip, left_hip, right_shoulder, left_shoulder = (
         joints[:, joint] for joint in SMPL22.facing
     )
@@ -106,9 +106,9 @@ def facing(joints: np.ndarray) -> np.ndarray:
 
 
 def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
-    """Puts a root below joints (F, 22, 3). Its path and its direction are smooth."""
-    # The root is the pelvis, projected onto the floor. It is smoothed in time: in an engine, the
-    # sway of a walk belongs to the pose and not to the path.
+    """Adds a root below joints (F, 22, 3). Its path and its direction are smooth."""
+    # The root is the pelvis, projected onto the floor and smoothed in time. In an engine, the sway
+    # of a walk belongs to the pose, not to the path.
     joints = joints.astype(float)
     frames = SMOOTHNESS * fps
     path = gaussian_filter1d(joints[:, 0][:, [0, 2]], frames, axis=0, mode="nearest")
@@ -119,8 +119,8 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
     """Returns whether the left and right toes are planted, (F, 2), by height and speed."""
-    # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps shorter
-    # than `SHORT` are closed, and contacts shorter than `SHORT` are removed.
+    # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
+    # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
     steps = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     steps = np.concatenate([steps[:1], steps, steps[-1:]])
@@ -137,11 +137,11 @@ def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
 def anchored(
     motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool
 ) -> GroundedMotion:
-    """Returns the motion with another first or last pose. The change fades over some seconds.
+    """Replaces the first or last pose of a motion. The change fades out over some seconds.
 
     `pose` (22, 3) is relative to the root. Bones keep their lengths.
     """
-    # The difference to the pose is added with a weight that falls smoothly from 1 to 0: 3 w^2 - 2
+    # The difference from the pose is added with a weight that falls smoothly from 1 to 0: 3 w^2 - 2
     # w^3.
     frames = np.arange(len(motion)) / max(1.0, min(seconds * motion.fps, len(motion) - 1))
     share = np.clip(1 - (frames[::-1] if at_end else frames), 0, 1)
@@ -177,9 +177,9 @@ def planted(
 ) -> GroundedMotion:
     """Returns the motion with toes that do not move during contacts.
 
-    Toes are also never below the floor. If a leg would be too short, the body is lowered. With
-    `fixed_start` and `fixed_end`, the first and the last pose do not change. A foot that is
-    planted in such a pose stays at its position in the pose.
+    The toes are also never below the floor. If a leg would be too short, the body is lowered. With
+    `fixed_start` and `fixed_end`, the first and the last pose do not change. A foot that is planted
+    in a fixed pose stays at its position in that pose.
     """
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
     # whole body is lowered smoothly for a moment. Then the legs bend to reach the footprints.
@@ -189,7 +189,7 @@ def planted(
         _shift(world[:, leg[-1]], flags, fixed_start, fixed_end, near)
         for leg, flags in zip(FEET, motion.contacts.T, strict=True)
     ]
-    # A blend of two poses that stand on the floor may be lower. A fixed pose keeps its height.
+    # A blend of two standing poses may be lower than both. A fixed pose keeps its height.
     fixed = [0] * fixed_start + [-1] * fixed_end
     for leg, shift in zip(FEET, shifts, strict=True):
         height = world[:, leg[-1], 1]
@@ -216,10 +216,10 @@ def planted(
 
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
-    """Returns how much (F,) the hip of a leg is too high for a foot moved by `shift` (F, 3)."""
-    # The hip may be anywhere in a sphere around the ankle. Its radius is the length of the
-    # straight leg, or the distance from hip to ankle in the motion if that is longer. `highest`
-    # is the height of the sphere above the hip's position on the floor.
+    """Returns by how much (F,) the hip of a leg is too high for a foot moved by `shift` (F, 3)."""
+    # The hip may be anywhere in a sphere around the ankle. The radius of the sphere is the length
+    # of the straight leg, or the distance from hip to ankle in the motion if this distance is
+    # longer. `highest` is the height of the sphere above the hip's position on the floor.
     hip, knee, ankle = (world[:, joint] for joint in leg[:3])
     length = np.linalg.norm(knee - hip, axis=1) + np.linalg.norm(ankle - knee, axis=1)
     reach = np.maximum(REACH * length, np.linalg.norm(ankle - hip, axis=1))
@@ -231,14 +231,14 @@ def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndar
 def _shift(
     toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool, near: int
 ) -> np.ndarray:
-    """Returns the movement (F, 3) of a toe (F, 3) over the floor.
+    """Returns the horizontal displacement (F, 3) of a toe (F, 3).
 
-    The movement changes smoothly from each contact to the next.
+    The displacement changes smoothly from each contact to the next.
     """
-    # Within a contact, the shift brings the toe to its mean position, or to the position in a
-    # fixed pose. Between contacts, one shift changes into the next. If a contact begins or ends
-    # fewer than `near` frames from a fixed pose, there is no time to move the toe. The toe then
-    # stays where it is in that pose.
+    # Within a contact, the shift moves the toe to its mean position, or to its position in a fixed
+    # pose. Between contacts, one shift is blended into the next. If a contact begins or ends fewer
+    # than `near` frames from a fixed pose, there is no time to move the toe. The toe then stays at
+    # its position in that pose.
     last = len(toe) - 1
     floor = np.array([1.0, 0.0, 1.0])
     frames, shifts = [], []
@@ -250,7 +250,7 @@ def _shift(
         if at_start or at_end:
             footprint = toe[begin] if at_start else toe[end]
         target = np.tile(footprint, (end + 1 - begin, 1))
-        if at_start and at_end:  # it cannot stay in place between two given poses
+        if at_start and at_end:  # the toe cannot stay in place between two given poses
             target = np.linspace(toe[begin], toe[end], len(target))
         frames += range(begin, end + 1)
         shifts += list((target - toe[begin : end + 1]) * floor)
@@ -272,9 +272,9 @@ def _shift(
 
 
 def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
-    """Returns a loop several times in a row.
+    """Returns several repetitions of a loop in a row.
 
-    Its last frame is the first frame of the next repetition.
+    The last frame of each repetition is the first frame of the next one.
     """
     # Each repetition begins at the place and in the direction in which the previous one ended.
     # The path of each repetition is turned and moved there.
@@ -302,7 +302,7 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 def planted_loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns a loop with planted toes.
 
-    The result is still a loop: its last pose is its first one.
+    The result is still a loop: its last pose is its first pose.
     """
     # Contacts are cut at the ends of a single cycle. Therefore several cycles in a row are
     # planted. The middle one is kept, because its neighbors are cycles, too.

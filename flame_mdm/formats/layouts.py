@@ -1,4 +1,4 @@
-"""Skeletons of motion files, their maps to SMPL's joints, and checks by the size of the body."""
+"""Skeletons of motion files, their maps to SMPL's joints, and body size checks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
 from flame_mdm.safe_io import read_package_yaml, read_yaml, regular_file
 
-# For each axis that may point up, the rows of the rotation that maps it to +y
+# For each possible up axis, the rows of the rotation that maps it to +y
 UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
@@ -36,9 +36,9 @@ LEG, USUAL_LEG = (
 CHILD = 0.25
 # Minimum length of a foot in meters, ankle to toes
 FOOT = 0.02
-# If left and right limbs differ by more than this ratio, the joints are not in the assumed order.
+# If left and right limbs differ by more than this ratio, the joints are not in the assumed order
 UNEQUAL = 1.5
-# The order is also wrong if the lengths of limbs vary by more than this fraction of their mean.
+# The order is also wrong if the lengths of limbs vary by more than this fraction of their mean
 CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 # Prefixes of SMPL's joints
@@ -52,28 +52,28 @@ UNITS = {  # in meters
     "the unit of CMU's recordings": 0.0564444,
 }
 
-# A joint of the file, or weights of several joints for a weighted mean
+# A joint of the file, or weights of several joints whose weighted mean is used
 Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """Map from the joints of files to the 22 joints of SMPL, in meters, y up.
+    """Map from the joints of files to SMPL's 22 joints, in meters, y up.
 
     The fields are the keys of `skeleton.yaml`.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-    # For each joint of SMPL, the name of its joint in the files
+    # For each SMPL joint, the name of its joint in the files
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
-    # Names of the joints of arrays, in order; BVH files contain their own
+    # Names of the joints of arrays, in order. BVH files contain their own names.
     joints: list[str] = []
     # Meters per unit of length in the files
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0
-    # The axis that points up
+    # The up axis
     up: Literal["y", "z", "-y"] = "y"
-    # frame rate of files that do not contain it
+    # Frame rate of files that do not contain it
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
-    # The files contain mirrored motion; the sign of x is changed
+    # Whether the files contain mirrored motion. If so, the sign of x is changed.
     mirrored: bool = False
     # Whether bodies may be children
     children: bool = False
@@ -83,7 +83,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The joints of files that the map uses."""
+        """The joints in the files that the map uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -93,9 +93,9 @@ class Layout(BaseModel):
 
     @property
     def bones(self) -> Mapping[str, str]:
-        """Bones that the joints of SMPL follow, by joint.
+        """Bones that SMPL's joints follow, by joint.
 
-        A map of positions may use means of several joints instead.
+        The map of positions may use means of several joints instead.
         """
         return self._bones
 
@@ -105,9 +105,10 @@ class Layout(BaseModel):
         return self._rig
 
     def bone(self, joint: str) -> str:
-        """Returns the joint of files that turns like a joint of SMPL.
+        """Returns the joint in the files that turns like an SMPL joint.
 
-        The result is the bone of the joint, or the joint with the largest weight in its position.
+        The result is the bone of the SMPL joint, or the joint with the largest weight in its
+        position.
         """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
@@ -119,9 +120,9 @@ class Layout(BaseModel):
         return layout
 
     def ending(self, **ends: str) -> dict[str, Source]:
-        """Returns a map in which some joints of SMPL are the end sites of their parents.
+        """Returns a map in which some SMPL joints are the end sites of their parents.
 
-        Each keyword is joint=parent, for example the toes.
+        Each keyword argument is joint=parent, for example for the toes.
         """
         return {
             side + joint: f"{self.map[side + parent]}.end"
@@ -130,9 +131,9 @@ class Layout(BaseModel):
         }
 
     def pairs(self) -> dict[str, str]:
-        """Returns the counterparts on the other side, by joint of files that the map uses.
+        """Returns the counterpart on the other side of each joint in the files that the map uses.
 
-        A joint without counterpart is its own.
+        A joint without a counterpart is its own counterpart.
         """
         pairs: dict[str, str] = {}
         for joint, source in self.map.items():
@@ -162,7 +163,7 @@ class Layout(BaseModel):
 
 
 def opposite(joint: str) -> str:
-    """Returns the joint of SMPL on the other side of the body, or the joint itself."""
+    """Returns the SMPL joint on the other side of the body, or the joint itself."""
     for side, other in (SIDES, SIDES[::-1]):
         if joint.startswith(side):
             return other + joint.removeprefix(side)
@@ -208,7 +209,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @cache
 def _variants() -> dict[str, Layout]:
-    """Returns the supported layouts by name, also with end sites for toes, hands, or both."""
+    """Returns the supported layouts by name, and variants with end sites for toes, hands, or both."""
     variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
     toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
     for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
@@ -220,9 +221,9 @@ def _variants() -> dict[str, Layout]:
 
 @cache
 def _spelled() -> dict[str, dict[str, str]]:
-    """Returns spellings of the names of the joints that each of `_variants` uses.
+    """Returns the spellings of the joint names that each of `_variants` uses.
 
-    The result for a layout is a mapping from spelling to name.
+    The result maps each layout to a mapping from spelling to name.
     """
     return {name: spelled(layout.pairs()) for name, layout in _variants().items()}
 
@@ -242,11 +243,10 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout of a file that `read_tree` read, and the names of its joints in this
-    layout.
+    """Returns the layout of a file from `read_tree`, and the names of its joints in this layout.
 
-    `fields` of `Layout` override the known fields. Known skeletons with arrays in meters are in
-    centimeters in BVH files, as written by `flame_mdm.formats`.
+    `fields` of `Layout` override the known fields. Known skeletons whose arrays are in meters are
+    in centimeters in BVH files, as written by `flame_mdm.formats`.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
@@ -255,9 +255,9 @@ def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Seque
 
 
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns layout and joint names of an array (F, J, 3).
+    """Returns the layout and the joint names of an array (F, J, 3).
 
-    Both come from `fields`, or from the number of joints.
+    Both are taken from `fields`, or determined by the number of joints.
     """
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"joints have shape {joints.shape}, not (frames, joints, 3)")
@@ -320,7 +320,7 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 
 
 def _one(name: str, candidates: Sequence[str]) -> str:
-    """Returns the joint of a file that a name means.
+    """Returns the joint of a file to which a name refers.
 
     If several joints are possible, the joint with exactly this name is returned.
     """
@@ -350,7 +350,7 @@ def skeleton_file(path: Path) -> Path | None:
 def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
     """Returns the fields of `Layout` in the `skeleton_file` of a file.
 
-    `up` (y, z or -y) overrides the axis that points up.
+    `up` (y, z or -y) overrides the up axis.
     """
     if up is not None and up not in UP:
         raise UserError(f"up={up}: the axis that points up is one of {', '.join(UP)}")
@@ -359,7 +359,7 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 
 
 def read_skeleton(path: Path) -> dict[str, Any]:
-    """Reads some fields of `Layout` from a skeleton file.
+    """Reads fields of `Layout` from a skeleton file.
 
     A `UserError` names the file and the key.
     """
@@ -399,10 +399,10 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
         joints: (F, 22, 3), SMPL's joints in meters.
         unit: unit of the file, in meters.
         children: whether bodies may be children.
-        doubt: a line about another fault of the motion, for the message.
+        doubt: a line about another problem of the motion, for the message.
 
     Raises:
-        UserError: If the legs are not a person's; the message suggests a unit.
+        UserError: If the leg length is not a person's. The message suggests a unit.
     """
     leg, shortest = leg_length(joints), CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:
@@ -434,8 +434,8 @@ def _usual_unit(leg: float, unit: float) -> str:
     return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
 
 
-# Fraction of the frames in which the toes of both feet point backward. Above it, left and right
-# are exchanged.
+# Fraction of the frames in which the toes of both feet point backwards. Above this fraction, left
+# and right are exchanged.
 BACKWARDS = 0.25
 
 
@@ -443,7 +443,7 @@ def check_feet(joints: np.ndarray) -> None:
     """Checks the feet of SMPL's joints (F, 22, 3).
 
     Raises:
-        UserError: If a foot has no length, or the toes point backwards.
+        UserError: If a foot has no length, or if the toes point backwards.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     for side in ("left", "right"):
@@ -452,9 +452,9 @@ def check_feet(joints: np.ndarray) -> None:
             raise UserError(
                 f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}"
             )
-    # The toes of a foot in the air may point backwards, for example in a run. Therefore only the
-    # lower foot of each frame counts. The toes of one foot of a kneeling person point backwards,
-    # too. Therefore, left and right count as exchanged only if both feet point backwards in
+    # The toes of a foot in the air may point backwards, for example in a run. Therefore, only the
+    # lower foot of each frame counts. The toes of one foot of a kneeling person also point
+    # backwards. Therefore, left and right count as exchanged only if both feet point backwards in
     # enough frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [
@@ -471,10 +471,10 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Checks that an array of joints was not taken for another skeleton with as many joints.
+    """Checks that an array of joints was not mistaken for another skeleton with the same number of joints.
 
-    The bones of a person's limbs have the same length on both sides, and keep their length. With
-    another order of joints or another skeleton, the same pairs of joints are not bones.
+    The limbs of a person have the same length on both sides, and their length does not change. With
+    another order of joints or another skeleton, these pairs of joints are not bones.
 
     Args:
         joints: (F, 22, 3), SMPL's joints, mapped as if the array had the joints of the skeleton.

@@ -1,9 +1,9 @@
 """`Motion`, one motion outside the models, and writers of motion files.
 
-`docs/formats.md` describes the files. The 6D rotations among the 263 features of HumanML3D are
-not SMPL's rotations: they follow different chains and do not define the twist of a bone. They are
-never exported. Rotations come from joint positions (`flame_mdm.formats.poses`), or from features
-and files that contain SMPL's rotations.
+`docs/formats.md` describes the files. The 6D rotations in the 263 features of HumanML3D are not
+SMPL's rotations: they follow different chains and do not define the twist of a bone. They are never
+exported. Rotations are computed from joint positions (`flame_mdm.formats.poses`), or come from
+features and files that contain SMPL's rotations.
 """
 
 import json
@@ -46,7 +46,7 @@ from flame_mdm.safe_io import atomic_write, write_text
 from flame_mdm.visualize.body import Mesh
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
-"""Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y).
+"""Converts AMASS's coordinates (z up) to y up as in HumanML3D: (-x, z, y).
 
 It is its own inverse.
 """
@@ -57,7 +57,7 @@ END_SITES = {
     "left_wrist": ADULT[22],
     "right_wrist": ADULT[23],
 }
-"""Tips of head, toes and hands beyond the last joints, in meters.
+"""Tips of the head, toes and hands beyond the last joints, in meters.
 
 Without them, programs do not draw these bones.
 """
@@ -70,16 +70,17 @@ class Motion(PosedFigure):
     Attributes:
         joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`. Joints
             are float32.
-        poses: rotations of SMPL's joints, if they are known.
-        features: (F, D) float32 features in the units of the data; empty if they are not known.
+        poses: rotations of SMPL's joints, if known.
+        features: (F, D) float32 features in the units of the data; empty if unknown.
         representation: name of the representation of the features.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
-        degenerate: number of frames in which the features determine no rotation for some joint.
+        degenerate: number of frames in which the features determine no rotation for at least one
+            joint.
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
         notes: lines for the user about the file that was read, such as frames that were left out.
-        bones: rotations from the bones of the file that was read, for features that contain
-            rotations. They show how a forearm turns about its own axis. Files and pictures are
-            made from `poses` or joint positions instead.
+        bones: rotations from the bones of the source file, for features that contain rotations.
+            They show how a forearm turns about its own axis. Files and pictures are made from
+            `poses` or joint positions instead.
 
     Raises:
         UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive
@@ -139,22 +140,22 @@ class Motion(PosedFigure):
 
         Args:
             path: the file. Its extension selects the format (docs/formats.md).
-            rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out. Some programs
-                expect it.
+            rest_pose: begin a `.bvh` file with a frame of the rest pose, with the arms to the
+                sides. Some programs expect it.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
-                `flame_mdm.formats.retarget.presets`. Default: SMPL's.
+                `flame_mdm.formats.retarget.presets`. Default: SMPL's skeleton.
             character: your own character, as a file or as the result of `characters.read`. The
                 motion of a `.glb` character with a skin can be saved as a `.glb`, `.fbx` or USD
                 file, the motion of a `.bvh` character as a `.bvh` file.
             body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from
                 `formats.people.load_body`. Default: the mannequin.
-            root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or
-                USD file. Otherwise, it stays in place. For `rig="unreal"` and `rig="soma"`.
+            root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD
+                file. Otherwise, it stays in place. Only for `rig="unreal"` and `rig="soma"`.
             facts: additional entries of an `.npz` file, such as the seed.
 
         Raises:
-            UserError: If an argument is unknown, or does not fit the file or the motion, or if av
-                is missing for `.mp4`.
+            UserError: If an argument is unknown, if it does not fit the file or the motion, or if
+                the package av is missing for `.mp4`.
         """
         path = Path(path)
         ending = path.suffix.lower()
@@ -196,9 +197,9 @@ class Motion(PosedFigure):
     def resampled(self, fps: float) -> "Motion":
         """Returns this motion at another frame rate, with the same duration.
 
-        Known rotations are interpolated on the sphere, so bones keep their length. Without
-        rotations, joints are interpolated by cubic splines. Features belong to one frame rate, so
-        they are left out.
+        Known rotations are interpolated on the sphere, so that bones keep their length. Without
+        rotations, joints are interpolated by cubic splines. Features are left out, because they are
+        valid for one frame rate only.
         """
         if math.isclose(self.fps, fps):
             return self
@@ -233,8 +234,8 @@ class Motion(PosedFigure):
     def show(self) -> Any:
         """Returns a player.
 
-        In a Jupyter notebook, the player is displayed; otherwise, the path of a page for any
-        browser is returned.
+        A Jupyter notebook displays the player. Elsewhere, the path of an HTML page is returned,
+        which opens in any browser.
         """
         from flame_mdm.visualize import player_page
 
@@ -282,7 +283,7 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     summary = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
         turns, translation = amass_parameters(motion.poses)
-        # AMASS has 52 joints. The 30 joints of the hands are at rest.
+        # AMASS has 52 joints. The 30 joints of the hands are in the rest pose.
         content |= {
             "poses": np.pad(turns, ((0, 0), (0, 90))),
             "trans": translation,
@@ -362,7 +363,7 @@ def _write_rigged(
 
 
 def _write_character(motion: Motion, path: Path, character: Character | BvhCharacter) -> str:
-    """Writes a character's motion.
+    """Writes the motion of a character.
 
     A .glb or .bvh file keeps the skeleton of the character's file. The motion of a .glb character
     can also be written as an .fbx or USD file.
@@ -414,8 +415,8 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     return summary + (reason and f"; without a body: {reason}")
 
 
-# In millimeters. The message about a written file names the joint with the largest error if it
-# exceeds this.
+# In millimeters. If the error is larger than this, the message about a written file names the joint
+# with the largest error.
 LARGE_ERROR = 10
 
 

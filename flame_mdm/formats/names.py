@@ -2,9 +2,9 @@
 
 Blender's extension contains this file, so it needs only the standard library.
 
-Programs write the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
-left up leg`, `L_UpLeg`. Case, separators, and a prefix that many joints share make no difference.
-The mark of the side may be short or long (L, left), at the beginning or the end.
+Programs spell the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
+left up leg`, `L_UpLeg`. Differences in case, separators, and a prefix that many joints share are
+ignored. The mark of the side may be short or long (L, left), and at the beginning or the end.
 """
 
 import re
@@ -23,13 +23,13 @@ JOINED = re.compile(r"mixamorig\d*")
 
 
 class Match(NamedTuple):
-    """The skeleton that fits some names best.
+    """The best-matching skeleton for some names.
 
     Attributes:
         skeleton: key of the skeleton.
-        numbers: indices of the joints that each name in the skeleton may mean. Several indices
+        numbers: indices of the joints to which each name in the skeleton may refer. Several indices
             are ambiguous.
-        missing: names of the skeleton that no joint has.
+        missing: names of the skeleton that match no joint.
     """
 
     skeleton: str
@@ -38,15 +38,15 @@ class Match(NamedTuple):
 
 
 def plain(name: str) -> str:
-    """Returns a name in lower case, without separators and other signs."""
+    """Returns a name in lower case, without separators and other special characters."""
     return re.sub(r"[\W_]", "", name).lower()
 
 
 def spellings(name: str, opposite: str) -> list[str]:
     """Returns the `plain` spellings of a name. The name itself is first.
 
-    `opposite` is its counterpart on the other side. The mark of the side is spelled short or
-    long, before or after the rest: LeftHip, L_Hip, hip.L.
+    `opposite` is the counterpart on the other side. The mark of the side is spelled short or long,
+    before or after the rest of the name: LeftHip, L_Hip, hip.L.
     """
     name, opposite = plain(name), plain(opposite)
     options = [name]
@@ -62,9 +62,9 @@ def spellings(name: str, opposite: str) -> list[str]:
 
 
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Returns a mapping from every spelling that `spellings` returns to its name.
+    """Returns a mapping from all spellings that `spellings` returns to the names.
 
-    If two names have the same spelling, it means the name that is spelled exactly like it.
+    If two names have the same spelling, it refers to the name that is spelled exactly like it.
 
     Args:
         pairs: for each name, its counterpart on the other side, or the name itself.
@@ -80,14 +80,15 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
-    """Returns the skeleton that fits names of joints best.
+    """Returns the skeleton that best matches the names of joints.
 
-    Skeletons without missing joints are preferred. Then the number of joints decides, then the
-    order. If several prefixes fit equally well, the match is ambiguous.
+    Skeletons without missing joints are preferred. The next criteria are the number of joints and
+    the order. If several prefixes match equally well, the match is ambiguous.
 
     Args:
-        names: names of the joints of a file, at least one.
-        skeletons: for each key, the name in the skeleton by spelling of a joint. The first
+        names: names of the joints of a file, at least one name.
+        skeletons: for each skeleton, a mapping from spellings of a joint to the skeleton's name of
+            the joint. The first
             spelling is preferred.
     """
     best: list[Match] = []
@@ -123,7 +124,7 @@ def _match(key: str, skeleton: Mapping[str, str], by_name: Mapping[str, list[int
 
 
 def _prefixes(names: Sequence[str]) -> list[str]:
-    """Returns "" and the prefixes, up to a separator, that at least `SHARED` names have.
+    """Returns "" and all prefixes, up to a separator, that at least `SHARED` names have.
 
     The most frequent prefix is first.
     """

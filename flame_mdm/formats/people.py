@@ -2,8 +2,8 @@
 
 Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
 Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp., Apache-2.0.
-Its shapes and weights come from MakeHuman and MPFB2, CC0. Anny can also download topologies of
-SMPL and SMPL-X, which are not free for commercial use. This project never builds them.
+Its shapes and weights come from MakeHuman and MPFB2, CC0. Anny can also download topologies of SMPL
+and SMPL-X, which are not free for commercial use. This project never uses these topologies.
 """
 
 import os
@@ -31,9 +31,9 @@ from flame_mdm.visualize.body import (
 )
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
-"""Anny's numbers and their defaults, from 0 to 1.
+"""Anny's shape parameters and their defaults.
 
-From 0 to 1, they mean male to female, baby to old (2/3: a young adult), small to tall, and light
+Values from 0 to 1 mean male to female, baby to old (2/3: a young adult), small to tall, and light
 to heavy.
 """
 PARTS = {
@@ -51,9 +51,9 @@ PARTS = {
     "ankle": "foot",
     "foot": "toe",
 }
-"""For each joint of SMPL, prefixes of the names of Anny's bones that follow it.
+"""For each SMPL joint, prefixes of the names of Anny's bones that follow it.
 
-Others follow the pelvis.
+All other bones follow the pelvis.
 """
 HEADS = {
     "hip": "upperleg01",
@@ -62,7 +62,7 @@ HEADS = {
     "foot": "toe2-1",
     "shoulder": "upperarm01",
 } | {**{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}}
-"""For each joint of SMPL, the bone of Anny that begins there."""
+"""For each SMPL joint, the bone of Anny that begins there."""
 CLOTHES = {
     "neck": SKIN,
     "head": SKIN,
@@ -75,9 +75,8 @@ CLOTHES = {
 def load_body(name: str) -> Mesh:
     """Returns a body by its name.
 
-    A name is "mannequin", a file, or "anny" with numbers of its shape, such as "anny gender=1
-    age=0.9". Anny takes about 90 seconds for the first body. Each body is saved in the user's
-    cache.
+    A name is "mannequin", a file, or "anny" with shape parameters, such as "anny gender=1 age=0.9".
+    The first body of Anny takes about 90 seconds. Each body is saved in the user's cache.
 
     Raises:
         UserError: If the file is damaged, a number is unknown, or Anny is not installed.
@@ -100,7 +99,7 @@ def _cache() -> Path:
 
 
 def shape_of(words: list[str]) -> dict[str, float]:
-    """Returns the numbers of a shape from words such as age=0.9."""
+    """Returns the shape parameters given by words such as age=0.9."""
     shape = dict(SHAPE)
     for word in words:
         key, _, value = word.partition("=")
@@ -116,9 +115,9 @@ def shape_of(words: list[str]) -> dict[str, float]:
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of a file with a body of Anny; see `packed`.
+    """Returns the arrays of a body file for a body of Anny; see `packed`.
 
-    Anny takes about 90 seconds the first time.
+    The first call takes about 90 seconds.
     """
     try:
         package = import_module("anny")
@@ -128,7 +127,7 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
         ) from None
     model = package.Anny(rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
     output = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
-    axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's z is up, and it faces -y
+    axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's body has z up and faces -y
     points, heads = (
         output[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads")
     )
@@ -162,7 +161,7 @@ def _owner(bone: str) -> int:
 
 
 def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
-    """Returns SMPL's joints (22, 3) in Anny's rest pose, from the beginnings of Anny's bones."""
+    """Returns SMPL's joints (22, 3) in Anny's rest pose, given the start points of Anny's bones."""
     joints = np.zeros((len(SMPL22), 3))
     for joint, bone in HEADS.items():
         for side in ("left", "right") if joint not in JOINT else ("",):
@@ -189,10 +188,10 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _turns(joints: np.ndarray) -> np.ndarray:
-    """Returns rotations (22, 3, 3) in the world from SMPL's rest pose to Anny's rest pose.
+    """Returns world rotations (22, 3, 3) from SMPL's rest pose to Anny's rest pose.
 
-    `joints` (22, 3) are in Anny's rest pose. Pelvis, chest and head keep their direction, and
-    feet stay level. Arms are twisted so that elbows bend like SMPL's.
+    `joints` (22, 3) are in Anny's rest pose. Pelvis, chest and head keep their direction, and the
+    feet stay level. The arms are twisted so that the elbows bend like SMPL's.
     """
     turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     usual = np.array(ADULT)
@@ -231,7 +230,7 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns how far points of the head are inside the hair.
+    """Returns how far points of the head are inside the region of the hair.
 
     Hair is above the forehead and behind the ears.
     """
@@ -251,9 +250,9 @@ def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
 def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Returns weights (V, 28) with helper bones.
 
-    The upper part of a limb follows a helper bone, which turns less about the limb. In the
-    forearm, the lower part follows a helper bone, which takes part in the twist of the wrist.
-    `joints` (22, 3) are the joints of the mesh.
+    The upper part of a limb follows a helper bone, which turns less about the limb. In the forearm,
+    the lower part follows a helper bone, which takes part of the twist of the wrist. `joints` (22,
+    3) are the joints of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:

@@ -1,4 +1,4 @@
-"""Joint rotations from joint positions: analytic inverse kinematics of 22 joints of SMPL."""
+"""Joint rotations from joint positions: analytic inverse kinematics of SMPL's 22 joints."""
 
 import math
 from collections.abc import Sequence
@@ -20,27 +20,26 @@ CHILDREN = tuple(
 )
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
-"""Joints with children, from the root outward. Left and right joints form groups."""
+"""Joints with children, from the root outward. Corresponding left and right joints form groups."""
 # For each joint between pelvis and chest, its fraction of the rotation from pelvis to chest
 SPINE = {
     3: 1 / 3,
     6: 2 / 3,
 }
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
-"""For hips and shoulders: z of the direction in which knee or elbow bends in the rest pose."""
+"""For hips and shoulders: z of the direction in which the knee or elbow bends in the rest pose."""
 STRAIGHT = 0.15
-"""Sine of the bend angle of a knee or elbow at which two cues of the limb's twist have the same
-weight.
+"""Sine of the bend angle of a knee or elbow at which two cues of the limb's twist have equal weight.
 
 The cues are the bend and the rotation of the parent. Weights are squared, so that a clear bend
 dominates.
 """
-# Weight of the foot relative to the shin, for the twist of a thigh. The shin says nothing about
-# the twist while the leg is straight.
+# Weight of the foot relative to the shin, for the twist of a thigh. While the leg is straight, the
+# shin does not determine the twist.
 FOOT = 0.3
 # Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
 SMOOTH = 0.1
-# Number of squarings. The result is the power 4,096, in which only the largest eigenvector
+# Number of squarings. The result is the 4,096th power, in which only the largest eigenvector
 # remains.
 SQUARINGS = 12
 
@@ -49,13 +48,13 @@ SQUARINGS = 12
 class Poses:
     """A moving body, in meters, y up.
 
-    The rest pose is SMPL's: arms to the sides, facing +z, left at +x.
+    The rest pose is SMPL's rest pose: arms to the sides, facing +z, left at +x.
     """
 
     # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
     offsets: Tensor
-    # (F, 22, 3, 3) float64, relative to the parents. A rotation applies to the bones that leave
-    # its joint.
+    # (F, 22, 3, 3) float64, rotations relative to the parents. A rotation applies to the bones that
+    # begin at its joint.
     rotations: Tensor
     root: Tensor  # (F, 3) float64, position of the pelvis
 
@@ -85,13 +84,13 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class BoneRotations:
-    """Rotations of SMPL's joints that a file contains, taken from its bones.
+    """Rotations of SMPL's joints, taken from the bones of a file.
 
     Attributes:
-        poses: the rotations, on a body with the bones of the file. None: the file has no usable
-            rotations.
-        reason: why the rotations of the file cannot be used. "": the file has no rotations, or
-            they can be used.
+        poses: the rotations, on a body with the bones of the file. None if the file contains no
+            usable rotations.
+        reason: why the rotations of the file cannot be used. "" if they can be used, or if the file
+            contains no rotations.
     """
 
     poses: Poses | None = None
@@ -102,19 +101,19 @@ def solve(joints: Tensor, fps: float) -> Poses:
     """Computes a body and its rotations, which reproduce joint positions in every frame.
 
     Bones get their mean length over the clip. Pelvis and chest have three bones each, and get the
-    rotation that fits all three best (Kabsch 1976). Every other joint aims its bone at the next
-    joint.
+    rotation that fits all three bones best (Kabsch 1976). Every other joint aims its bone at the
+    next joint.
 
     Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
-    twisted so that knees and elbows bend like hinges. The spine twists evenly from pelvis to
-    chest. All other joints, including head, hands and toes, follow their parent.
+    twisted so that knees and elbows bend like hinges. The twist of the spine is distributed evenly
+    from pelvis to chest. All other joints, including head, hands and toes, follow their parent.
 
     Args:
         joints: (F, 22, 3) in the order of `SMPL22`, in meters, y up.
         fps: frames per second.
 
     Raises:
-        UserError: If the joints have another shape, or a bone has no length.
+        UserError: If the joints have the wrong shape, or if a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
@@ -133,10 +132,10 @@ def solve(joints: Tensor, fps: float) -> Poses:
 
 
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
-    """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve`, without checks.
+    """Returns the offsets (22, 3) and quaternions (F, 22, 4) of `solve`, without checks.
 
-    Both results have the precision of the joints. The function has no data-dependent branches and
-    solves similar joints in one batch, so that its ONNX graph is small.
+    Both results have the same precision as the joints. The function has no data-dependent branches
+    and solves similar joints in one batch, so that its ONNX graph is small.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
@@ -193,11 +192,11 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
 
     The quaternions are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute
-    orientation using unit quaternions"), computed by repeated squaring. Bones without length give
-    the identity.
+    orientation using unit quaternions"), computed by repeated squaring. Bones without length result
+    in the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
-    # The rotation is the eigenvector of the largest eigenvalue of this symmetric matrix. ONNX has
+    # The rotation is the eigenvector of this symmetric matrix with the largest eigenvalue. ONNX has
     # no operator for eigenvectors. The columns of high powers of a matrix approach this
     # eigenvector, and repeated squaring needs few operations.
     rows = (
@@ -251,7 +250,7 @@ def _twist(
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
-    """Smooths (F, N) over time with a Gaussian. Its standard deviation is `frames`."""
+    """Smooths (F, N) over time with a Gaussian whose standard deviation is `frames`."""
     reach = int(4 * frames + 0.5)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / frames) ** 2).to(x)
     padded = torch.cat([x[:1].expand(reach, -1), x, x[-1:].expand(reach, -1)])

@@ -1,6 +1,6 @@
-"""Rotations of a body in the world.
+"""World rotations of a body.
 
-Blender's extension contains this file, so it needs only numpy.
+Blender's extension contains this file, so the file needs only numpy.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 UPRIGHT = np.cos(np.radians(30))
 STANDING = 0.02  # maximum height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))
-"""Limits for the bend of toes.
+"""Limits of the bend of the toes.
 
 Toes stay flat while the toe joint is below the first height, and follow the foot above the second
 height. The third number is the maximum bend.
@@ -28,15 +28,14 @@ def complete(
     Args:
         joints: (F, 22, 3) in meters.
         offsets: (22, 3), joints relative to their parents in the rest pose.
-        world: (F, 22, 3, 3), rotations in the world.
+        world: (F, 22, 3, 3), world rotations.
 
     Returns:
-        The rotation (22, 3, 3) of each part of the body in the rest pose, the rotations (F, 22,
-            3, 3) of these parts in the world, and the offsets (22, 3) of a body that stands on
-            flat feet.
+        The rotation (22, 3, 3) of each body part in the rest pose, the world rotations (F, 22, 3,
+        3) of the parts, and the offsets (22, 3) of a body that stands on flat feet.
     """
-    # A person who stands upright looks straight ahead. Therefore the median direction from neck
-    # to head, relative to an upright chest, is the direction of a level head. Toes stay flat on
+    # A person who stands upright looks straight ahead. Therefore, the median direction from neck to
+    # head, relative to an upright chest, is the direction of a level head. The toes stay flat on
     # the floor while the heel rises.
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):
@@ -58,7 +57,7 @@ def complete(
 
 
 def world_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Converts rotations (..., 22, 3, 3) relative to the parents to rotations in the world."""
+    """Converts rotations (..., 22, 3, 3) relative to the parents to world rotations."""
     world = rotations.copy()
     for parent, joint in SMPL22.edges:
         world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
@@ -77,7 +76,7 @@ def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotations (..., 3, 3) that turn directions (..., 3) into others."""
+    """Returns the smallest rotations (..., 3, 3) that turn directions (..., 3) into other directions."""
     a, b = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=-1)
@@ -97,7 +96,7 @@ def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Returns the position of the toes of a flat foot relative to the ankle, at rest."""
-    # The foot is flat in the frames in which ankle and toes together are lowest.
+    # The foot is flat in the frames in which ankle and toes are lowest together
     height = ankle[:, 1] + toe[:, 1]
     flat = height <= height.min() + STANDING
     length = np.linalg.norm(offset)

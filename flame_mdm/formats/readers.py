@@ -1,7 +1,7 @@
 """The reader of motion files. Writers are in `flame_mdm.formats.motion`.
 
-`docs/formats.md` describes the files. Commands, data sets and Python read motions here, so a file
-gets the same skeleton, frame rate and checks everywhere.
+`docs/formats.md` describes the files. Commands, data sets and Python all use this reader, so that a
+file always gets the same skeleton, frame rate and checks.
 """
 
 import math
@@ -42,31 +42,31 @@ from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import naming, regular_file
 
-# Rotation from the camera's axes of the action data sets, y down, to y up
+# Rotation from the camera axes of the action data sets (y down) to y up
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-# Number of features of the representations with SMPL's rotations
+# Number of features of the representations that contain SMPL's rotations
 ROTATED = {
     "smpl147": 147,
     "rot6d-25": 150,
     "motion272": 272,
 }
 BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAMERA_AXES}
-"""For each axis that may point up in a file of SMPL's rotations, the rotation to y up.
+"""For each possible up axis in a file of SMPL's rotations, the rotation to y up.
 
 As in AMASS, the default is z.
 """
 PELVIS = (0.0, -0.223, 0.028)
-"""Position of the pelvis of SMPL's template in meters, in the axes of the file.
+"""Position of the pelvis in SMPL's template in meters, in the axes of the file.
 
-A body is there at translation 0, for any rotation.
+A body with translation 0 is at this position, for any rotation.
 """
 
 Standard = Callable[[Bvh], tuple[Bvh, Mapping[str, Any]]]
-"""A change of the tree of a published data set.
+"""A function that changes the tree of a published data set.
 
-The function returns the tree and fields of `Layout`.
+It returns the tree and fields of `Layout`.
 
-Without fields, the file determines the layout.
+Without fields, the layout is determined from the file.
 """
 
 
@@ -75,10 +75,10 @@ class Doubts:
     """Findings that look wrong in a motion, but may be intended.
 
     Attributes:
-        upright: mean vertical component of the direction of the trunk, -1 to 1. The value is NaN
-            (not measured) for files of this project and for KIT-ML's skeleton.
-        lying: a line if the body lies, "" otherwise.
-        jump: a line if the body jumps or a leg flips, "" otherwise.
+        upright: mean vertical component of the trunk direction, from -1 to 1. The value is NaN (not
+            measured) for files of this project and for KIT-ML's skeleton.
+        lying: a message if the body lies, otherwise "".
+        jump: a message if the body jumps or a leg flips, otherwise "".
     """
 
     upright: float = math.nan
@@ -93,16 +93,16 @@ class Doubts:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A motion that was read from a file, with findings of the reader.
+    """A motion that was read from a file, with the findings of the reader.
 
     Attributes:
-        motion: the motion. The notes of the motion are lines for the user.
-        layout: skeleton, unit and frame rate of the file, as `prepare` lists them.
+        motion: the motion. Its notes are lines for the user.
+        layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
         doubts: findings that look wrong. Their lines are among the notes of the motion.
         smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes; None
-            if the file has none.
-        tree: the tree of joints without rest pose, at the frame rate of the file; None if the
-            file has none.
+            if the file contains no such rotations.
+        tree: the tree of joints without frames of a rest pose, at the frame rate of the file; None
+            if the file contains no tree.
     """
 
     motion: Motion
@@ -122,30 +122,30 @@ def read(
 ) -> Motion:
     """Reads a motion file.
 
-    The file can be an `.npz` file of this project, of AMASS or with joints and fps, a `.bvh`
-    file, an animation in an `.fbx`, `.glb`, `.vrm` or `.vrma` file, or an `.amc`, `.json` or
-    `.npy` file.
+    Supported are `.npz` files of this project, of AMASS, or with joints and fps; `.bvh` files;
+    animations in `.fbx`, `.glb`, `.vrm` and `.vrma` files; and `.amc`, `.json` and `.npy` files.
 
     Args:
-        path: the file. The nearest `skeleton.yaml` in its folder or above describes it, except
-            for files written by this project. `fps`, `unit` and `up` override it.
-        fps: frames per second; overrides the rate in the file. .npy and .amc files contain no
+        path: the file. The nearest `skeleton.yaml`, in its folder or above it, describes the file,
+            except for files written by this project. `fps`, `unit` and `up` override it.
+        fps: frames per second; overrides the rate in the file. .npy and .amc files contain no frame
             rate.
-        unit: meters per unit of length in the file. Not for files with SMPL's rotations, such as
-            AMASS's files.
-        up: the axis of the file that points up: y, z or -y.
-        resample_to: target frame rate; None = the rate of the file. Rotations are interpolated on
-            the sphere, joints and translations with cubic splines.
-        animation: name or number, from 1, of an animation in an FBX or GLB file; None = the first
-            one.
+        unit: meters per unit of length in the file. Not applicable to files with SMPL's rotations,
+            such as AMASS's files.
+        up: the up axis of the file: y, z or -y.
+        resample_to: target frame rate; None = the frame rate of the file. Rotations are
+            interpolated on the sphere, joints and translations with cubic splines.
+        animation: name or number, counted from 1, of an animation in an FBX or GLB file; None = the
+            first animation.
 
     Returns:
-        The motion; its `notes` say what was left out or looks wrong.
+        The motion. Its `notes` say what was left out or looks wrong.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        UserError: If the file is damaged or of another kind, has no rate, or is not of a person's
-            size. Also if an argument has no effect on the file.
+        UserError: If the file is damaged or of an unsupported type, if it has no frame rate, or if
+            the body does not have the size of a person. Also if an argument has no effect on the
+            file.
 
     Example:
         >>> walk = read("walk.bvh", resample_to=20)
@@ -169,9 +169,9 @@ def read_recording(
 ) -> Recording:
     """Reads and checks a motion; see `read` for arguments and errors.
 
-    `as_smpl` maps all arrays to SMPL's 22 joints. Otherwise, KIT-ML's 21 joints and SMPL's hands
-    are kept. `standard` changes the tree of a published data set. As published, its root is then
-    resampled linearly.
+    With `as_smpl`, all arrays are mapped to SMPL's 22 joints. Otherwise, KIT-ML's 21 joints and
+    SMPL's hands are kept. `standard` changes the tree of a published data set, whose root is then
+    resampled linearly, as in the published version.
     """
     path = Path(path)
     if path.suffix.lower() not in ENDINGS:
@@ -199,9 +199,9 @@ def read_recording(
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
-    """Returns a motion of joints (F, J, 3) in meters, y up.
+    """Converts joints (F, J, 3) in meters, y up, to a motion.
 
-    The built-in skeleton is chosen by the number of joints.
+    The number of joints selects the built-in skeleton.
     """
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not is_real(values):
@@ -274,7 +274,7 @@ def _of_scene(
 ) -> Recording:
     """Returns the recording of an animation of nodes.
 
-    Its positions are in meters, y up, unless `fields` differ.
+    Its positions are in meters, y up, unless `fields` override this.
     """
     _refuse(fields, ["joints"], "FBX and GLB files contain the names of their joints")
     scene = scenes.read(path, animation)
@@ -306,7 +306,7 @@ def _of_joints(
 ) -> Recording:
     """Returns the recording of an array of joints.
 
-    `said` has the keys of the command, which override the keys of the file.
+    `said` contains the keys of the command, which override the keys of the file.
     """
     rate, joints = _rate(data, rate, fields), data["joints"]
     stated = {key: data[key] for key in ("up", "unit") if key in data}
@@ -425,7 +425,7 @@ def _of_ours(
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
     """Returns the frame rate of arrays.
 
-    The rate comes from the command, the file, or skeleton.yaml, in this order.
+    The rate is taken from the command, the file, or skeleton.yaml, in this order.
     """
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
@@ -436,7 +436,7 @@ def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]
 
 
 def _checked(fields: dict[str, Any]) -> dict[str, Any]:
-    """Checks fields of `Layout`, some of which may be from a JSON file, and returns them."""
+    """Checks and returns fields of `Layout`, some of which may come from a JSON file."""
     try:
         Layout(**{key: value for key, value in fields.items() if key in ("up", "unit")})
     except ValueError as error:
@@ -448,7 +448,7 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: str) -> None:
-    """Raises `UserError` if a key cannot have an effect on the file."""
+    """Raises `UserError` if the file has a key that cannot have an effect on it."""
     for key in without_effect:
         if key in fields:
             raise UserError(
@@ -480,7 +480,7 @@ def _label(path: Path, layout: Layout, rate: float) -> str:
 def _resampled(motion: Motion, fps: float | None) -> Motion:
     """Returns a motion at another frame rate, with only its joints.
 
-    A motion that already has this rate is returned unchanged.
+    A motion that already has this frame rate is returned unchanged.
     """
     if fps is None or math.isclose(motion.fps, fps):
         return motion
@@ -489,9 +489,9 @@ def _resampled(motion: Motion, fps: float | None) -> Motion:
 
 
 def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Returns the position of the pelvis (F, 3) and rotation matrices (F, 24, 3, 3).
+    """Returns the pelvis positions (F, 3) and rotation matrices (F, 24, 3, 3).
 
-    The arguments are a translation and quaternions.
+    `smpl` consists of a translation and quaternions.
     """
     translation, turns = smpl
     return translation + torch.tensor(PELVIS, dtype=torch.float64), rotation.quaternion_to_matrix(
@@ -502,7 +502,7 @@ def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """Returns a translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes.
 
-    `axes` turns the axes of the file to y up.
+    `axes` rotates the axes of the file to y up.
     """
     if torch.equal(axes, AMASS_AXES):
         return translation, turns
@@ -530,7 +530,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
             raise UserError(
                 f"{len(data['poses'])} frames of poses, but {len(data['joints'])} frames of joints"
             )
-        # This translation does not include the pelvis of SMPL's template
+        # This translation does not include the pelvis position of SMPL's template
         translation, turns = smpl_motion(data)
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))

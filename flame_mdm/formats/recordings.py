@@ -9,19 +9,19 @@ AT_60: frozenset[str] = frozenset(
     read_package_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"]
 )
 """Subjects and single recordings that CMU recorded at 60 frames per second."""
-# Skeletons of CMU's recordings and their conversions
+# Skeletons of CMU's recordings and of their conversions
 CMU_SKELETONS = (
     "CMU",
     "CMU ASF",
     "Daz",
     "Character Creator",
 )
-# Name of a recording of CMU, with its subject
+# File name of a CMU recording, with its subject
 TRIAL = re.compile(r"(?<!\d)(\d{2,3})_\d{2,3}(?!\d)")
 
 
 def is_at_60(trial: str) -> bool:
-    """Returns whether CMU lists a recording, such as 60_01, at 60 frames per second."""
+    """Returns whether CMU lists a recording, such as 60_01, with 60 frames per second."""
     return not {trial, trial.partition("_")[0]}.isdisjoint(AT_60)
 
 

@@ -1,6 +1,6 @@
 """Frame rates, lengths and resampling of motions.
 
-Rates and lengths are limited, because a file of a few bytes can declare any value.
+Rates and lengths are limited, because even a file of a few bytes can declare any value.
 """
 
 import math
@@ -14,16 +14,16 @@ from flame_mdm.errors import UserError
 RATES = (0.1, 1000.0)
 # Maximum number of frames of a motion: 70 minutes at 120 frames per second
 MAX_FRAMES = 500_000
-# Maximum number of frames times joints of a tree: an hour of 57 joints at 120 frames per second
+# Maximum number of frames times joints of a tree: one hour with 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000
-# Number of frames times joints that a file of any size may have; reading it takes 300 MB
+# Number of frames times joints that are accepted for any file size; reading them takes 300 MB
 FEW_POSITIONS = 1_000_000
 BYTES_PER_POSITION = 4
 """Minimum number of bytes per frame and joint, for files with more positions.
 
-A joint with three numbers of one digit takes 6 bytes in each frame, but end sites take no bytes.
+A joint with three one-digit numbers takes 6 bytes per frame, but end sites take no bytes.
 """
-# Maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 fps
+# Maximum number of joint positions after upsampling: 38 minutes with 22 joints at 20 fps
 MAX_RESAMPLED = 1_000_000
 
 
@@ -34,7 +34,7 @@ def frame_rate(value: Any, name: str = "fps") -> float:
         UserError: If the value is not a number in `RATES`.
     """
     number = np.asarray(value)
-    # Some programs write an array with one number
+    # Some programs write an array that contains one number
     number = number.reshape(()) if number.size == 1 else number
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         limits = f"from {RATES[0]:g} to {RATES[1]:g}"
@@ -51,7 +51,7 @@ def check_frames(frames: int) -> None:
 def check_tree(frames: int, joints: int, size: int) -> None:
     """Raises `UserError` if a file of `size` bytes has too many frames for its number of joints.
 
-    Each joint takes memory in each frame, even if the file contains no numbers for it.
+    Each joint takes memory in each frame, even if the file contains no numbers for this joint.
     """
     check_frames(frames)
     most = min(MAX_POSITIONS, max(FEW_POSITIONS, size // BYTES_PER_POSITION))
@@ -65,14 +65,14 @@ def check_tree(frames: int, joints: int, size: int) -> None:
 def frame_pairs(
     frames: int, rate: float, fps: float, joints: int, slack: float = 1e-6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the frames before and after each new frame, and its position between them, 0 to 1.
+    """Returns the frames before and after each new frame, and its position between them, from 0 to 1.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may be
-    past it by `slack` of a frame.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may be up
+    to `slack` of a frame later.
 
     Raises:
-        UserError: If there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED`
-            positions after resampling.
+        UserError: If there are more than `MAX_FRAMES` frames before resampling, or more than
+            `MAX_RESAMPLED` positions after it.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1
@@ -81,7 +81,7 @@ def frame_pairs(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
-    # Frames are counted from the first one, so that rounding errors do not accumulate. A new
+    # Frames are counted from the first frame, so that rounding errors do not accumulate. A new
     # frame that is slightly past the last old frame takes the value of the last old frame.
     times = np.arange(count) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
@@ -91,8 +91,8 @@ def frame_pairs(
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
     """Resamples positions (F, ...) from `rate` to `fps` frames per second.
 
-    Returns F' = floor((F - 1) fps / rate) + 1 frames. With `cubic`, values between frames are on
-    a cubic spline, and bones keep their length to 0.1 %. Otherwise, they are interpolated
+    Returns F' = floor((F - 1) fps / rate) + 1 frames. With `cubic`, values between frames lie on a
+    cubic spline, and bones keep their length to within 0.1 %. Otherwise, values are interpolated
     linearly.
     """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
@@ -105,7 +105,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Returns the cubic spline through values (F, ...) at `times` (N,).
 
-    The values are at times 0, 1, ...; times are in frames.
+    The values are at times 0, 1, ...; `times` are in frames.
     """
     from scipy.interpolate import CubicSpline  # imported here, because few motions need it
 

@@ -25,7 +25,7 @@ DIRECTIONS = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back":
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
 """Euler orders for which common poses are far from gimbal lock.
 
-Such poses are bent limbs, a hanging arm, and a body that turns or bows.
+Common poses are bent limbs, a hanging arm, and a body that turns or bows.
 """
 
 
@@ -36,7 +36,7 @@ def presets() -> dict[str, dict[str, Any]]:
 
 
 def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the joint names of a skeleton in `rigs.yaml`, without prefix, by SMPL's joint."""
+    """Returns the joint names of a skeleton in `rigs.yaml`, without prefix, by SMPL joint."""
     names = {}
     for part, side, mark in _parts(skeleton):
         bones = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
@@ -55,7 +55,7 @@ def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def preset(name: str | None, poses: Poses) -> Rig:
-    """Returns a skeleton of `rigs.yaml` with a body's bone lengths; None = SMPL's skeleton."""
+    """Returns a skeleton of `rigs.yaml` with the bone lengths of a body; None = SMPL's skeleton."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
         return Rig(
@@ -88,14 +88,14 @@ def preset(name: str | None, poses: Poses) -> Rig:
             label = label.replace("*", mark)
             if isinstance(source, str):
                 joint = JOINT[side + source]
-                # A joint without a child continues the bone before it.
+                # A joint without a child continues in the direction of the previous bone.
                 end = SMPL22.parents.index(joint) if joint in SMPL22.parents else joint
                 local = _axes(data.get("axes", {}), part, source, offsets[end], side == "right_")
                 joints.append(
                     _RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local)
                 )
             else:
-                # A joint that SMPL lacks is between its parent and the next joint of SMPL, at a
+                # A joint that SMPL lacks lies between its parent and the next SMPL joint, at a
                 # fraction of the distance. It does not rotate.
                 above = joints[parent]
                 following = next(ours for _, ours in names[number:] if isinstance(ours, str))
@@ -119,7 +119,8 @@ def preset(name: str | None, poses: Poses) -> Rig:
 class _RigJoint(NamedTuple):
     """A joint of a rig in the rest pose.
 
-    It has a name, a parent, a joint of SMPL, a position, a world rotation and a neutral rotation.
+    Its fields are a name, a parent, an SMPL joint, a position, a world rotation and a neutral
+    rotation.
     """
 
     name: str
@@ -132,13 +133,13 @@ class _RigJoint(NamedTuple):
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
     """Returns the local axes (3, 3) of a joint in a T-pose; `bone` is the bone's direction."""
-    # Gram-Schmidt: the first direction is kept. The second direction loses its part along the
-    # first. The third axis is their cross product. The right side is the mirror image of the left
-    # side. In skeletons that are "opposed", all three axes are then reversed, which keeps them
-    # right-handed.
+    # Gram-Schmidt: the first direction is kept. The component along the first direction is removed
+    # from the second direction. The third axis is their cross product. The right side is the mirror
+    # image of the left side. In "opposed" skeletons, all three axes are then reversed, which keeps
+    # them right-handed.
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
-    # The file lists axes for two directions, and only for the left side.
+    # The file lists the axes for two directions, and only for the left side.
     for axis, direction in axes.get(joint, axes.get(part, {})).items():
         toward = np.array(DIRECTIONS[direction], float) if direction in DIRECTIONS else bone * flip
         for column in columns:
@@ -158,8 +159,8 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """Applies a motion to a skeleton.
 
     Returns:
-        The local rotations (F, J, 3, 3), as in `Rig.local`, and the position of the hips (F, 3)
-            in the world.
+        The local rotations (F, J, 3, 3), as in `Rig.local`, and the world position of the hips (F,
+        3).
     """
     return rig.local(rig.turned(world_rotations(poses.rotations.numpy()))), poses.root.numpy()
 
@@ -170,7 +171,7 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
     Programs can then interpolate the angles.
 
     Args:
-        matrices: (F, J, 3, 3).
+        matrices: (F, J, 3, 3), the rotations.
         orders: order of the axes of each joint, such as "ZXY".
 
     Returns:

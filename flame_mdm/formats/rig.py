@@ -1,6 +1,6 @@
 """Skeletons of other programs, and moving characters.
 
-Blender's extension contains this file, so it needs only numpy.
+Blender's extension contains this file, so the file needs only numpy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,16 +17,16 @@ CENTIMETER = 0.01
 SIDES = ("left", "right")
 LEGS = (("hip", "knee"), ("knee", "ankle"))
 LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
-"""Joints whose bone takes the direction of the motion's bone, with the joint at its end."""
+"""Joints whose bone takes the direction of the motion's bone, with the joint at the end of the bone."""
 SPINE = ("spine1", "spine2", "spine3")
-# Maximum angle in degrees between the trunk of a rest pose and the vertical
+# Maximum angle in degrees between the trunk in a rest pose and the vertical
 TILT = 45
 # A facing direction within this angle of an axis, in degrees, is replaced by the axis
 SNAP = 8
 # Minimum sine of the bend angle of an elbow or knee in the rest pose. The twist of a straighter
-# limb cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees
-# at the knees and by 5 degrees at the elbows. A small bend is therefore far from the axis of the
-# joint.
+# limb cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees at
+# the knees and by 5 degrees at the elbows. The axis of a small bend is therefore far from the axis
+# of the joint.
 BEND = 0.25
 # Maximum height in meters of the lowest joint of a clip that stands on the floor
 GROUND = 0.1
@@ -46,11 +46,11 @@ class Rig:
     parents: tuple[int, ...]
     # (J, 3), positions of the joints
     positions: np.ndarray
-    # (J, 3, 3), rotations of the joints in the world
+    # (J, 3, 3), world rotations of the joints
     turns: np.ndarray
-    # For each joint, the index of the joint of SMPL whose rotation it takes, or -1
+    # For each joint, the index of the SMPL joint whose rotation it takes, or -1
     sources: tuple[int, ...]
-    # (J, 3, 3), rotations of these joints in the world while SMPL is in its rest pose
+    # (J, 3, 3), world rotations of these joints while SMPL is in its rest pose
     neutral: np.ndarray
     # Order of the Euler angles of each joint in BVH files
     orders: tuple[str, ...]
@@ -58,7 +58,7 @@ class Rig:
     unit: float = CENTIMETER
     # (3, 3), rotation from the world of the file
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))
-    # (J,), scale of each joint: world units per unit of the joint. Empty = all scales are 1
+    # (J,), scale of each joint: world units per unit of the joint. Empty = all scales are 1.
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property
@@ -69,14 +69,14 @@ class Rig:
     def offsets(self) -> np.ndarray:
         """Returns the position (J, 3) of each joint relative to its parent.
 
-        The position of a root is in the world of the file.
+        The position of a root is in the world coordinates of the file.
         """
         return np.stack(
             [self.within(self.positions[joint], joint) for joint in range(len(self.joints))]
         )
 
     def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
-        """Converts positions (..., 3) from the world to the frame of a joint's parent at rest."""
+        """Converts world positions (..., 3) to the coordinates of a joint's parent at rest."""
         parent = self.parents[joint]
         if parent < 0:
             return positions @ self.frame
@@ -86,14 +86,14 @@ class Rig:
     def rest(self) -> np.ndarray:
         """Returns the rotation (J, 3, 3) of each joint relative to its parent.
 
-        The rotation of a root is relative to the world of the file.
+        The rotation of a root is relative to the world coordinates of the file.
         """
         return self.local(self.turns)
 
     def local(self, turned: np.ndarray) -> np.ndarray:
-        """Converts rotations (..., J, 3, 3) in the world to rotations relative to the parents.
+        """Converts world rotations (..., J, 3, 3) to rotations relative to the parents.
 
-        The rotation of a root becomes relative to the world of the file.
+        The rotation of a root becomes relative to the world coordinates of the file.
         """
         local = turned.copy()
         for joint, parent in enumerate(self.parents):
@@ -102,9 +102,9 @@ class Rig:
         return local
 
     def turned(self, body: np.ndarray) -> np.ndarray:
-        """Returns rotations (F, J, 3, 3) in the world that follow SMPL's, `body` (F, 22, 3, 3).
+        """Returns world rotations (F, J, 3, 3) that follow SMPL's world rotations `body` (F, 22, 3, 3).
 
-        Joints without counterpart in SMPL follow their parent.
+        Joints without a counterpart in SMPL follow their parent.
         """
         rest, turned = self.rest(), np.tile(self.turns, (len(body), 1, 1, 1))
         for joint, (parent, source) in enumerate(zip(self.parents, self.sources, strict=True)):
@@ -132,13 +132,13 @@ class Rig:
 def recognized(
     names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]
 ) -> dict[str, list[int]]:
-    """Returns, for each joint of SMPL, the numbers of the joints that may correspond to it.
+    """Returns, for each SMPL joint, the numbers of the joints that may correspond to it.
 
-    The correspondence comes from the most similar known skeleton.
+    The correspondence is determined by the most similar known skeleton.
 
     Args:
         names: names of the joints by number.
-        skeletons: joint of SMPL by spelling of a joint, as in
+        skeletons: for each skeleton, a mapping from joint spellings to SMPL joints, as in
             `flame_mdm.formats.names.best_match`.
     """
     numbers = list(names)
@@ -153,9 +153,9 @@ def recognized(
 def matched(
     source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, int], list[str]]:
-    """Returns the numbers of a character's joints, by joint of SMPL, and the missing joints.
+    """Returns the numbers of a character's joints, by SMPL joint, and the missing joints.
 
-    Only required joints are reported as missing. Each joint of SMPL has at most one number.
+    Only required joints are reported as missing. Each SMPL joint has at most one number.
     """
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
@@ -182,7 +182,7 @@ class RestPose:
     floor: float
 
     def position(self, joint: str) -> np.ndarray:
-        """Returns the position (3,) of SMPL's joint in the rest pose."""
+        """Returns the position (3,) of an SMPL joint in the rest pose."""
         return self.rig.positions[self.map[joint]]
 
 
@@ -196,25 +196,25 @@ def rest_pose(
     lowest: np.ndarray,
     vertical: Sequence[int],
 ) -> RestPose:
-    """Returns a rest pose, turned to y up and +z ahead.
+    """Returns a rest pose, turned so that y is up and +z is ahead.
 
     Args:
         source: name of the character in messages.
         names: names of the J joints.
         parents: index of each joint's parent.
-        positions: (J, 3), in a world of any unit and direction.
-        turned: (J, 3, 3), rotations in this world.
-        joints: index of the character's joint by joint of SMPL.
-        lowest: points in this world that include the lowest one.
-        vertical: (3,), the direction in this world that is up.
+        positions: (J, 3), in world coordinates with any unit and direction.
+        turned: (J, 3, 3), rotations in these coordinates.
+        joints: index of the character's joint by SMPL joint.
+        lowest: points in these coordinates that include the lowest point.
+        vertical: (3,), the up direction in these coordinates.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
     def middle(name: str) -> np.ndarray:
         return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
 
-    # First, the pose must be usable: limbs have a length, trunk and legs are upright, and left
-    # and right joints are apart.
+    # First, the pose must be usable: limbs have a length, the trunk and the legs are upright, and
+    # left and right joints are at different points.
     trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
     up = np.array(vertical)
     shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)
@@ -233,9 +233,9 @@ def rest_pose(
             f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. Use a T- or an A-pose"
         )
 
-    # The axes of the new frame are: x to the left, from hips and shoulders, y up, z ahead. A
-    # direction that is nearly an axis of the file becomes this axis. Small asymmetries of a mesh
-    # then do not turn the character.
+    # The axes of the new coordinates are x to the left (from hips and shoulders), y up, and z
+    # ahead. A direction that is nearly an axis of the file is replaced by this axis, so that small
+    # asymmetries of a mesh do not turn the character.
     left = at["left_hip"] + at["left_shoulder"] - at["right_hip"] - at["right_shoulder"]
     left = left - up * (up @ left)
     if np.linalg.norm(left) <= shortest:
@@ -251,7 +251,7 @@ def rest_pose(
         )
     sources = dict(joints)
     spine = [joint for joint in SPINE if joint in sources]
-    if spine:  # the arms start at the last joint of the spine, which moves as the chest
+    if spine:  # the arms start at the last joint of the spine, which moves like the chest
         sources["spine3"] = sources.pop(spine[-1])
     of = {number: JOINT[joint] for joint, number in sources.items()}
     rig = Rig(
@@ -268,14 +268,14 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with neutral rotations, in which its limbs point like SMPL's at rest.
+    """Returns the skeleton with neutral rotations, in which its limbs have the directions of SMPL's limbs at rest.
 
     `offsets` (22, 3) are the offsets of SMPL's joints from their parents at rest.
     """
-    # Each bone of a limb is turned from the character's rest pose to SMPL's. Its direction comes
-    # first, then its twist, so that knees and elbows bend about the same axis. A limb that is
-    # clearly bent at rest shows this axis. If a limb is straight, knees are assumed to bend
-    # backward, and elbows forward.
+    # Each bone of a limb is turned from the character's rest pose to SMPL's. First its direction is
+    # matched, then its twist, so that knees and elbows bend about the same axis. A limb that is
+    # clearly bent at rest shows this axis. In a straight limb, knees are assumed to bend backwards,
+    # and elbows forward.
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
         for (start, middle, end), bend in (
@@ -311,22 +311,22 @@ def follow(
     neutral: np.ndarray,
     world: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, Rig]:
-    """Moves a character like a body.
+    """Applies the motion of a body to a character.
 
     Args:
         character: the character.
         joints: (F, 22, 3), joints of the body in meters.
         offsets: (22, 3), offsets of the joints from their parents in the rest pose.
-        neutral: (22, 3, 3), rotations of the body's parts in the rest pose.
-        world: (F, 22, 3, 3), rotations of the body's parts in the world.
+        neutral: (22, 3, 3), rotations of the body parts in the rest pose.
+        world: (F, 22, 3, 3), world rotations of the body parts.
 
     Returns:
         Rotations (F, J, 3, 3) and positions (F, J, 3) of the character, and its skeleton.
     """
     # All joints get the rotations of the body, relative to the rest poses. The hips follow the
-    # scaled path. Legs with other proportions would then hover or sink. Therefore each leg is
-    # bent until its toes or its ankle are at the scaled position, at the character's own height
-    # above the floor.
+    # scaled path. Legs with other proportions would then hover or sink. Therefore, each leg is bent
+    # until its toes or its ankle reach the scaled position, at the character's own height above the
+    # floor.
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)
     neutral[JOINT["neck"]] = neutral[JOINT["head"]]
@@ -341,7 +341,7 @@ def follow(
         for a, b in LEGS
     ]
     scale = float(np.linalg.norm(leg_bones, axis=1).sum() / np.linalg.norm(legs, axis=1).sum())
-    # heights of the ankles above the floor while the feet are flat
+    # Heights of the ankles above the floor while the feet are flat
     flat = {s: (neutral[JOINT[f"{s}_ankle"]].T @ offsets[JOINT[f"{s}_foot"]])[1] for s in SIDES}
     higher = {
         s: character.position(f"{s}_ankle")[1] - character.floor + scale * flat[s] for s in SIDES
@@ -377,11 +377,11 @@ def follow(
 def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
-    """Returns the position (F, 3) of a knee if the ankle is at `target`, or as near as possible.
+    """Returns the position (F, 3) of a knee if the ankle is at `target`, or as close to it as possible.
 
     The knee bends to the same side as before.
     """
-    # Thigh, shin and the line to the target are a triangle, as in `cleanup.bend`.
+    # Thigh, shin and the line to the target form a triangle, as in `cleanup.bend`.
     thigh, shin = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
     line = target - hip
     length = np.maximum(np.linalg.norm(line, axis=1), 1e-9)
@@ -392,8 +392,8 @@ def _bent(
     out = (knee - hip) - before * ((knee - hip) * before).sum(1, keepdims=True) / (before**2).sum(
         1, keepdims=True
     )
-    # A straight leg does not show where its knee points, so a small part of the thigh's front is
-    # added.
+    # A straight leg does not show in which direction its knee points, so a small fraction of the
+    # thigh's front direction is added.
     out = out + STRAIGHT * thigh[:, None] * forward
     out = out - line * (out * line).sum(1, keepdims=True)
     out = out / np.linalg.norm(out, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Moving skeletons of other programs, with a person's skin, for .glb, .fbx and USD files.
+"""Moving skeletons of other programs, with the skin of a person, for .glb, .fbx and USD files.
 
 Lengths are in meters, y up. The rest pose faces +z. F, J and V are the numbers of frames, joints
 and vertices.
@@ -42,7 +42,7 @@ PALETTE = tuple(
 )
 """Materials of the package's person."""
 CONTACTS = ("LeftFootContact", "RightFootContact")
-"""Properties in .fbx and USD files that say whether the left or right foot is planted."""
+"""Properties in .fbx and USD files that indicate whether the left or right foot is planted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +91,13 @@ class RiggedClip:
             the root.
         offsets: (J, 3), position of each joint relative to its parent in the rest pose.
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
-        turns: (F, J, 3, 3), rotations relative to parents.
-        moves: positions (F, 3) relative to their parents, for the joints that move there.
-        lift: height of a person above these positions: the thickness of the soles.
-        skins: the meshes; () if the motion does not fit a person.
+        turns: (F, J, 3, 3), rotations relative to the parents.
+        moves: positions (F, 3) relative to their parents, for the joints with a moving position.
+        lift: height by which a person is raised above these positions: the thickness of the soles.
+        skins: the meshes; () if no person fits the motion.
         scales: (J,), units of the parent per unit of each joint.
         root: index of the joint on the floor above the hips; -1 = no such joint.
-        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) = not known.
+        contacts: (F, 2), whether the left and the right toes are planted; (0, 2) = unknown.
     """
 
     name: str
@@ -115,9 +115,9 @@ class RiggedClip:
     contacts: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), bool))
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns positions (F, J, 3) and rotations (F, J, 3, 3) of the joints in the world.
+        """Returns the world positions (F, J, 3) and world rotations (F, J, 3, 3) of the joints.
 
-        They are not lifted. All joints of the skeleton must have the scale 1.
+        The joints are not lifted. All joints of the skeleton must have the scale 1.
         """
         positions = np.tile(self.offsets, (len(self.turns), 1, 1))
         for joint, moved in self.moves.items():
@@ -138,7 +138,7 @@ class RiggedClip:
     def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Returns the changes of each of `CONTACTS`: frames (K,) and new values (K,).
 
-        The first frame is always among them. The result is empty if the contacts are not known.
+        The first frame is always included. The result is empty if the contacts are unknown.
         """
         if not len(self.contacts):
             return {}
@@ -149,7 +149,7 @@ class RiggedClip:
         return changes
 
     def on_path(self, path: np.ndarray, heading: np.ndarray) -> "RiggedClip":
-        """Returns a clip whose body stays in place, moved along a path.
+        """Moves a clip whose body stays in place along a path.
 
         The root moves. If there is no root on the floor, the hips move.
 
@@ -173,9 +173,9 @@ class RiggedClip:
         return replace(self, turns=turns, moves=moves)
 
     def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Returns `offsets` and `moves` with the person on its soles.
+        """Returns `offsets` and `moves` with the person standing on the soles.
 
-        The hips are lifted, and a root stays on the floor.
+        The hips are lifted, while a root stays on the floor.
         """
         offsets = self.offsets.copy()
         moves = {joint: moved.copy() for joint, moved in self.moves.items()}
@@ -222,7 +222,7 @@ def rigged(
     fitted: FittedBody | None = None,
     root_motion: bool = False,
 ) -> RiggedClip:
-    """Returns a moving body as a clip of a skeleton.
+    """Converts a moving body to a clip of a skeleton.
 
     Args:
         poses: the body.
@@ -230,8 +230,8 @@ def rigged(
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
         fitted: the body of the person. Its toes bend as in pictures. None = no skin.
-        root_motion: the root on the floor follows the hips and their direction. Otherwise, it
-            stays in place.
+        root_motion: whether the root on the floor follows the hips and their direction. Otherwise,
+            it stays in place.
 
     Raises:
         UserError: If `root_motion` is set for a skeleton without a root on the floor.
@@ -268,10 +268,10 @@ def rigged(
 def _with_root_motion(
     turns: np.ndarray, hips: np.ndarray, skeleton: Rig
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-    """Moves the path and the direction of the hips on the floor to the root above the hips.
+    """Transfers the path and the direction of the hips on the floor to the root above the hips.
 
-    The direction is the heading of the hips relative to the first frame's axes, a rotation about
-    the vertical axis.
+    The direction is the heading of the hips relative to the axes of the first frame, a rotation
+    about the vertical axis.
     """
     root, joint = skeleton.parents[skeleton.hips], skeleton.hips
     above = skeleton.turns[root]
@@ -309,8 +309,8 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     count = len(skinned)
     binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
 
-    # Joints without vertices keep their position in their parents, because three.js reads it from
-    # the pose of the mesh.
+    # Joints without vertices keep their position relative to their parents, because three.js reads
+    # it from the pose of the mesh.
     worlds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     worlds[skinned] = np.linalg.inv(binds[:count])
     local = np.tile(np.eye(4), (len(rig.joints), 1, 1))

@@ -7,14 +7,14 @@ from flame_mdm.formats import fbx_scene, glb_animation
 from flame_mdm.formats.animated import AnimatedNodes
 
 TIP = re.compile(r"[_. ]?(end|nub|tip)(site)?$", re.IGNORECASE)
-"""Suffixes of the node at the tip of the last bone, which BVH files call an end site."""
+"""Suffixes of the node at the tip of the last bone, which is called an end site in BVH files."""
 
 
 def read(path: Path, animation: str | None = None) -> AnimatedNodes:
-    """Reads an animation by its name or number, from 1; None = the first one.
+    """Reads an animation by its name or number, counted from 1; None = the first animation.
 
     Raises:
-        UserError: As the readers of both formats.
+        UserError: As in the readers of both formats.
     """
     reader = fbx_scene if path.suffix.lower() == ".fbx" else glb_animation
     return reader.read(path, animation)
@@ -27,11 +27,11 @@ def animations(path: Path) -> list[str]:
 
 
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
-    """Returns a name per node, as in the layouts of skeletons.
+    """Returns a joint name per node, as in the layouts of skeletons.
 
-    If the file declares the bones of a humanoid, they get SMPL's names. A node at the tip of a
-    bone is called `NAME.end`, like the end site of a bone in a BVH file. This also applies if the
-    tip has the name of the bone with another ending.
+    If the file declares the bones of a humanoid, these bones get SMPL's names. A node at the tip of
+    a bone is called `NAME.end`, like the end site of a bone in a BVH file. This also applies if the
+    name of the tip is the name of the bone with another ending.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

@@ -64,7 +64,7 @@ def _paths(clip: RiggedClip) -> list[str]:
 
 
 def _name(name: str) -> str:
-    """Returns a name of only letters, digits and underscores, which begins with no digit."""
+    """Returns a name that contains only letters, digits and underscores, and does not begin with a digit."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", name) or "_"
     return f"_{plain}" if plain[0].isdigit() else plain
 
@@ -160,12 +160,12 @@ def _mesh(stage: Any, skin: Skin) -> None:
 
 
 def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
-    """Declares the box around the person in each frame. The joints determine the box."""
+    """Declares the bounding box of the person in each frame, computed from the joints."""
     from pxr import UsdGeom, Vt
 
     positions, _ = clip.world()  # scales are ignored: the box only has to be large enough
     positions[..., 1] += clip.lift
-    # distance in meters from joints to the farthest point of the surface, the tips of hands and
+    # Distance in meters from joints to the farthest point of the surface, at the tips of hands and
     # head
     margin = 0.25
     boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()

@@ -1,7 +1,7 @@
 """Writes a motion as a VRM animation (.vrma), which can move any VRM avatar.
 
 Source: VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A
-.vrma file is a .glb file without a mesh. It declares which nodes are the bones of a humanoid. Its
+.vrma file is a .glb file without a mesh that declares which nodes are the bones of a humanoid. Its
 rest pose is VRM's T-pose: limbs along the axes, feet straight ahead, soles on the floor. Programs
 apply the rotations relative to this pose, and scale the path of the hips by the ratio of the two
 hip heights.
@@ -28,7 +28,7 @@ LIMBS = {"shoulder": (1, 0, 0), "elbow": (1, 0, 0), "hip": (0, -1, 0), "knee": (
 def rest_rig(poses: Poses) -> Rig:
     """Returns VRM's humanoid in its T-pose, with the bone lengths of a body.
 
-    Its axes are the axes of the world.
+    Its axes are the world axes.
     """
     names = {joint: bone for bone, joint in HUMANOID.items()}
     offsets = poses.offsets.numpy().copy()
@@ -40,7 +40,7 @@ def rest_rig(poses: Poses) -> Rig:
             toward = np.array(direction, float) * [sign, 1, 1]
             neutral[joint] = shortest_turns(toward[None], offsets[child][None])[0]
             offsets[child] = toward * np.linalg.norm(offsets[child])
-        # The foot turns about the vertical axis, so its sole stays flat.
+        # The foot turns about the vertical axis, so that its sole stays flat.
         ankle, toes = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
         sideways, down, ahead = offsets[toes]
         angle = np.arctan2(sideways, ahead)

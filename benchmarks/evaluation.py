@@ -33,9 +33,7 @@ TORCHMETRICS, FRAMEWORK = "torchmetrics' FrechetInceptionDistance", "framework"
 
 
 class Stub(Extractor):
-    """An extractor without a network:
-    the first numbers of a motion, and random features of captions.
-    """
+    """An extractor without a network: the first numbers of a motion, and random features of captions."""
 
     sha256 = "stub"
 
@@ -66,9 +64,7 @@ class Windows:
 
 
 def random_clips(count: int) -> Clips:
-    """Returns clips with random features;
-    a third of the clips have the maximum length, as in HumanML3D.
-    """
+    """Returns clips with random features; a third of the clips have the maximum length, as in HumanML3D."""
     generator = np.random.default_rng(0)
     lengths = np.minimum(generator.integers(40, 275, count), 199)
     ends = np.cumsum(lengths)

@@ -31,9 +31,7 @@ STEP, LOADER, RESIDENT = "step", "loader, one core", "resident, one core"
 
 
 def training(features: int) -> Callable[[MotionBatch], None]:
-    """Returns a training step (forward, backward, update)
-    of MDM's encoder in the size for CPUs.
-    """
+    """Returns a training step (forward, backward, update) of MDM's encoder in the size for CPUs."""
     model = MDMEncoder(
         features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0
     )

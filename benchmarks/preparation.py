@@ -1,5 +1,4 @@
-"""Measures speed and memory
-of `make prepare` at several sizes: `python benchmarks/preparation.py`.
+"""Measures speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
 
 For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder
 (1.1 KB of disk per frame), with one worker per core. The results are the processor time of all
@@ -25,9 +24,7 @@ MEMORY = ("main process, MiB", "worker, MiB", "private to main, MiB", "private t
 
 
 def private(process: int) -> int:
-    """Returns the private memory of a process in bytes;
-    0 after its end, and on systems without /proc.
-    """
+    """Returns the private memory of a process in bytes; 0 after its end, and on systems without /proc."""
     try:
         lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -52,9 +49,7 @@ class Peaks(threading.Thread):
 
 
 def prepare(clips: int) -> None:
-    """Prepares clips in this process;
-    prints as JSON the frames, processor seconds and bytes of memory.
-    """
+    """Prepares clips in this process; prints as JSON the frames, processor seconds and bytes of memory."""
     from flame_mdm.data.store import write_store
     from flame_mdm.data.synthetic import Synthetic
     from flame_mdm.representations.humanml import HumanML
@@ -78,9 +73,7 @@ def prepare(clips: int) -> None:
 
 
 def measure(settings: Settings) -> Section:
-    """Measures memory and time of the preparation
-    of large data sets and returns the section of the page.
-    """
+    """Measures memory and time of the preparation of large data sets and returns the section of the page."""
     rows: list[Row] = []
     growth: list[tuple[float, float]] = []
     for size in [2000] if settings.quick else [250_000, 1_000_000]:

@@ -1,5 +1,4 @@
-"""Times training steps of one process and
-of two gloo processes: `python benchmarks/processes.py`.
+"""Times training steps of one process and of two gloo processes: `python benchmarks/processes.py`.
 
 Both trainings use the same batches of 16 clips: one process has all 16 clips, two processes have
 8 clips each. Each process has one thread. With one core per process, the ideal ratio is 0.5; two

@@ -46,9 +46,7 @@ def values(run: Run) -> dict[str, float]:
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
-    """Returns the values of the runs in a folder,
-    by training (with its data set), speed and seed.
-    """
+    """Returns the values of the runs in a folder, by training (with its data set), speed and seed."""
     runs: dict[str, dict[str, BySeed]] = {}
     for path in sorted(folder.glob(f"*/{CONFIG}")):
         run = read_run(path.parent)
@@ -65,9 +63,7 @@ def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
 
 
 def shown(mean: float, half: float, sign: str = "") -> str:
-    """Returns mean and half width as text;
-    both have the decimals of a half width with two significant digits.
-    """
+    """Returns mean and half width as text; both have the decimals of a half width with two significant digits."""
     decimals = next((count for count in range(6) if half >= 10 ** (1 - count)), 6 if half else 2)
     return f"{mean:{sign},.{decimals}f} ± {half:,.{decimals}f}"
 
@@ -80,9 +76,7 @@ def interval(sample: Sequence[float]) -> tuple[float, float]:
 
 
 def measure(settings: Settings) -> Section:
-    """Compares the metrics of runs that differ only in speed,
-    and returns the section of the page.
-    """
+    """Compares the metrics of runs that differ only in speed, and returns the section of the page."""
     folder = Path(settings.runs or ".")
     tables: dict[str, list[Row]] = {}
     differing: list[str] = []

@@ -116,9 +116,7 @@ def render(sections: dict[str, Any]) -> str:
 
 
 def _position(name: str) -> tuple[int, bool]:
-    """Returns the position of a section on the page,
-    in the order of the scripts, CPU before GPU.
-    """
+    """Returns the position of a section on the page, in the order of the scripts, CPU before GPU."""
     scripts = [*SECTIONS, *ON_REQUEST]
     return scripts.index(name.removesuffix("_cuda")), name.endswith("_cuda")
 

@@ -1,7 +1,5 @@
 # pyright: standard
-"""Evaluator audit: perturbs real motions at graded strengths
-and measures them like generated motions.
-"""
+"""Evaluator audit: perturbs real motions at graded strengths, and measures them like generated motions."""
 
 from __future__ import annotations
 
@@ -52,8 +50,7 @@ AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
-    """Measures perturbed motions of a split,
-    with intervals from bootstrap resamples; see docs/audit.md.
+    """Measures perturbed motions of a split, with intervals from bootstrap resamples; see docs/audit.md.
 
     A killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if
     data, protocol and extractor do not match.
@@ -121,9 +118,7 @@ def _measured(
     texts: Sequence[Text],
     bar: ProgressBar,
 ) -> dict[str, Any]:
-    """Returns the parts of a card:
-    the metrics, and the values of each perturbation at each grade.
-    """
+    """Returns the parts of a card: the metrics, and the values of each perturbation at each grade."""
     base = measure(measure.inputs[BASE], texts)
     scores, listed = [measure.scores(measure.inputs[BASE], texts)], []
     for perturbation in perturbations:
@@ -167,7 +162,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 
 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
-    """Returns by name the metrics whose inputs the audit has, so that it can compute them."""
+    """Returns the metrics by name for which the audit has all inputs."""
     metrics = make_metrics(evaluator.metrics)
     return {
         name: metric
@@ -183,9 +178,9 @@ def _named(metric: str, part: str) -> str:
 class _Measure:
     """Computes metrics from cached inputs, for all motions and for each bootstrap resample.
 
-    The value of a motion or pair is weighted by the number of times that it is drawn, so the
-    candidates of retrieval are not resampled. FID is computed again for each resample. Retrieval
-    and diversity are means over all pools and pairs that a protocol may draw.
+    Each motion or pair is weighted by the number of times that it is drawn, so the candidates of
+    retrieval are not resampled. FID is computed again for each resample. Retrieval and diversity
+    are means over all pools and pairs that a protocol may draw.
     """
 
     def __init__(
@@ -251,9 +246,7 @@ class _Measure:
         return self.metrics[metric].direction_of(part)
 
     def facts_of(self, name: str) -> dict[str, Any]:
-        """Returns the facts about a value that a card states,
-        except its direction; see `AuditedMetric`.
-        """
+        """Returns the facts that a card states about a value, except its direction; see `AuditedMetric`."""
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]
         return {
@@ -266,9 +259,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that reads every requested attribute exactly;
-        None if there is no such value.
-        """
+        """Name of the value that reads every requested attribute exactly; None if there is no such value."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -276,9 +267,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Signs of the values that judge pairs of motion and text by features:
-        1, or -1 if lower is better.
-        """
+        """Signs of the values that judge pairs of motion and text by features: 1, or -1 if lower is better."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -322,7 +311,7 @@ class _Measure:
         }
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
-        """Returns features (N, E) of texts, float64; each distinct caption is encoded once."""
+        """Returns features (N, E) of texts, float64. Each distinct caption is encoded once."""
         assert self.extractor is not None
         new = {text.caption: text for text in texts if text.caption not in self.encoded}
         if new:
@@ -360,9 +349,9 @@ def _agreement(
     """Returns how well metrics of pairs agree with exact attributes, by metric.
 
     "auc" is the probability that a pair with every requested attribute has a better score than a
-    pair without. Its pairs are real motions and the strongest perturbations of the meaning.
-    "correlation" is Spearman's rank correlation over these perturbations at all grades. Returns
-    {} if the exact attributes are unknown.
+    pair that lacks an attribute. Its pairs are real motions and the strongest perturbations of the
+    meaning. "correlation" is Spearman's rank correlation over these perturbations at all grades.
+    Returns {} if the exact attributes are unknown.
     """
     truth = measure.truth
     if truth is None or truth not in scores[0]:

@@ -31,9 +31,9 @@ class Evaluate(Callback):
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
-        extractor: source of the protocol's extractor, as in `flame-mdm evaluate`: a file, a
-            folder, a model in the package or a run directory. None = the extractor that the
-            protocol names; "none" = skip metrics that need features.
+        extractor: source of the protocol's extractor, as in `flame-mdm evaluate`: a file, a folder,
+            a model in the package or a run directory. None = the extractor named in the protocol;
+            "none" = skip metrics that need features.
         samples: motions per replication; None = the protocol's number.
 
     Raises `UserError` before training begins, if the extractor does not exist.
@@ -58,9 +58,7 @@ class Evaluate(Callback):
         self.real: dict[str, Value | None] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Opens protocol and extractor,
-        so that a mismatch with the data is reported before training.
-        """
+        """Opens the protocol and the extractor, so that a mismatch with the data is reported before training."""
         assert isinstance(pl_module, GeneratorTask)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         model = pl_module.generator
@@ -106,7 +104,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Adds the value that selects checkpoints, and the curves of dashboards."""
+        """Adds the value by which checkpoints are selected, and the curves of dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name
@@ -117,9 +115,9 @@ class Evaluate(Callback):
             self.curves[f"{label}/real"] = real.mean
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # The values were computed at the start of the epoch: by now, the averaged weights are
-        # swapped out.
         """Logs the values of the last evaluation."""
+        # The values were computed at the start of the epoch, because the averaged weights have been
+        # swapped out by now.
         pl_module.log_dict(self.curves)
         pl_module.log_dict(
             {name: x for name, x in self.values.items() if name not in self.curves}, logger=False
@@ -128,7 +126,7 @@ class Evaluate(Callback):
 
 
 def _find_extractor(source: str) -> None:
-    """Raises `UserError` if an extractor does not exist; the message explains how to get it."""
+    """Raises `UserError` if an extractor does not exist. The message explains how to obtain it."""
     try:
         find(source)
     except (UserError, FileNotFoundError) as error:

@@ -25,9 +25,7 @@ def world_size() -> int:
 
 
 def is_first() -> bool:
-    """Whether this process is the first one,
-    which computes metrics, writes files and shows progress.
-    """
+    """Whether this process is the first one, which computes metrics, writes files and shows progress."""
     return world_size() == 1 or dist.get_rank() == 0
 
 
@@ -40,9 +38,7 @@ def shared(value: T) -> T:
 
 
 def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
-    """Returns the results for all items in every process;
-    each of N processes computes every N-th result.
-    """
+    """Returns the results for all items in every process. Each of N processes computes every N-th result."""
     count = world_size()
     if count == 1:
         return [function(item) for item in items]
@@ -58,8 +54,8 @@ def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
 def processes(device: str | None) -> Iterator[str]:
     """Joins the process group that torchrun started, if any, and yields the device.
 
-    By default, the device is a GPU if this machine has one. Raises `UserError` if this machine
-    lacks the requested device.
+    By default, the device is a GPU if this machine has one. Raises `UserError` if this machine does
+    not have the requested device.
     """
     if device is None:
         local = int(os.environ.get("LOCAL_RANK", 0))
@@ -68,13 +64,13 @@ def processes(device: str | None) -> Iterator[str]:
     if int(os.environ.get("WORLD_SIZE", 1)) == 1:
         yield device
         return
-    # Imported before the group exists: otherwise, the default arguments of its functions would
-    # keep the group and its gloo threads alive, and a live thread can abort the process while
-    # Python shuts down.
+    # This import must precede the creation of the group. Otherwise, the default arguments of its
+    # functions would keep the group and its gloo threads alive, and a live thread can abort the
+    # process while Python shuts down.
     from torch.distributed.nn import functional  # noqa: F401
 
-    # Motions are gathered once per replication, on the CPU; a process that finishes early may
-    # wait for hours.
+    # Motions are gathered once per replication, on the CPU. A process that finishes early may wait
+    # for hours.
     dist.init_process_group("gloo", timeout=timedelta(days=7))
     try:
         yield device

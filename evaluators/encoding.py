@@ -1,5 +1,5 @@
 # pyright: standard
-"""Encodes changed joint positions as features, without changing their height."""
+"""Encodes modified joint positions as features, without changing their height."""
 
 from collections.abc import Sequence
 
@@ -13,10 +13,10 @@ Joints = np.ndarray
 
 
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
-    """Encodes motions as features (F, D) float32, with one row per frame and at their own height.
+    """Encodes motions as features (F, D) float32, with one row per frame and at their original height.
 
-    The encoder of a representation needs one more frame. The encoder also puts the lowest joint
-    on the floor, which would hide floating and sinking; here, the height is restored.
+    The encoder of a representation needs one more frame. It also places the lowest joint on the
+    floor, which would hide floating and sinking. This function restores the height.
     """
     longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
     encoded = []

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluations: measure real motions, generate motions, measure them, and write the result."""
+"""Evaluations: measures real motions, generates motions, measures them, and writes the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -48,7 +48,7 @@ def evaluate(request: EvaluationRequest) -> None:
         >>> from evaluators.evaluation_request import EvaluationRequest
         >>> evaluate(EvaluationRequest(ckpt="runs/quickstart/default", quick=True))  # doctest: +SKIP
     """
-    if request.out is not None:  # checked now, before hours of work
+    if request.out is not None:  # checked before hours of work
         if Path(request.out).is_dir():
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
@@ -78,15 +78,15 @@ class Evaluation:
     protocol: Protocol
     # Clips of the evaluated split
     clips: Clips
-    # The opened extractor. With None, metrics that need features have no value.
+    # The opened extractor. If it is None, metrics that need features have no value.
     extractor: Extractor | None
-    # Representation of the motions, on the device to compute on
+    # Representation of the motions, on the device for computations
     representation: Representation
     # Seed of all random draws
     seed: int = 0
     # Batch size of the extractor
     batch_size: int = 64
-    # The training split, for metrics that look for copies of its motions
+    # The training split, for metrics that search for copies of its motions
     training: Clips | None = None
 
     def run(
@@ -99,14 +99,14 @@ class Evaluation:
     ) -> Measured:
         """Evaluates real motions of all replications, and then the motions of the source.
 
-        Each rank generates a share of the batches and computes their features. Rank 0 computes
-        the metrics; all ranks return the result. Raises `UserError` before anything is generated
-        if real motions do not have the expected values, unless `force`.
+        Each rank generates a share of the batches and computes their features. Rank 0 computes the
+        metrics, and all ranks return the result. If real motions do not have the expected values,
+        raises `UserError` before anything is generated, unless `force` is True.
 
         Args:
             source: source of the motions; None = only real motions are measured.
-            ground_truth: whether to measure real motions, too.
-            force: whether to generate even if real motions do not have the expected values.
+            ground_truth: whether to also measure real motions.
+            force: whether to generate motions even if real motions do not have the expected values.
             resamples: number of sets that are drawn from the motions of the first replication,
                 for intervals over motions.
         """
@@ -160,7 +160,7 @@ class Evaluation:
 
     @cached_property
     def several(self) -> Evaluator | None:
-        """The evaluator for several motions per prompt; None if the protocol has no such part."""
+        """The evaluator for several motions per prompt; None if the protocol has no multimodality."""
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
@@ -179,8 +179,8 @@ class Evaluation:
     ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
         """Measures real motions, and returns them for comparisons with the source's motions.
 
-        Each replication has two references: the real motions of the same clips, and a set of real
-        motions for metrics that compare sets.
+        Each replication has two references: the real motions of the evaluated clips, and a set of
+        real motions for metrics that compare sets.
         """
         scores = []
         real_sets = []
@@ -217,7 +217,7 @@ class Evaluation:
         return self.evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Returns a line for each value of real motions of the test split that differs from the expected one."""
+        """Returns a line for each value of real motions of the test split that differs from its expected value."""
         if not values or self.protocol.resized_samples or self.protocol.cuts_motions:
             return []
         lines = []
@@ -240,8 +240,8 @@ class Evaluation:
 
         Returns {} unless the test split is evaluated.
         """
-        # A data set without test clips (HumanAct12) is tested on its training clips, so they are
-        # checked.
+        # A data set without test clips (HumanAct12) is tested on its training clips, so their
+        # values are checked.
         info = self.clips.store.info
         if self.clips.clips[0].split != "test" and info["clips"]["test"]:
             return {}
@@ -253,8 +253,9 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns notes that restrict the meaning of the values:
-        repeated clips, and unchecked values of real motions.
+        """Returns notes that restrict the meaning of the values.
+
+        The notes concern repeated clips, and unchecked values of real motions.
         """
         lines = []
         clips = len(self.protocol.selected(self.clips))
@@ -372,7 +373,7 @@ class Evaluation:
     ) -> Motions:
         """Returns motions with the conditions of their rows.
 
-        `captions`, if given, replace the captions of the rows.
+        If `captions` are given, they replace the captions of the rows.
         """
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None

@@ -1,7 +1,7 @@
 # pyright: standard
 """The keys of an evaluation.
 
-This module does not import torch, so that wrong keys are reported at once.
+This module does not import torch, so that invalid keys are reported at once.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class EvaluationKeys:
 class EvaluationRequest(EvaluationKeys):
     """The keys of `flame-mdm evaluate`, with the composed data set and representation.
 
-    Raises `UserError` if keys contradict each other, or a value is out of range.
+    Raises `UserError` if keys contradict each other, or if a value is out of range.
     """
 
     ckpt: str | None = None
@@ -106,9 +106,7 @@ class EvaluationRequest(EvaluationKeys):
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-        """Creates a request from a mapping of keys to values;
-        keys of the sampler become `options`.
-        """
+        """Creates a request from a mapping of keys to values. Keys of the sampler become `options`."""
         kinds = (cls, SamplerOptions)
         keywords, options = (
             {key.name: config[key.name] for key in fields(kind) if key.name in config}
@@ -117,7 +115,7 @@ class EvaluationRequest(EvaluationKeys):
         return cls(**keywords, options=SamplerOptions(**options))
 
     def __post_init__(self) -> None:
-        _ = self.editing  # checks its keys
+        _ = self.editing  # checks the keys of the edit
         subjects = [
             name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None
         ]

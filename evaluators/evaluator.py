@@ -28,9 +28,9 @@ from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.seeds import key
 
-# Motions per update of a metric; more motions do not fit into a processor's cache
+# Motions per update of a metric. More motions do not fit into a processor's cache.
 CHUNK = 64
-# inputs of metrics that come from an extractor
+# Inputs of metrics that come from an extractor
 FEATURES = {"generated", "real", "text", "logits"}
 PAIRED = {
     "generated": "real",
@@ -38,9 +38,7 @@ PAIRED = {
     "nearest": "real_nearest",
     "references": "references",
 }
-"""Names of the inputs from paired real motions,
-and the names of the same inputs from generated motions.
-"""
+"""Names of the inputs from paired real motions -> names of the same inputs from generated motions."""
 
 
 @dataclass
@@ -57,7 +55,7 @@ class Motions:
     tokens: list[list[str] | None] | None = None
     # Further inputs by their names in `evaluators.metrics`
     inputs: dict[str, Any] = field(default_factory=dict)
-    # the parts kept from real motions: arguments `region` and `joints` of `kept_parts`
+    # The parts kept from real motions: arguments `region` and `joints` of `kept_parts`
     edit: Mapping[str, Any] | None = None
 
     def __len__(self) -> int:
@@ -65,8 +63,9 @@ class Motions:
 
 
 Rows = dict[str, Any]
-"""Metric inputs of N motions by their names in `evaluators.metrics`:
-tensors, or lists of N entries (such as joints).
+"""Metric inputs of N motions by their names in `evaluators.metrics`.
+
+The inputs are tensors, or lists of N entries (such as joints).
 """
 
 
@@ -74,9 +73,9 @@ tensors, or lists of N entries (such as joints).
 class Evaluator:
     """Computes metrics of motions, with one feature pass for all metrics.
 
-    For the same features, all values are bit-identical for any batch size and order. Several
-    processes share the feature pass. Each process gets whole batches, so that features do not
-    depend on the number of processes. The first process computes the metrics.
+    For the same features, all values are bit-identical for any batch size and order. If there are
+    several processes, they share the feature pass. Each process gets whole batches, so that
+    features do not depend on the number of processes. The first process computes the metrics.
 
     Example:
         >>> from flame_mdm.representations.humanml import HumanML
@@ -93,14 +92,14 @@ class Evaluator:
     metrics: Mapping[str, Config]
     representation: Representation
     batch_size: int = 64
-    # whether metrics that lack features have no value, instead of raising an error
+    # Whether metrics that lack features have no value, instead of raising an error
     skip_features: bool = False
-    # training motions, to find copies of them among generated motions; None = not measured
+    # Training motions, to find copies of them among generated motions. None = not measured.
     training: TrainingMotions | None = None
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:
-        """Computes the metric inputs of motions; all processes pass the same motions.
+        """Computes the metric inputs of motions. All processes pass the same motions.
 
         Raises `UserError` if a motion is not finite.
         """
@@ -138,9 +137,9 @@ class Evaluator:
         return rows
 
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
-        """Returns the training motions for comparisons.
+        """Returns the training motions that other motions are compared with.
 
-        They are the poses of all frames, and the features of windows.
+        They consist of the poses of all frames, and the features of windows.
         """
         facing = self.representation.skeleton.facing
         joints = replace(self, extractor=None).extract(whole)["joints"]
@@ -154,7 +153,7 @@ class Evaluator:
     def reference(self) -> Rows | None:
         """Returns the features of the extractor's own real motions.
 
-        Returns None for an extractor without such motions; sets are then compared with the data
+        Returns None for an extractor without such motions. Sets are then compared with the data
         set.
         """
         features = self.extractor and self.extractor.reference()
@@ -205,10 +204,9 @@ class Evaluator:
     def score(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
-        """Computes all metrics of generated motions and their paired real motions,
-        in the same order.
+        """Computes all metrics of generated motions and of their paired real motions, in the same order.
 
-        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself
+        Comparisons of sets use `real`, a separate draw, because the distance of a set from itself
         is 0. Returns the values by name (`metric` or `metric/part`), and the reasons for missing
         values by metric. A value that cannot be computed is None. Both mappings are empty in all
         processes except the first. Raises `UserError` if the motions lack an input that a metric
@@ -222,8 +220,7 @@ class Evaluator:
     def resample(
         self, generated: Rows, paired: Rows, real: Rows, seed: int, resamples: int
     ) -> dict[str, list[float | None]]:
-        """Computes all metrics of `resamples` sets
-        of motions drawn with replacement, for a bootstrap.
+        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap.
 
         Metrics that compare two sets draw from both sets. The draws depend only on `seed` and the
         numbers of motions, so that the same clips are drawn for two models. The arguments are
@@ -251,12 +248,10 @@ class Evaluator:
     def _updated(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
-        """Returns all metrics after their update with the motions,
-        and the names of computable metrics.
-        """
+        """Returns all metrics after their update with the motions, and the names of computable metrics."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
-            # returns False: metrics are not synchronized, since this process has all motions
+            # Returns False: metrics are not synchronized, because this process has all motions
             metric.distributed_available_fn = bool
         count = len(generated["keys"])
         usable = self.check(generated, metrics) if count else {}
@@ -275,7 +270,7 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name, to read their declared properties."""
+        """The metrics by name, whose declared properties can be read."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:
@@ -338,7 +333,7 @@ def _chunk(generated: Rows, paired: Rows, part: slice) -> Rows:
 def _values(
     computations: Mapping[str, Callable[[], Any]], metrics: Mapping[str, SampleMetric]
 ) -> tuple[dict[str, float | None], dict[str, str]]:
-    """Returns the values of metrics, and the reasons for missing ones."""
+    """Returns the values of metrics, and the reasons for missing values."""
     values: dict[str, float | None] = {}
     reasons: dict[str, str] = {}
     for name, metric in metrics.items():

@@ -10,7 +10,7 @@ ACTION = (
     "action",
     "content",
 )
-# value that a caption need not mention: without it, a caption is less exact, but not wrong
+# Value that a caption need not mention. Without it, a caption is less exact, but not wrong.
 UNSAID = "normal"
 
 _Stated = frozenset[tuple[str, str | int | float]]
@@ -20,8 +20,8 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
     """Returns sorted near misses of each clip, by the attribute that differs.
 
     A caption of another clip is a near miss if both clips show the same action, and differ in
-    exactly one of the attributes that both have (side, style, count, ...). For example, "walks
-    backward" is a near miss of a slow walk forward.
+    exactly one of the attributes (side, style, count, ...) that both of them have. For example,
+    "walks backward" is a near miss of a slow walk forward.
     """
     stated = [_stated(clip) for clip in clips]
     captions: dict[_Stated, set[str]] = {}
@@ -32,9 +32,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip,
-    with slots in the action: "wave-left-hand" is "wave-{side}-hand".
-    """
+    """Returns the attributes of a clip, with slots in the action: "wave-left-hand" is "wave-{side}-hand"."""
     stated = {
         name: value
         for name, value in clip.attributes.items()

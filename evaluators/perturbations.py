@@ -1,6 +1,5 @@
 # pyright: standard
-"""Graded perturbations of real motions for audits:
-changes that a metric should notice, or ignore.
+"""Graded perturbations of real motions for audits: changes that a metric should detect, or ignore.
 
 Each function takes joints (F, J, 3) in meters, y up, and keeps the number of frames unless its
 docstring says otherwise. All random draws come from a generator, so that the grades of a
@@ -63,17 +62,13 @@ def lift(joints: Joints, centimeters: float) -> Joints:
 
 
 def resize(joints: Joints, percent: float) -> Joints:
-    """Makes all bones longer by this share,
-    without changing the floor or the root's path on it.
-    """
+    """Lengthens all bones by this percentage, without changing the floor or the root's path on it."""
     ground = joints[:, :1] * GROUND
     return ground + (1 + percent / 100) * (joints - ground)
 
 
 def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False) -> Joints:
-    """Moves the whole body in a random direction,
-    in one random inner frame or in the last frame.
-    """
+    """Moves the whole body in a random direction, in one random inner frame or in the last frame."""
     frame = int(draws.integers(1, len(joints) - 1))
     direction = draws.standard_normal(3)
     popped = joints.copy()
@@ -105,31 +100,26 @@ def freeze(joints: Joints, percent: float) -> Joints:
 
 
 def play(joints: Joints, factor: float, fps: float) -> Joints:
-    """Plays the motion faster, which shortens it,
-    or slower, which is cut to the original length.
-    """
+    """Plays the motion faster, which shortens it, or slower, which is cut to the original length."""
     return resample(joints, fps * factor, fps)[: len(joints)]
 
 
 def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
-    """Resamples linearly to another frame rate and back;
-    frames after the last new frame repeat it.
-    """
+    """Resamples linearly to another frame rate and back. Frames after the last new frame repeat it."""
     back = resample(resample(joints, fps, rate), rate, fps)
     return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
 
 
 def crop(joints: Joints, percent: float) -> Joints:
-    """Cuts this share off the end of the motion; at least three frames remain."""
+    """Cuts this percentage off the end of the motion. At least three frames remain."""
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 
 def drop_repetition(joints: Joints, count: int) -> Joints:
     """Cuts one of `count` repetitions out of a motion, which becomes shorter.
 
-    The cut joins two frames with similar poses: the nearest poses whose distance in time is one
-    period, give or take 20 %. The second part continues at the position where the first part
-    ends.
+    The cut joins two frames with similar poses: the nearest poses whose distance in time is within
+    20 % of one period. The second part continues at the position where the first part ends.
     """
     poses = joints - joints[:, :1] * GROUND
     change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
@@ -147,8 +137,7 @@ def drop_repetition(joints: Joints, count: int) -> Joints:
 
 
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
-    """Replaces the second half with the second half of another motion, starting at the same
-    position.
+    """Replaces the second half with the second half of another motion, starting at the same position.
 
     Poses are blended over `BLEND` seconds.
     """
@@ -187,9 +176,7 @@ class Perturbation:
     grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation with the grades that the motions allow, or one per kind;
-        [] if none is possible.
-        """
+        """Returns the perturbation with the grades that the motions allow, or one per kind; [] if none is possible."""
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
@@ -199,21 +186,17 @@ class Perturbation:
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions and texts at a grade;
-        pair i belongs to real motion i with texts[i].
-        """
+        """Returns the motions and texts at a grade. Pair i belongs to real motion i with texts[i]."""
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the motions (N,) in the order in which they are perturbed,
-        which is the same at all grades.
-        """
+        """Returns the motions (N,) in the order in which they are perturbed, which is the same at all grades."""
         return scene.draws("order", self.name).permutation(len(scene))
 
 
 @dataclass(frozen=True)
 class ChangedJoints(Perturbation):
-    """Changes the joints of all motions; the draws of a motion are the same at all grades.
+    """Changes the joints of all motions. The draws of a motion are the same at all grades.
 
     Attributes:
         change: function of joints (F, J, 3), the grade, and the options in `takes`.
@@ -277,9 +260,7 @@ class ReplacedShare(ChangedSet):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions after this share of them (in percent) was replaced,
-        with the same texts.
-        """
+        """Returns the motions, of which this share (in percent) was replaced, with the same texts."""
         count = round(len(scene) * grade / 100)
         replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
         base, other = sets[BASE], sets[self.name]
@@ -289,7 +270,7 @@ class ReplacedShare(ChangedSet):
 
 @dataclass(frozen=True)
 class DroppedRepetition(ReplacedShare):
-    """Cuts one repetition out of a share of the motions; motions without repetitions stay as they are."""
+    """Cuts one repetition out of a share of the motions. Motions without repetitions are unchanged."""
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
         """Returns the perturbation if a motion has repetitions."""
@@ -298,17 +279,13 @@ class DroppedRepetition(ReplacedShare):
 
 @dataclass(frozen=True)
 class ReplacedCaptions(Perturbation):
-    """Replaces a share of the captions, in percent,
-    with wrong captions of the kind `name` in `Scene.wrong`.
-    """
+    """Replaces a share of the captions, in percent, with wrong captions of the kind `name` in `Scene.wrong`."""
 
     unit: str = "% of captions"
     grades: Sequence[float] = (1, 2, 5, 10, 20, 50, 100)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns a perturbation for each kind of wrong captions,
-        up to the share of motions that have one.
-        """
+        """Returns a perturbation for each kind of wrong captions, up to the share of motions that have one."""
         offered = []
         for kind in scene.wrong if captioned else ():
             if kind.partition(":")[0] == self.name:
@@ -320,9 +297,7 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same motions and the texts,
-        of which this share (in percent) is replaced.
-        """
+        """Returns the same motions, and the texts, of which this share (in percent) is replaced."""
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]
@@ -333,7 +308,7 @@ class ReplacedCaptions(Perturbation):
 class DroppedActions(Perturbation):
     """Drops a share of the actions, in percent.
 
-    Other motions are repeated instead, with their texts.
+    All other motions are repeated instead, with their texts.
     """
 
     unit: str = "% of actions"
@@ -345,9 +320,7 @@ class DroppedActions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns motions of the remaining actions with their texts,
-        repeated up to the same number.
-        """
+        """Returns motions of the remaining actions with their texts, repeated up to the same number."""
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]
@@ -418,9 +391,7 @@ def _other_half(scene: Scene) -> list[np.ndarray]:
 
 
 def _memorized(scene: Scene) -> list[np.ndarray]:
-    """Returns for each motion a training motion with the same captions or action;
-    otherwise the motion itself.
-    """
+    """Returns for each motion a training motion with the same captions or action; otherwise the motion itself."""
     training, copies = scene.data.clips("train"), []
     for row in scene.rows:
         same = [clip for clip in training.clips if clip.captions == row.clip.captions]
@@ -457,9 +428,7 @@ def through_others(representation: HumanML) -> list[Perturbation]:
 
 
 def perturbations_of(scene: Scene, captioned: bool) -> list[Perturbation]:
-    """Returns all perturbations that the motions and captions allow;
-    near misses also by attribute.
-    """
+    """Returns all perturbations that the motions and captions allow. Near misses are also listed by attribute."""
     listed = [*PERTURBATIONS, *through_others(scene.representation)]
     return [
         offered for perturbation in listed for offered in perturbation.offered(scene, captioned)
@@ -502,6 +471,4 @@ PERTURBATIONS: list[Perturbation] = [
     ChangedJoints("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), crop),
 ]
 # fmt: on
-"""All perturbations except near misses by attribute and other representations,
-which depend on the data.
-"""
+"""All perturbations except near misses by attribute and other representations, which depend on the data."""

@@ -28,7 +28,7 @@ from flame_mdm.sampling.motion_request import EditRequest
 class Plan:
     """All parts of an evaluation, opened and checked before anything is measured.
 
-    Raises `UserError` or `FileNotFoundError` if a file is missing, or model, data, protocol and
+    Raises `UserError` or `FileNotFoundError` if a file is missing, or if model, data, protocol and
     extractor do not match.
 
     Attributes:
@@ -167,9 +167,7 @@ def sampling_options(
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:
-    """Returns the options of the sampler and of `Edit`:
-    the requested values, by default the recipe's values.
-    """
+    """Returns the options of the sampler and of `Edit`: the requested values, by default the recipe's values."""
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
     if protocol.edit is not None:

@@ -35,9 +35,7 @@ Count = Annotated[Int, Field(ge=1)]
 
 @dataclass(frozen=True)
 class DrawnClip:
-    """A clip, with the frames and the caption
-    that were drawn from it for one generated motion.
-    """
+    """A clip, with the frames and the caption that were drawn from it for one generated motion."""
 
     #: Unique name of the motion.
     id: str
@@ -45,11 +43,11 @@ class DrawnClip:
     clip: Entry
     #: Indices of the frames drawn from the clip.
     frames: np.ndarray
-    #: Index of the caption drawn from the clip; None = the clip has none.
+    #: Index of the caption drawn from the clip; None = the clip has no captions.
     caption: int | None
     #: Name shared by all motions with the same caption and length.
     prompt: str
-    #: Indices of the frames that the model gets and continues. They are not measured.
+    #: Indices of the frames that the model gets as context and continues. They are not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
@@ -60,9 +58,7 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """The attributes of the clip that rules can read;
-        {} for clips with an attribute of `UNREAD`.
-        """
+        """The attributes of the clip that rules can read; {} for clips with an attribute of `UNREAD`."""
         return {
             name: value
             for name, value in self.clip.attributes.items()
@@ -96,8 +92,8 @@ class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
     The caption and crop of a clip, and the noise of the generated motion, are functions of (seed,
-    replication, id). Motions are generated at the length of the real clip. Real motions are
-    measured in the same way, in comparison with a second draw of real motions.
+    replication, id). Motions have the length of the real clip. Real motions are measured in the
+    same way, and compared with a second draw of real motions.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -109,8 +105,8 @@ class Protocol(ClosedSchema):
     version: Int
     #: Condition of the generated motions.
     condition: Literal["text", "action", "none"]
-    #: Mapping with the `_target_` of an `Extractor`, and its `path`, unless the user must give
-    #: the path.
+    #: Mapping with the `_target_` of an `Extractor`, and its `path`. The path is left out if the
+    #: user must give it.
     extractor: Config | None
     #: Mappings with the `_target_` of a metric, by name.
     metrics: dict[str, Config]
@@ -122,19 +118,19 @@ class Protocol(ClosedSchema):
     real_samples: Count | None = None
     #: A second evaluation with several motions per prompt.
     multimodality: Multimodality | None = None
-    #: If given, motions are edits of real motions; arguments `region` and `joints` of
-    #: `kept_parts`.
+    #: If given, motions are edits of real motions. The mapping contains the arguments `region` and
+    #: `joints` of `kept_parts`.
     edit: dict[str, Any] | None = None
     #: Standard deviation, in frames, of the Gaussian filter that smooths generated features over
     #: time.
     smoothing: Number | None = None
     #: Motions per batch, if the protocol measures time. The first batch is not timed.
     batch_size: Count | None = None
-    #: Which frames are given to a model that continues frames. "drawn": the first of the drawn
+    #: Frames that a model that continues frames gets as context. "drawn": the first of the drawn
     #: frames, which are not measured. "start": as in DiP's code, frames of the clip that begin at
     #: one of its first five frames; the motion that follows is as long as the drawn frames.
     context: Literal["drawn", "start"] = "drawn"
-    #: Number of frames that the model gets; `open_protocol` sets it.
+    #: Number of context frames that the model gets; `open_protocol` sets it.
     context_frames: Int = 0
     #: Attributes that evaluated clips must have. {} = all clips of the split.
     only: dict[str, Any] = Field({})
@@ -199,8 +195,8 @@ class Protocol(ClosedSchema):
     ) -> Extractor | None:
         """Opens the extractor at `path`, by default the protocol's extractor.
 
-        Returns None if the protocol needs no extractor, or if `path` is "none". Raises
-        `UserError` or `FileNotFoundError` if the extractor is missing, or belongs to another
+        Returns None if the protocol needs no extractor, or if `path` is "none". Raises `UserError`
+        or `FileNotFoundError` if the extractor is missing, or if it belongs to another
         representation or data set.
         """
         if self.extractor is None or path == "none":
@@ -219,9 +215,7 @@ class Protocol(ClosedSchema):
 
     @property
     def cuts_motions(self) -> bool:
-        """Whether the first frames of motions are cut off before measuring,
-        since the model gets them.
-        """
+        """Whether the first frames of motions, which the model gets as context, are cut off before measuring."""
         return self.context_frames > 0 and self.context == "drawn"
 
     @property
@@ -292,7 +286,7 @@ class Protocol(ClosedSchema):
         ]
 
     def count(self, clips: Clips) -> int:
-        """Returns the number of motions that a model generates in a whole evaluation."""
+        """Returns the number of motions that a model generates in an entire evaluation."""
         rows = self.samples or len(self.selected(clips))
         several = None if self.quick else self.multimodality
         again = (
@@ -305,8 +299,8 @@ class Protocol(ClosedSchema):
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
         """Checks that the clips and the model fit the protocol.
 
-        Raises `UserError` if there is no clip, a caption or label is missing, or the model has
-        another condition.
+        Raises `UserError` if there is no clip, if a caption or label is missing, or if the model
+        has another condition.
         """
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
         drawn = {
@@ -332,8 +326,8 @@ def protocol_names(folder: Path = FOLDER) -> list[str]:
 def protocol_config(name: str) -> Config:
     """Returns the options of a protocol: a name in experiments/evaluation, or a .yaml file.
 
-    A file may hold `variants`. For example, protocol `editing_in_between` is the variant
-    `in_between` of editing.yaml; the options of the variant replace options of the file. Raises
+    A file may contain `variants`. For example, protocol `editing_in_between` is the variant
+    `in_between` of editing.yaml. The options of the variant replace options of the file. Raises
     `UserError` if there is no such protocol.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
@@ -350,9 +344,7 @@ def protocol_config(name: str) -> Config:
 
 
 def _protocols(path: Path) -> dict[str, Config]:
-    """Returns the protocols in a file by name:
-    its variants and, if it has metrics, the file itself.
-    """
+    """Returns the protocols in a file by name: its variants and, if it has metrics, the file itself."""
     content = (read_package_yaml if path.parent == FOLDER else read_yaml)(path)
     variants = content.pop("variants", {}) if isinstance(content, dict) else None
     if not isinstance(variants, dict) or not all(
@@ -423,9 +415,7 @@ def open_protocol(
     model: MotionGenerator | None,
     **size: Any,
 ) -> tuple[Protocol, dict[str, Any]]:
-    """Returns a protocol that matches a split and a model,
-    and the options that `Protocol.resized` changed.
-    """
+    """Returns a protocol that matches a split and a model, and the options that `Protocol.resized` changed."""
     protocol = load_protocol(name, representation)
     if model is not None:
         protocol = protocol.model_copy(update={"context_frames": model.denoiser.context_frames})

@@ -32,9 +32,9 @@ from flame_mdm.training.start import recipe_changes
 class Scores:
     """Values of all metrics in one replication."""
 
-    # values by name, `metric` or `metric/part`; None = cannot be computed
+    # Values by name, `metric` or `metric/part`; None = the value cannot be computed
     values: Mapping[str, float | None]
-    # Why a value is missing, by metric
+    # Reasons for missing values, by metric
     reasons: Mapping[str, str]
     # Number of motions
     count: int
@@ -45,9 +45,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Scores of one part of an evaluation:
-    real motions, generated motions, or several per prompt.
-    """
+    """Scores of one part of an evaluation: real motions, generated motions, or several per prompt."""
 
     # Scores by replication
     scores: Sequence[Scores] = ()
@@ -89,12 +87,11 @@ class Outcome:
 
 
 def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
-    """Returns the mean of R >= 1 replications,
-    and the half width of its 95 % confidence interval.
+    """Returns the mean of R >= 1 replications, and the half width of its 95 % confidence interval.
 
-    The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the
-    code of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead.
-    With a single replication, there is no interval.
+    The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code
+    of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead. With a
+    single replication, there is no interval.
     """
     half = float(1.96 * np.std(values) / len(values) ** 0.5) if len(values) > 1 else None
     return float(np.mean(values)), half
@@ -156,14 +153,14 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
 
 
 def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
-    """Returns the extractor that the user gave, or the path that the protocol names."""
+    """Returns the extractor that the user gave, or the path in the protocol."""
     return request.extractor or str((plan.protocol.extractor or {}).get("path", ""))
 
 
 def _checkpoint(plan: Plan) -> Checkpoint | None:
     """Describes the checkpoint.
 
-    The file name of the checkpoint shows how it was selected from its run.
+    The file name shows how the checkpoint was selected from its run.
     """
     model, file = plan.model, plan.file
     if model is None or file is None:
@@ -190,7 +187,7 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
     """Returns the reasons why values are not valid.
 
-    Evaluated clips may be training clips of the model or the extractor.
+    Evaluated clips may be in the training data of the model or the extractor.
     """
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
     trained = {"training data": plan.model.facts.get("fingerprint") if plan.model else None}
@@ -251,7 +248,7 @@ def show(result: Result, path: Path) -> None:
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns the text at the end of a line that explains the intervals; "" without intervals."""
+    """Returns the explanation of the intervals at the end of a line; "" without intervals."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""
@@ -263,7 +260,7 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
 def _cell(value: Value | None, usual: str) -> str:
     """Formats a value with its interval, if any.
 
-    The numbers of motions are added if they differ from the numbers of most values.
+    The numbers of motions are added if they differ from the numbers for most values.
     """
     if value is None or value.mean is None:
         return "-"

@@ -16,9 +16,7 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
 RANDOM, NEAR = "wrong captions", "near misses"
-"""Kinds of wrong captions:
-captions of random other motions, and captions with one wrong attribute.
-"""
+"""Kinds of wrong captions: captions of random other motions, and captions with one wrong attribute."""
 
 
 class Text(NamedTuple):
@@ -36,9 +34,7 @@ def text_of(row: DrawnClip, caption: str) -> Text:
 
 @dataclass
 class Scene:
-    """Real motions of a split:
-    the clips, the features (F, D) of each clip, and the seed of all draws.
-    """
+    """Real motions of a split: the clips, the features (F, D) of each clip, and the seed of all draws."""
 
     data: MotionDataModule
     rows: list[DrawnClip]
@@ -67,7 +63,7 @@ class Scene:
         return [row.clip.action or 0 for row in self.rows]
 
     def draws(self, *parts: str | int) -> np.random.Generator:
-        """Returns a random generator, which is a function of the seed and the parts."""
+        """Returns a random generator whose state is a function of the seed and the parts."""
         return np.random.default_rng(key("audit", self.seed, *parts))
 
     @cached_property

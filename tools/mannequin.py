@@ -32,8 +32,7 @@ from flame_mdm.visualize.body import (
 )
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
-"""Rotations of the left side, in degrees about x, y and z,
-from SMPL's rest pose to the stored pose.
+"""Rotations of the left side, in degrees about x, y and z, from SMPL's rest pose to the stored pose.
 
 The arms are lowered in the stored pose: arms mostly hang, so the skin is stretched less than from
 outstretched arms.
@@ -52,8 +51,7 @@ ORIGIN, UP = np.zeros(3), np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
 
 
 def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0) -> Field:
-    """Returns a function: the approximate signed distance from a tube
-    with elliptic cross sections and round ends.
+    """Returns a function: the approximate signed distance from a tube with elliptic cross sections and round ends.
 
     Args:
         origin: the point at length 0.
@@ -86,17 +84,13 @@ def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Field:
 
 
 def union(first: np.ndarray, second: np.ndarray, blend: float) -> np.ndarray:
-    """Joins two signed distances;
-    surfaces closer than `blend` meters are rounded into each other.
-    """
+    """Joins two signed distances; surfaces closer than `blend` meters are rounded into each other."""
     share = np.maximum(blend - np.abs(first - second), 0) / blend
     return np.minimum(first, second) - share**2 * blend / 4
 
 
 def pose() -> tuple[np.ndarray, np.ndarray]:
-    """Returns the joints (22, 3) of the stored pose,
-    with the pelvis at 0, and their world rotations (22, 3, 3).
-    """
+    """Returns the joints (22, 3) of the stored pose, with the pelvis at 0, and their world rotations (22, 3, 3)."""
     joints, turned = np.zeros((22, 3)), np.tile(np.eye(3), (22, 1, 1))
     for joint, parent in enumerate(SMPL22.parents):
         side, _, name = SMPL22.joints[joint].rpartition("_")
@@ -231,9 +225,7 @@ def axes_of_hand(wrist: np.ndarray) -> np.ndarray:
 
 
 def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the points and normals (V, 3) of the left half,
-    with the fingers bent into a loose fist.
-    """
+    """Returns the points and normals (V, 3) of the left half, with the fingers bent into a loose fist."""
     joints, turned = pose()
     wrist, axes = joints[JOINT["left_wrist"]], axes_of_hand(turned[JOINT["left_wrist"]])
     local = (points - wrist) @ axes.T
@@ -314,9 +306,7 @@ def gradient(distance: Field, points: np.ndarray) -> np.ndarray:
 
 
 def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
-    """Enlarges head and hand and shrinks their surroundings,
-    so that head and hand keep more vertices.
-    """
+    """Enlarges head and hand and shrinks their surroundings, so that head and hand keep more vertices."""
     joints, turned = pose()
     hand = joints[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
     radii = np.linspace(0, 3, 6001)

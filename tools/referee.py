@@ -1,5 +1,4 @@
-"""Calibrates the referee on captioned motions:
-writes its thresholds and prints how often it is right.
+"""Calibrates the referee on captioned motions: writes its thresholds and prints how often it is right.
 
 python tools/referee.py data/bandai-humanml-clean-smpl22 data/cmu-humanml-clean-smpl22 ... [figures=FILE.json]
 
@@ -74,8 +73,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Case:
-    """A claim about a motion, and the change that falsified it;
-    "" = no change, so the claim is true.
+    """A claim about a motion, and the change that falsified it; "" = no change, so the claim is true.
 
     `is_built`: whether the claim comes from `built_cases`, not from a caption.
     """
@@ -133,9 +131,7 @@ def read(folder: Path) -> Iterator[Example]:
 
 
 def cases_of(example: Example) -> list[Case]:
-    """Returns the claims of all captions of a motion
-    and their falsified versions, without duplicates.
-    """
+    """Returns the claims of all captions of a motion and their falsified versions, without duplicates."""
     claims = {str(claim): claim for text in example.captions for claim in read_claims(text)}
     cases = []
     for claim in claims.values():
@@ -148,9 +144,7 @@ def cases_of(example: Example) -> list[Case]:
 
 
 def built_cases(example: Example) -> list[Case]:
-    """Returns claims about durations, the start and the end:
-    claims assumed to be true, and falsified claims.
-    """
+    """Returns claims about durations, the start and the end: claims assumed to be true, and falsified claims."""
     if example.dataset == SYNTHETIC:
         return []
     sets = [{claim.kind for claim in read_claims(text)} for text in example.captions]
@@ -205,8 +199,7 @@ def calibrate(cases: Sequence[Case]) -> None:
 
 
 def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[float, float]:
-    """Returns two thresholds: claims are false up to the first score,
-    and true from the second score.
+    """Returns two thresholds: claims are false up to the first score, and true from the second score.
 
     The first threshold is set by hand and lowered until at most `MOST_REFUSED` of the true claims
     are judged false. The second threshold is raised until `LEAST_REFUSED` of the decided
@@ -252,9 +245,7 @@ def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def name_of(claim: Claim) -> str:
-    """Returns the kind of a claim,
-    with a mark for claims about a duration, the start or the end.
-    """
+    """Returns the kind of a claim, with a mark for claims about a duration, the start or the end."""
     if claim.seconds is not None:
         return f"{claim.kind}, duration"
     return f"{claim.kind}, {claim.when}" if claim.when else claim.kind
@@ -263,9 +254,7 @@ def name_of(claim: Claim) -> str:
 def crossed(
     rows: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Returns the sums of `tally` over both halves,
-    each judged with the thresholds of the other half.
-    """
+    """Returns the sums of `tally` over both halves, each judged with the thresholds of the other half."""
     sums: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(lambda: defaultdict(int))
     for row in (*rows, *other):
         for name, value in row.items():
@@ -286,9 +275,7 @@ def by_set(examples: Sequence[Example]) -> dict[str, list[Example]]:
 
 
 def coverage(examples: Sequence[Example]) -> dict[str, Any]:
-    """Returns three numbers: captions, captions with a claim,
-    and captions with a decided claim.
-    """
+    """Returns three numbers: captions, captions with a claim, and captions with a decided claim."""
     captions = with_claim = with_decided = 0
     for example in examples:
         for text in example.captions:

@@ -89,9 +89,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str]:
-    """Returns the figures of both halves of the recordings,
-    each judged with the other half's thresholds.
-    """
+    """Returns the figures of both halves of the recordings, each judged with the other half's thresholds."""
     lines = [
         "",
         "Both halves of the recordings, each judged with thresholds from the other half:",

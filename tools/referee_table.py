@@ -111,8 +111,7 @@ def label(run: Path) -> str:
 
 
 def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarray]:
-    """Returns motions (F, 22, 3) that a run generates for captions,
-    each as long as a real motion.
+    """Returns motions (F, 22, 3) that a run generates for captions, each as long as a real motion.
 
     The maximum is `LONGEST` seconds.
     """
@@ -123,9 +122,7 @@ def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarr
 
 
 def baselines(joints: Joints, captions: list[str]) -> Mapping[str, tuple[Joints, list[str]]]:
-    """Returns by name real motions, mirrored motions,
-    and real motions with captions of other motions.
-    """
+    """Returns by name real motions, mirrored motions, and real motions with captions of other motions."""
     mirrored = [SMPL22.mirror(torch.from_numpy(motion)).numpy() for motion in joints]
     order = np.random.default_rng(0).permutation(len(captions))
     shuffled = list(captions)
@@ -144,9 +141,7 @@ def measured(
     captions: Sequence[str],
     extractor: MotionCLIPExtractor | None,
 ) -> dict[str, Any]:
-    """Returns the claim accuracy by group,
-    and the R-precision, which is None without an extractor.
-    """
+    """Returns the claim accuracy by group, and the R-precision, which is None without an extractor."""
     keys = torch.tensor([key(name) for name in ids])
     lengths = torch.tensor([len(motion) for motion in motions])
     joints = torch.zeros(len(motions), int(lengths.max()), 22, 3)

@@ -137,8 +137,7 @@ def write_model(model: MotionGenerator, folder: Path) -> None:
 
 
 def write_language(out: Path) -> None:
-    """Writes `language.json` and `language.bin`,
-    the tables with which the page understands texts.
+    """Writes `language.json` and `language.bin`, the tables with which the page understands texts.
 
     `language.bin` contains the vectors of the words, with 8 bits per number, followed by the
     words.
@@ -157,9 +156,7 @@ def write_language(out: Path) -> None:
 
 
 def language_constants() -> dict[str, Any]:
-    """Returns the constants of `flame_mdm.conditions.language`
-    that the page needs in addition to the tables.
-    """
+    """Returns the constants of `flame_mdm.conditions.language` that the page needs in addition to the tables."""
     return {
         "vowels": morphology.VOWELS,
         "never_corrected": spelling.NEVER_CORRECTED,
@@ -203,9 +200,7 @@ def write_pictures(out: Path, actions: Sequence[str]) -> None:
 
 
 def figure(example: Motion) -> dict[str, Any]:
-    """Returns the body of the example motion,
-    with which the page draws motions as the mannequin.
-    """
+    """Returns the body of the example motion, with which the page draws motions as the mannequin."""
     body, names = fit_body(example), list(SMPL22.joints)
     offsets = np.asarray(example.posed().offsets)
     helpers = []

@@ -80,9 +80,7 @@ def main(out: Path) -> None:
 
 
 def listed(model: Pretrained) -> list[str]:
-    """Returns the words of the table:
-    frequent words by frequency, then words for motion and things.
-    """
+    """Returns the words of the table: frequent words by frequency, then words for motion and things."""
     ranks = model.tokenizer.get_vocab()
     frequent = sorted((word for word in ranks if WORD.fullmatch(word)), key=ranks.__getitem__)[
         :FREQUENT
@@ -98,9 +96,7 @@ def listed(model: Pretrained) -> list[str]:
 
 
 def encoded(model: Pretrained, words: list[str]) -> np.ndarray:
-    """Returns the model's outputs (N, C) for single words:
-    means over tokens, including special tokens.
-    """
+    """Returns the model's outputs (N, C) for single words: means over tokens, including special tokens."""
     texts = [f"a person {word}" for word in words]
     outputs = []
     for first in range(0, len(texts), AT_ONCE):

@@ -37,7 +37,7 @@ class Extractor(ABC):
     # Hash of the weights or files. Values from extractors with different hashes are not
     # comparable.
     sha256: str
-    # fingerprint of the training data, if known
+    # Fingerprint of the training data, if known
     fingerprint: str | None = None
 
     @abstractmethod
@@ -48,14 +48,14 @@ class Extractor(ABC):
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns "features" (B, E) of motions; classifiers also return "logits" (B, A).
 
-        Motions are passed as `features` (B, F, D) in the data's units and as joints (B, F, J, 3)
-        in meters, y up, with mask (B, F).
+        Motions are passed as `features` (B, F, D) in the data's units, and as joints (B, F, J, 3)
+        in meters, y up, both with mask (B, F).
         """
 
     def texts(
         self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]
     ) -> Tensor | None:
-        """Returns features (B, E) of captions, whose "word/PART" tokens are passed if known.
+        """Returns features (B, E) of captions. Their "word/PART" tokens are passed if known.
 
         Returns None if the extractor does not read text.
         """
@@ -75,7 +75,7 @@ TrainedTask = TypeVar("TrainedTask", bound=ExtractorTask)
 class OwnExtractor(Extractor, Generic[TrainedTask]):
     """A network trained with `make train`, loaded from its checkpoint.
 
-    Raises `UserError` if the checkpoint holds another kind of model.
+    Raises `UserError` if the checkpoint contains another kind of model.
     """
 
     task: TrainedTask
@@ -122,7 +122,7 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
         self.encoded: dict[str, Tensor] = {}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of captions; each distinct caption is encoded once."""
+        """Returns features (B, E) of captions. Each distinct caption is encoded once."""
         new = sorted(set(captions) - self.encoded.keys())
         if new:
             self.encoded |= dict(zip(new, self.task.text(new), strict=True))
@@ -130,11 +130,10 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
 
     @torch.no_grad()
     def fit(self, motions: Sequence[Motion]) -> list[float]:
-        """Returns how well motions fit their texts:
-        the mean cosine similarity over the parts of a motion.
+        """Returns how well motions fit their texts: the mean cosine similarity over the parts of a motion.
 
-        A motion-CLIP overrates motions that it has selected: evaluate such motions with a
-        different motion-CLIP.
+        A motion-CLIP overrates motions that it has selected. Evaluate such motions with another
+        motion-CLIP.
         """
         scores = []
         for motion in motions:
@@ -154,17 +153,16 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
     trained, recipes = T2MTask, "t2m"
 
     def reads(self, other: Representation) -> bool:
-        """Whether the network reads motions in this representation,
-        or at least the features that both share.
-        """
+        """Whether the network reads motions in this representation, or at least the features that both share."""
         trained = self.task.representation
         is_part = (other.part_of, other.fps) == (trained.name, trained.fps)
         reads_part = is_part and self.task.network.used <= other.features
         return reads_part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of captions, from their words or,
-        if the extractor reads tags, from their tagged words.
+        """Returns features (B, E) of captions.
+
+        They are computed from the words or, if the extractor reads tags, from the tagged words.
         """
         return self.task.text(
             list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens)
@@ -194,15 +192,13 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 
 
 class ReleasedExtractor(Extractor, Generic[Network]):
-    """A network with its authors' released weights,
-    loaded from one file or from a folder of `FILES`.
-    """
+    """A network with its authors' released weights, loaded from one file or from a folder of `FILES`."""
 
     FILES: tuple[str, ...] = ()
     network: Network
     # Names of the representation and the data set that the network was trained on
     made_for: tuple[str, str]
-    # The network reads this many features, starting with the first.
+    # The network reads only this many features, starting with the first
     used = 0
 
     def __init__(self, path: str):
@@ -235,12 +231,11 @@ class ReleasedExtractor(Extractor, Generic[Network]):
 
 
 class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
-    """The released evaluator of Guo et al.
-    2022, or MARDM's first one, from a folder with five files.
+    """The released evaluator of Guo et al. 2022, or MARDM's first evaluator, from a folder with five files.
 
     The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM,
-    kit_... for KIT, eval_... in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe).
-    `full_length` is a legacy option, see `WordVectors`.
+    kit_... for KIT, eval_... in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe). `full_length`
+    is a legacy option; see `WordVectors`.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -267,8 +262,7 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
 
 
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
-    """The released second evaluator of MARDM.
-    Its CLIP-score is the `MotionCLIPScore` of its features.
+    """The second evaluator that MARDM released. Its CLIP-score is the `MotionCLIPScore` of its features.
 
     The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
     eval_std).
@@ -302,11 +296,11 @@ humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_
 
 
 class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
-    """A released action classifier (one of `CLASSIFIERS`) of 24 SMPL joints or their rotations.
+    """A released action classifier (one of `CLASSIFIERS`) of 24 SMPL joints or of their rotations.
 
     `random_start` is a legacy option, as in Guo et al. 2020 and all later work: the initial state
     of the humanact12 GRU is drawn from a normal distribution, separately for features and scores.
-    Here, the draw is a function of the motion.
+    In this implementation, the draw is a function of the motion.
     """
 
     def __init__(

@@ -1,7 +1,5 @@
 # pyright: standard
-"""Training of action classifiers,
-to evaluate action-to-motion on data sets without a released classifier.
-"""
+"""Training of action classifiers, to evaluate action-to-motion on data sets without a released classifier."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,9 +23,7 @@ from flame_mdm.representations import Representation
 
 
 class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
-    """Trains an action classifier on the joints
-    of any representation (`make train EXP=classifier/...`).
-    """
+    """Trains an action classifier on the joints of any representation (`make train EXP=classifier/...`)."""
 
     noun = "an action classifier"
 
@@ -35,7 +31,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
-        """Returns the network of a recipe; raises `UserError` if the data has fewer than two actions."""
+        """Returns the network of a recipe. Raises `UserError` if the data has fewer than two actions."""
         if len(actions) < 2:
             raise UserError(
                 f"a classifier needs a data set with at least two actions, but this one has {len(actions)}"

@@ -14,9 +14,7 @@ from flame_mdm.conditions.text import Pretrained
 from flame_mdm.denoisers.layers import sinusoid
 
 CLIP = ("openai/clip-vit-base-patch32", "3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268")
-"""CLIP's tokenizer on the Hugging Face hub,
-which is the same for all model sizes, and its commit.
-"""
+"""CLIP's tokenizer on the Hugging Face hub, which is the same for all model sizes, and its commit."""
 
 
 def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.TransformerEncoder:
@@ -25,7 +23,7 @@ def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.Transfo
 
 
 class _MotionEncoder(nn.Module):
-    """A transformer with a learned first token; the output for this token is the embedding of the motion."""
+    """A transformer with a learned first token, whose output is the embedding of the motion."""
 
     def __init__(self, features: int, width: int, transformer: nn.TransformerEncoder):
         super().__init__()
@@ -82,7 +80,7 @@ class MARDMClip(nn.Module):
     def text(self, tokens: Tensor) -> Tensor:
         """Returns vectors (B, 512) of captions.
 
-        The captions are CLIP's tokens (B, S), 0 after the end.
+        The captions are given as CLIP's tokens (B, S), with 0 after the end.
         """
         hidden = self.text_ln(
             self.textTransEncoder(self.token_embedding(tokens) + self.positional_embedding)
@@ -91,7 +89,7 @@ class MARDMClip(nn.Module):
 
 
 def clip_tokens(captions: Sequence[str]) -> Tensor:
-    """Returns CLIP's tokens (B, 77) of captions, 0 after the end; longer captions are cut."""
+    """Returns CLIP's tokens (B, 77) of captions, with 0 after the end. Longer captions are cut."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
     encoded = tokenizer(
         list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt"

@@ -35,11 +35,10 @@ POOL = 32  # number of pairs in a pool, as in R-precision
 
 
 class MotionCLIP(nn.Module):
-    """A transformer over [CLS, length, frame 1, frame 2, ...],
-    and a linear map of the pooled text vector.
+    """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear map of the pooled text vector.
 
-    The features are not scaled to norm 1, since Fréchet distance and MID use unscaled features.
-    The temperature is learned; its initial value is 0.07.
+    The features are not scaled to norm 1, because Fréchet distance and MID use unscaled features.
+    The temperature is learned, with an initial value of 0.07.
 
     Args:
         in_features: number D of features per frame of the motions.
@@ -48,8 +47,8 @@ class MotionCLIP(nn.Module):
         blind_features: number of features at the beginning of each frame that are set to 0.
             FLAME's code sets 3: each frame begins with the root's translation, so scores do not
             depend on position and height.
-        roughness: whether absolute second differences over time, which show noise, are inputs,
-            too.
+        roughness: whether absolute second differences over time, which show noise, are additional
+            inputs.
     """
 
     def __init__(
@@ -70,8 +69,8 @@ class MotionCLIP(nn.Module):
         super().__init__()
         self.max_frames, self.blind_features, self.roughness = max_frames, blind_features, roughness
         self.cls = nn.Parameter(torch.randn(latent_dim))
-        # Row 0, which the authors' code does not use, embeds the length of the longest motion;
-        # see the FLAME denoiser.
+        # Row 0, which the authors' code does not use, embeds the length of the longest motion; see
+        # the FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
         self.input = nn.Linear((1 + roughness) * in_features, latent_dim)
         self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU)
@@ -112,10 +111,10 @@ def info_nce(
 ) -> Tensor:
     """Contrastive loss over the pairs of all ranks: the mean of both cross-entropies.
 
-    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each rank compares its own
-    pairs (B, E) with the motions and texts of all ranks. DDP averages gradients over ranks. If
-    all ranks have the same number of pairs, the averages of losses and gradients equal the loss
-    and gradient of a single rank with all pairs.
+    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each rank compares its own pairs
+    (B, E) with the motions and texts of all ranks. DDP averages gradients over ranks. If all ranks
+    have the same number of pairs, the averages of losses and gradients equal the loss and gradient
+    of a single rank with all pairs.
 
     Args:
         motion: (B, E) features of the motions on this rank.
@@ -123,7 +122,7 @@ def info_nce(
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
-        wrong_text: (B, K, E) features of texts that are negatives of one motion each.
+        wrong_text: (B, K, E) features of texts, each of which is a negative of a single motion.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)
@@ -198,11 +197,10 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
-        """Imports the weights of FLAME's released motion-CLIP into the task
-        of a recipe with the same sizes.
+        """Imports the weights of FLAME's released motion-CLIP into the task of a recipe with the same sizes.
 
-        The weights have the authors' names. The pooler of the text encoder is imported, too,
-        since it has random weights from the authors' training. Raises `ValueError` if weights or
+        The weights have the authors' names. The pooler of the text encoder is also imported,
+        because it has random weights from the authors' training. Raises `ValueError` if weights or
         sizes do not match.
         """
         representation: Representation = instantiate(config["representation"])
@@ -231,7 +229,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def text_features(self, batch: MotionBatch) -> Tensor:
         """Returns features (B, E) of the captions of a batch."""
         cond = self.condition(batch)
-        # A learned null is not used here, but DDP requires a gradient for it
+        # A learned null condition is not used here, but DDP requires a gradient for it
         if cond.null is not None:
             cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
         return self.network.text(cond.pooled)
@@ -264,8 +262,7 @@ _MCLIP = {
 
 
 def our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the weights of FLAME's released network
-    by this project's names, without its RoBERTa.
+    """Renames the weights of FLAME's released network to this project's names, without its RoBERTa.
 
     Raises `ValueError` for unexpected weights.
     """

@@ -21,32 +21,32 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-# Near-miss captions per motion and step; they differ in different attributes if possible
+# Near-miss captions per motion and step. They differ in different attributes if possible.
 NEAR_MISSES = 2
-# Noise of strength 1 on the joints has this standard deviation, in meters.
+# Standard deviation, in meters, of noise of strength 1 on the joints
 JITTER = 0.02
-# Noise of strength 1 on the features has this standard deviation, in normalized features. This
-# noise moves joints by about 20 mm.
+# Standard deviation, in normalized features, of noise of strength 1 on the features. This noise
+# moves joints by about 20 mm.
 FEATURE_NOISE = 0.3
 # Weight of `calibration_error` relative to `info_nce`
 WEIGHT = 5.0
-# Length of all features. Noise of strength s moves all motions alike, so its FID is about (10
-# s)^2.
+# Length of all features. Noise of strength s moves all motions in the same direction, so its FID is
+# about (10 s)^2.
 LENGTH = 10.0
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
     """Trains motion-CLIP with distances of a known scale, and with texts that differ in details.
 
-    - Texts: motions of clips with the same captions or attributes are not negatives of each
-      other's captions. Near-miss captions (see `near_misses`) are additional negatives.
-    - Motions: half of them have a noisy copy. The strength of its noise is drawn from [0, 1],
-      small values more often. The distance between motion and copy, both scaled to norm 1, is
+    - Texts: motions of clips with the same captions or attributes are not negatives of each other's
+      captions. Near-miss captions (see `near_misses`) are additional negatives.
+    - Motions: half of them have a noisy copy. The strength of its noise is drawn from [0, 1], with
+      small values more often. The distance between a motion and its copy, both scaled to norm 1, is
       trained to be this strength. One half of the copies has white noise on the joints and is
-      encoded again, like motions from files. The other half has noise on normalized features,
-      like generated motions.
+      encoded again, like motions from files. The other half has noise on normalized features, like
+      generated motions.
 
-    All features have the same length: cosines leave lengths undetermined, which would disturb
+    All features have the same length. Cosines leave lengths undetermined, which would disturb
     Euclidean distances.
     """
 
@@ -58,7 +58,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
-        """Returns the parts of a recipe; raises `UserError` if the representation does not encode joints."""
+        """Returns the parts of a recipe. Raises `UserError` if the representation does not encode joints."""
         if not isinstance(representation, HumanML):
             raise UserError(
                 f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again. "
@@ -128,9 +128,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:
-        """Returns a near miss of a clip as a function of (seed, step, clip, number);
-        "" if the clip has none.
-        """
+        """Returns a near miss of a clip as a function of (seed, step, clip, number); "" if the clip has none."""
         attributes = self.near_misses[name] or [[""]]
         draw = key("near miss", self.seed, step, name)
         texts = attributes[(draw + number) % len(attributes)]
@@ -138,8 +136,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
 
 def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
-    """Returns the mean absolute difference between distances
-    of features (B, E) and `strength` (B,).
+    """Returns the mean absolute difference between distances of features (B, E) and `strength` (B,).
 
     Features are scaled to norm 1 before their distance is computed.
     """
@@ -152,8 +149,8 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
     """Returns noisy copies (B, F, D) of normalized motions.
 
-    The first half of the motions gets noise on the joints, the second half on the features, with
-    `strength` (B,). Noise is drawn from torch's generator of the CPU.
+    In the first half of the motions, noise is added to the joints; in the second half, to the
+    features. Its strength is `strength` (B,). The noise is drawn from torch's CPU generator.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

@@ -1,9 +1,8 @@
 # pyright: standard
-"""The evaluator of HumanML3D
-and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
+"""The evaluator of HumanML3D and KIT-ML.
 
-The authors' code returns embeddings in the order of descending length; this code keeps the order
-of the input.
+Source: Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text". The authors'
+code returns embeddings in the order of descending length. This code keeps the order of the input.
 """
 
 import itertools
@@ -68,7 +67,8 @@ class WordVectors:
     def read(cls, folder: Path) -> Self:
         """Reads our_vab_data.npy and our_vab_idx.pkl.
 
-        Raises `FileNotFoundError` if a file is missing, and `UserError` for other content.
+        Raises `FileNotFoundError` if a file is missing, and `UserError` if its content is not
+        valid.
         """
         rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = _read_numbers(folder / "our_vab_data.npy").astype(np.float32)
@@ -87,11 +87,10 @@ class WordVectors:
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
         """Returns the text encoder's input for captions.
 
-        Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the
-        20th are dropped. If a word has no vector, both the word and its part of speech are
-        encoded as unknown. `full_length` is a legacy option of MFM's code and of MDM's code
-        before January 2024: every caption is treated as if it filled all 22 slots, which lowers
-        R-precision.
+        Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the 20th
+        are dropped. If a word has no vector, both the word and its part of speech are encoded as
+        unknown. `full_length` is a legacy option, as in MFM's code and in MDM's code before January
+        2024: every caption is treated as if it filled all 22 slots, which lowers R-precision.
         """
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows, parts = [], []
@@ -108,7 +107,7 @@ class WordVectors:
 class LearnedWords(nn.Module):
     """Word vectors learned with the evaluator, for data sets without tagged words.
 
-    Vectors of parts of speech are 0.
+    The vectors of parts of speech are 0.
     """
 
     def __init__(self):
@@ -117,9 +116,7 @@ class LearnedWords(nn.Module):
         nn.init.normal_(self.table.weight, std=0.3)  # similar to the scale of GloVe vectors
 
     def forward(self, captions: Sequence[Sequence[str]]) -> Words:
-        """Returns the text encoder's input for the words of captions;
-        words after the 20th are dropped.
-        """
+        """Returns the text encoder's input for the words of captions. Words after the 20th are dropped."""
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows = [
             [hashed(token.partition("/")[0], self.table.num_embeddings) for token in tokens]
@@ -137,10 +134,10 @@ class T2MEvaluator(nn.Module):
     """Embeds motions and captions in a joint space, for the metrics of HumanML3D and KIT.
 
     The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units, and
-    are normalized with the `mean` and `std` (D,) of the released weights. As in the authors' code
-    for real motions, motions are padded with zeros to `max_frames` after normalization, so the
-    convolutions see 3 frames past the end. The network sees the first `used_features` features
-    (MARDM: 67; KIT: 64); None = all features except the contacts.
+    are normalized with the `mean` and `std` (D,) of the released weights. After normalization,
+    motions are padded with zeros to `max_frames`, as in the authors' code for real motions. The
+    convolutions therefore read 3 frames past the end. The network reads the first `used_features`
+    features (MARDM: 67; KIT: 64); None = all features except the contacts.
     """
 
     mean: Tensor
@@ -178,14 +175,12 @@ class T2MEvaluator(nn.Module):
         used = slice(self.used)
         x = (x[..., used] - self.mean[used]) / self.std[used] * mask[..., None]
         x = pad_to(x[:, : self.max_frames], self.max_frames)
-        with torch.no_grad():  # The movement encoder is frozen when texts and motions are matched
+        with torch.no_grad():  # the movement encoder is frozen when texts and motions are matched
             movements = self.movement_encoder(x)
         return self.motion_encoder(movements, lengths // UNIT)
 
     def text(self, words: Words) -> Tensor:
-        """Returns embeddings (B, E) of captions from the output of `WordVectors` or
-        `LearnedWords`.
-        """
+        """Returns embeddings (B, E) of captions from the output of `WordVectors` or `LearnedWords`."""
         weight = self.text_encoder.input_emb.weight
         return self.text_encoder(words.vectors.to(weight), words.parts.to(weight), words.lengths)
 
@@ -207,7 +202,7 @@ class _MovementEncoder(nn.Module):
 
 
 class _Recurrent(nn.Module):
-    """A bidirectional GRU with a learned initial state; its two final states are mapped to the embedding."""
+    """A bidirectional GRU with a learned initial state, whose two final states are mapped to the embedding."""
 
     def __init__(self, in_features: int, hidden: int, embedding: int):
         super().__init__()
@@ -264,9 +259,7 @@ def read_statistics(folder: Path) -> list[Tensor]:
 
 
 def load_t2m(folder: Path) -> T2MEvaluator:
-    """Loads the evaluator, or MARDM's evaluator of 67 or 64 features,
-    from the folder of a `T2MExtractor`.
-    """
+    """Loads the evaluator, or MARDM's evaluator of 67 or 64 features, from the folder of a `T2MExtractor`."""
     mean, std = read_statistics(folder)
     network = T2MEvaluator(mean, std, used_features=len(mean) if len(mean) in (67, 64) else None)
     path = folder / "finest.tar"

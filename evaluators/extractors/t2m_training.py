@@ -1,7 +1,5 @@
 # pyright: standard
-"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`),
-for data that its released weights do not fit.
-"""
+"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`), for data that its released weights do not fit."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,9 +23,7 @@ from flame_mdm.representations import Representation
 
 
 class _MovementDecoder(nn.Module):
-    """The decoder for the movement encoder:
-    two transposed convolutions decode one vector to 4 frames.
-    """
+    """The decoder for the movement encoder: two transposed convolutions decode one vector to 4 frames."""
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -46,9 +42,7 @@ class _MovementDecoder(nn.Module):
 def reconstruction_terms(
     network: T2MEvaluator, decoder: nn.Module, batch: MotionBatch
 ) -> dict[str, Tensor]:
-    """Returns the loss terms (B,) of the movement autoencoder,
-    over the real frames of each motion.
-    """
+    """Returns the loss terms (B,) of the movement autoencoder, over the real frames of each motion."""
     frames = batch.x.shape[1] // UNIT * UNIT
     x, mask = batch.x[:, :frames, : network.used], batch.mask[:, :frames]
     latents, units = network.movement_encoder(x), mask[:, UNIT - 1 :: UNIT]
@@ -69,16 +63,16 @@ def matching_loss(
     """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
 
     Returns a scalar for B pairs. Each text is compared with its own motion, and with a wrong
-    motion: the motion of the nearest previous pair that the text does not fit. The wrong motion
-    adds no loss if its distance is larger than `margin`. The authors shift the motions by a
+    motion: the motion of the nearest previous pair that the text does not describe. The wrong
+    motion adds no loss if its distance is larger than `margin`. The authors shift the motions by a
     random number of rows instead, which also pushes matching pairs apart.
 
     Args:
         motion: (B, E) features of the motions.
         text: (B, E) features of the texts.
         margin: distance beyond which a wrong motion adds no loss.
-        fits: (B, B) bool, True = the text of the row describes the motion of the column; None =
-            only its own.
+        fits: (B, B) bool, True = the text of the row describes the motion of the column. None =
+            each text describes only its own motion.
     """
     count = len(motion)
     rows = torch.arange(count, device=motion.device)
@@ -116,8 +110,8 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
     Checkpoints contain the word vectors.
 
     Args:
-        words: folder of our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is only
-            read for training. "learned" = learn the vectors, for data sets whose words are not
+        words: folder with our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is read
+            only for training. "learned" = learn the vectors, for data sets whose words are not
             tagged; see `LearnedWords`.
         sparsity, smoothness: weights of two losses, the mean magnitude of movement vectors and
             the mean magnitude of differences between successive vectors.
@@ -202,15 +196,11 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
-        """Returns the word vectors (words, 300) that were read from a file;
-        `facts` maps words to rows.
-        """
+        """Returns the word vectors (words, 300) that were read from a file. `facts` maps words to rows."""
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the word vectors of a checkpoint;
-        raises `UserError` if a resumed run reads other vectors.
-        """
+        """Restores the word vectors of a checkpoint. Raises `UserError` if a resumed run reads other vectors."""
         if self.learns_words:
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):
@@ -220,8 +210,9 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.words = WordVectors(self.facts["words"], state.cpu())
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """Returns features (B, E) of captions. The captions are "word/PART" tokens, or words if
-        the vectors are learned.
+        """Returns features (B, E) of captions.
+
+        The captions are "word/PART" tokens or, if the vectors are learned, words.
         """
         assert self.words is not None
         return self.network.text(self.words(tokens))
@@ -248,9 +239,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return loss + 0 * sum(parameter.sum() for parameter in self._idle())
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Removes the gradients of idle parameters,
-        which momentum would change even with a gradient of 0.
-        """
+        """Removes the gradients of idle parameters, which momentum would change even with a gradient of 0."""
         for parameter in self._idle():
             parameter.grad = None
 

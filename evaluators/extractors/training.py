@@ -22,9 +22,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class ExtractorTask(Task, Generic[Network]):
-    """Task that trains a feature extractor,
-    which shares no parts with the models that it evaluates.
-    """
+    """Task that trains a feature extractor, which shares no parts with the models that it evaluates."""
 
     network: Network
 
@@ -38,7 +36,7 @@ class ExtractorTask(Task, Generic[Network]):
         seed: int = 0,
     ):
         super().__init__(optimizer=optimizer, seed=seed)
-        # The order of the parts determines the numbers of parameters in saved optimizer states.
+        # The order of the parts determines the numbering of parameters in saved optimizer states
         self.condition, self.representation = condition, representation
         self.network, self.val_metrics = network, nn.ModuleDict()
 
@@ -75,7 +73,7 @@ class ExtractorTask(Task, Generic[Network]):
         raise NotImplementedError
 
     def metrics(self) -> Mapping[str, Metric]:
-        """Returns the metrics of a validation; their "loss" selects the best checkpoint."""
+        """Returns the validation metrics. Their "loss" selects the best checkpoint."""
         raise NotImplementedError
 
     def setup(self, stage: str) -> None:
@@ -94,7 +92,7 @@ class ExtractorTask(Task, Generic[Network]):
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
         """Adds a batch to the validation metrics.
 
-        With fewer clips than ranks, each rank has all clips, and only rank 0 counts.
+        If there are fewer clips than ranks, each rank has all clips, and only rank 0 counts.
         """
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return

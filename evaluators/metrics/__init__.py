@@ -27,13 +27,13 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
 A key is the `flame_mdm.seeds.key` of an id. With several samples per id, the number of the sample
-is part of the key. Metrics that compare motions one by one (MID, position and displacement
-errors) take real motions in the order of the generated motions.
+is part of the key. Metrics that compare motions one by one (MID, position and displacement errors)
+require real motions in the order of the generated motions.
 
-`compute()` returns a number, or a dict of numbers by name; None without samples. It raises
-`UserError` if a number would be meaningless, for example with too few samples. For the same
-features, values are bit-identical for any batch size, order and number of processes. Random draws
-depend only on `seed`.
+`compute()` returns a number, or a dict of numbers by name. Without samples, it returns None. It
+raises `UserError` if a number would be meaningless, for example if there are too few samples. For
+the same features, values are bit-identical for any batch size, order and number of processes.
+Random draws depend only on `seed`.
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
-    """Creates metrics by name from mappings with a `_target_`;
-    each metric gets the `options` that it takes.
-    """
+    """Creates metrics by name from mappings with a `_target_`. Each metric gets the `options` that it accepts."""
     metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():
         legal = parameters(config["_target_"]) if "_target_" in config else ()
@@ -65,7 +63,7 @@ def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Sam
 
 
 def inputs_of(metric: Metric) -> dict[str, bool]:
-    """Returns the names of the inputs that `update` takes, and whether each input is required."""
+    """Returns the names of the inputs of `update`, and whether each input is required."""
     parameters = inspect.signature(metric.update).parameters
     if "rows" in parameters:  # `SampleMetric.update`
         return dict.fromkeys(("keys", *getattr(metric, "states", ())), True)
@@ -78,7 +76,7 @@ def required_inputs(metric: Metric) -> list[str]:
 
 
 def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
-    """Updates each metric with the inputs that it takes. Raises `UserError` if a required input is missing."""
+    """Updates each metric with its inputs. Raises `UserError` if a required input is missing."""
     for name, metric in metrics.items():
         for needed in required_inputs(metric):
             if needed not in inputs:
@@ -89,7 +87,7 @@ def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> UserError:
-    """Returns the error for a metric without its input `needed`."""
+    """Returns the error for a metric whose input `needed` is missing."""
     return UserError(
         f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
         "choose data, an extractor or a protocol with this input"

@@ -16,16 +16,16 @@ TOP = (1, 2, 3)
 
 
 def equally_weighted(values: Tensor) -> Tensor:
-    """Returns values (N,) with weights of 1, (N, 2)."""
+    """Returns values (N,) with a column of weights of 1, (N, 2)."""
     return torch.stack([values, torch.ones(len(values), dtype=values.dtype)], 1)
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct: Tensor) -> Tensor:
     """Returns the rank (N,) of the correct candidate of each query, 0 = first.
 
-    The rank is the number of candidates that are closer than the correct one, or equally close
-    and earlier in the pool. `pools` (N, P) has the indices of the candidates (M, E) of each query
-    (N, E), and `correct` (N,) is the position of the correct candidate in each pool.
+    The rank is the number of candidates that are closer than the correct candidate, or equally
+    close and earlier in the pool. `pools` (N, P) contains the indices of the candidates (M, E) of
+    each query (N, E). `correct` (N,) is the position of the correct candidate in each pool.
     """
     pools, correct = pools.to(queries.device), correct.to(queries.device)
     ranks = []
@@ -42,9 +42,9 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct:
 class RPrecision(SampleMetric):
     """Base class of R-precision.
 
-    R-precision is the fraction of queries with their correct candidate among the k nearest of a
-    pool. `update` takes `generated` (B, E), `text` (B, E), `text_keys` (B,) and `keys` (B,). The
-    values `top1`, `top2` and `top3` are in [0, 1]; higher is better.
+    R-precision is the fraction of queries whose correct candidate is among the k nearest candidates
+    of a pool. `update` takes `generated` (B, E), `text` (B, E), `text_keys` (B,) and `keys` (B,).
+    The values `top1`, `top2` and `top3` are in [0, 1]; higher is better.
 
     Args:
         pool: number of candidates of a query, including the correct candidate.
@@ -71,8 +71,7 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns for each query the probability
-        that its correct candidate is among the k nearest.
+        """Returns for each query the probability that its correct candidate is among the k nearest.
 
         The pool is random.
 
@@ -80,9 +79,9 @@ class RPrecision(SampleMetric):
             distance: (N, M) distances from queries to candidates.
             correct: (N,) index of the correct candidate of each query.
         """
-        # A random pool has pool - 1 of the other candidates. The number of closer candidates in a
-        # pool has a hypergeometric distribution, so the probability is exact without drawing
-        # pools. Half of the candidates at an equal distance count as closer.
+        # A random pool contains pool - 1 of the other candidates. The number of closer candidates
+        # in a pool has a hypergeometric distribution, so the exact probability is known without
+        # drawing pools. Half of the candidates at an equal distance count as closer.
         others = distance.shape[1] - 1
         if others + 1 < self.pool:
             raise UserError(f"a pool needs {self.pool} candidates, but there are only {others + 1}")
@@ -97,16 +96,15 @@ class RPrecision(SampleMetric):
 
 
 class TextsForMotion(RPrecision):
-    """R-precision, texts for a motion: is the motion's text among the k nearest of 32?
+    """R-precision, texts for a motion: is the motion's text among the k nearest of 32 texts?
 
     This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of
     FLAME's code. A motion ranks 32 texts by Euclidean distance: its own text, and 31 texts drawn
-    without replacement from other captions. In FLAME's code, a pool is a batch, so the last pool
-    may be smaller. The own text is at a random position, so that an extractor that cannot tell
-    texts apart gets k / 32.
+    may be smaller. The motion's own text is at a random position, so that an extractor that cannot
+    tell texts apart gets k / 32.
 
     Args:
-        pool: number of texts in a pool, including the own text.
+        pool: number of texts in a pool, including the motion's own text.
         seed: seed of the pools.
 
     Example:
@@ -118,8 +116,8 @@ class TextsForMotion(RPrecision):
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
         """Returns the rank (N,) of each motion's own text in its pool, 0 = first."""
-        # Each motion draws its other texts from the captions except its own: drawn indices at or
-        # above the own caption are increased by one. Then the own caption, which is last, swaps
+        # Each motion draws its other texts from all captions except its own. Drawn indices at or
+        # above its own caption are increased by one. Then its own caption, which is last, swaps
         # places with a random text.
         generator = np.random.default_rng(self.seed)
         _, first, correct = np.unique(
@@ -146,23 +144,23 @@ class TextsForMotion(RPrecision):
 
 
 class MotionsForText(RPrecision):
-    """R-precision, motions for a text: is the text's motion among the k nearest of 32?
+    """R-precision, motions for a text: is the text's motion among the k nearest of 32 motions?
 
     This is the definition in the code of Guo et al. 2022, which the tables of MDM and MFM use.
     Test pairs in random order are split into pools of 32. In a pool, each text ranks the motions
     by Euclidean distance; equal captions may be in the same pool.
 
-    The code differs in two ways. It drops an incomplete last pool; here, the texts of an
-    incomplete last pool rank the last 32 motions, so that every text counts once. Its distances
-    are float32: if a motion and its text have the same features, the motion may rank last (square
-    root of a negative number).
+    The authors' code differs in two ways. It drops an incomplete last pool. In this implementation,
+    the texts of an incomplete last pool rank the last 32 motions, so that every text counts once.
+    Its distances are float32: if a motion and its text have the same features, the motion may rank
+    last (square root of a negative number).
 
     Args:
-        pool: number of motions in a pool, including the own motion.
+        pool: number of motions in a pool, including the text's own motion.
         seed: seed of the pools.
-        normalize: whether to scale features to norm 1 first, which ranks by cosine. An
-            extractor trained with cosines, such as motion-CLIP, does not constrain lengths: the
-            motions with the shortest features would be nearest to every text.
+        normalize: whether to scale features to norm 1 first, which ranks by cosine. An extractor
+            trained with cosines, such as motion-CLIP, does not constrain lengths. Without
+            normalization, the motions with the shortest features would be nearest to every text.
 
     Example:
         >>> metric, features, keys = MotionsForText(pool=3), torch.eye(3), torch.arange(3)
@@ -208,9 +206,9 @@ def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]
 class MultimodalDistance(SampleMetric):
     """MM-Dist (MFM, eq. 10), the mean Euclidean distance between motions and their texts.
 
-    Guo et al. 2022 call it "matching score". Their code computes in float32 and drops an
-    incomplete last batch; here, every motion counts. Lower is better. `update` takes `generated`
-    (B, E), `text` (B, E) and `keys` (B,).
+    Guo et al. 2022 call it "matching score". Their code computes in float32 and drops an incomplete
+    last batch. In this implementation, every motion counts. Lower is better. `update` takes
+    `generated` (B, E), `text` (B, E) and `keys` (B,).
 
     Args:
         normalize: whether to scale features to norm 1 first, for extractors trained with
@@ -245,8 +243,7 @@ class MultimodalDistance(SampleMetric):
 
 
 class MotionCLIPScore(SampleMetric):
-    """mCLIP score of FLAME ("Evaluation Metrics"):
-    mean cosine of the features of motions and their texts.
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and their texts.
 
     The value is in [-1, 1]; higher is better. `update` takes `generated` (B, E), `text` (B, E)
     and `keys` (B,).
@@ -303,9 +300,9 @@ class MutualInformationDivergence(SampleMetric):
     """MID in nats: the mean of `pointwise_mutual_information` over generated motions.
 
     Kim et al. 2022. Higher is better. MID needs more samples than motion and text have features
-    together, because the joint covariance is singular otherwise. The authors' code requires only
-    half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and
-    `keys` (B,); row i of `real` is the real motion of text i.
+    together, because otherwise the joint covariance is singular. The authors' code requires only
+    half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and `keys`
+    (B,); row i of `real` is the real motion of text i.
 
     Args:
         eps: added to the diagonals of covariances before they are inverted; 5e-4 in FLAME, 0 in
@@ -328,7 +325,7 @@ class MutualInformationDivergence(SampleMetric):
         self.eps = eps
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
-        """Returns the MID of features (N, E); raises `UserError` if there are too few samples."""
+        """Returns the MID of features (N, E). Raises `UserError` if there are too few samples."""
         self.need(
             len(text),
             real.shape[1] + text.shape[1] + 1,
@@ -337,7 +334,7 @@ class MutualInformationDivergence(SampleMetric):
         return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the pointwise mutual information of each motion; raises `UserError` if there are too few motions."""
+        """Returns the pointwise mutual information of each motion. Raises `UserError` if there are too few motions."""
         real, real_text = rows["paired"], rows["paired_text"]
         if len(real) <= real.shape[1] + real_text.shape[1]:
             raise UserError(f"{len(real)} motions are too few to estimate the covariances")

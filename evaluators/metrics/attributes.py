@@ -1,7 +1,7 @@
 # pyright: standard
 """Attributes of a motion, read from its joints by geometric rules.
 
-The attributes are action, side, count, direction, speed and amount. The rules read what a person
+The attributes are action, side, count, direction, speed and amount. The rules detect what a person
 would see in a clip of a few seconds that shows one action of the synthetic set. Each threshold is
 stated next to its rule. The joints are SMPL's 22 joints.
 """
@@ -53,7 +53,7 @@ UNREAD = (
     "while",
     "ends",
 )
-# No rule reads these actions, so clips with them are not scored either
+# No rule reads these actions, so clips with them are not scored
 UNDECIDED = MORE.keys() - CHECKED.keys()
 
 
@@ -69,7 +69,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
         fps: frames per second.
 
     Returns:
-        "action", and the further `ATTRIBUTES` that the motion has. {} if no action of the set is
+        "action", and all further `ATTRIBUTES` of the motion. {} if no action of the set is
         recognized, for example in noise, or if the joints do not form a body.
 
     Example:
@@ -85,8 +85,8 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     floor = np.percentile(smooth[:, TOES, 1], 10)
     forward, left, turned = heading_of(smooth)
 
-    # The body stands if the neck is 25 cm above the pelvis, and the pelvis is 50 cm above the
-    # toes, half of the time.
+    # The body stands if, in half of the frames, the neck is 25 cm above the pelvis and the pelvis
+    # is 50 cm above the toes.
     pelvis = smooth[:, PELVIS, 1]
     stands = (
         np.median(smooth[:, NECK, 1] - pelvis) > 0.25
@@ -96,9 +96,9 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if lowered or not stands:
         return lowered
     jumps = count_rises((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
-    # A leap covers more than 45 cm with both feet side by side. A dance sways at least three
-    # times by more than 3.5 cm from side to side. A hand that picks something up comes within 42
-    # cm of the floor.
+    # A leap covers more than 45 cm with both feet side by side. In a dance, the body sways at least
+    # three times by more than 3.5 cm from side to side. A hand that picks something up comes within
+    # 42 cm of the floor.
     stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
     if (
         jumps
@@ -133,9 +133,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
 
 def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
-    """Returns the attributes of one clip (F, 22, 3) and,
-    as "checks", the result of each check of `CHECKED`.
-    """
+    """Returns the attributes of one clip (F, 22, 3) and, as "checks", the result of each check of `CHECKED`."""
     seen: dict[str, Any] = dict(read_attributes(joints, fps))
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -148,8 +146,7 @@ def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Whether the joints form a body:
-    limbs of 15 to 60 cm that vary by less than 25 %, and smooth joints.
+    """Whether the joints form a body: limbs of 15 to 60 cm that vary by less than 25 %, and smooth joints.
 
     A joint is smooth if it stays within 2 cm of a curve.
     """
@@ -165,8 +162,8 @@ def _lowered(
 ) -> dict[str, str | int]:
     """Reads crawling, lying down, sitting down and standing up.
 
-    The pelvis of a standing person is higher than 78 cm, of a seated person at 35 to 72 cm, of a
-    lying person below 35 cm. The trunk of a person who lies or crawls is tilted by more than 55
+    The pelvis is higher than 78 cm if a person stands, between 35 and 72 cm if a person sits, and
+    below 35 cm if a person lies. The trunk of a person who lies or crawls is tilted by more than 55
     degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
@@ -189,16 +186,14 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Reads walks and runs,
-    which move more than 33 cm from their start and lift both ankles by 4 cm.
-    """
+    """Reads walks and runs, which move more than 33 cm from their start and lift both ankles by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
     if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
-    # The speed in the middle counts, since walks begin and end with standing
+    # The speed in the middle counts, because walks begin and end with standing
     speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)
     ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
     if abs(turned) > 90:
@@ -229,9 +224,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads throws, salutes, raised arms, waves, claps and punches;
-    without any of them, standing.
-    """
+    """Reads throws, salutes, raised arms, waves, claps and punches; if none is found, standing."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -243,8 +236,7 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
     from_head = smooth[:, WRISTS] - smooth[:, [HEAD]]
     near = (np.linalg.norm(from_head, axis=-1) < 0.225) & (from_head[..., 1] > -0.08)
     for side, name in enumerate(SIDES):
-        # In a throw, the hand moves from above the shoulder far to the front within half a
-        # second.
+        # In a throw, the hand moves from above the shoulder far to the front within half a second.
         drawn = np.flatnonzero((above[:, side] > 0) & (ahead[:, side] < 0.1))
         if any((ahead[i : i + round(0.5 * fps), side] > 0.38).any() for i in drawn):
             return {"action": "throw", "side": name}
@@ -255,7 +247,7 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
         up = (fore[:, side, 1] > 0.2 * length[side]) & (above[:, side] > 0.1)
         if up.sum() < 0.35 * fps:
             continue
-        # In a wave, the forearm swings about the elbow; a raised arm stays still.
+        # In a wave, the forearm swings about the elbow. A raised arm stays still.
         swing = straight[up, side] - gaussian_filter1d(
             straight[up, side], 0.25 * fps, mode="nearest"
         )
@@ -280,9 +272,7 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
 
 def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
-    """Counts how often the head pitches forward by more than 32 degrees and comes back,
-    relative to the shoulders.
-    """
+    """Counts how often the head pitches forward by more than 32 degrees and back, relative to the shoulders."""
     base = smooth[:, [NECK, *COLLARS, *SHOULDERS]].mean(1)
     head = smooth[:, HEAD] - base - (smooth[:, NECK] - base).mean(0)
     nod = np.degrees(np.arctan2((head[:, [0, 2]] * forward).sum(-1), head[:, 1]))
@@ -290,8 +280,7 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns whether each requested attribute,
-    and combinations of attributes, were read from a motion.
+    """Returns whether each requested attribute, and combinations of attributes, were read from a motion.
 
     Each action of `CHECKED` is read by its own check. Returns {} for actions without a rule.
 
@@ -317,8 +306,8 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 class AttributeAccuracy(Timed, MotionMean):
     """Fraction of motions that show the requested value, by attribute. A metric of this project.
 
-    There is one value in [0, 1] for each of `ATTRIBUTES`, for `action_and_side` and for `all`;
-    higher is better. Rules read the attributes from the joints, without a network; see
+    There is one value in [0, 1] for each of `ATTRIBUTES`, for `action_and_side` and for `all`.
+    Higher is better. Rules read the attributes from the joints, without a network; see
     `right_attributes`.
 
     Args:
@@ -342,9 +331,7 @@ class AttributeAccuracy(Timed, MotionMean):
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns by attribute whether each motion shows the requested value,
-        and whether a value was requested.
-        """
+        """Returns by attribute whether each motion shows the requested value, and whether one was requested."""
         pairs = zip(rows["seen"], rows["requested"], strict=True)
         shown = [right_attributes(json.loads(str(seen)), requested) for seen, requested in pairs]
         weighted: dict[str, Tensor] = {}
@@ -377,8 +364,8 @@ class AttributeAccuracy(Timed, MotionMean):
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     """Reads the side, left or right, of a motion (F, 22, 3) of the Bandai set.
 
-    The side of walk-turn-left and walk-turn-right is read from the turn of the body, the side of
-    walk-left and walk-right from the direction of travel. For all other contents, it is the side
+    For walk-turn-left and walk-turn-right, the side is read from the turn of the body; for
+    walk-left and walk-right, from the direction of travel. For all other contents, it is the side
     of the hand that rises higher above its shoulder. The side in the name of the content is not
     used.
 
@@ -399,11 +386,11 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
 
 
 class SideAccuracy(Timed, MotionMean):
-    """Share of motions of the Bandai set that show the requested side, left or right.
+    """Fraction of motions of the Bandai set that show the requested side, left or right.
 
     A metric of this project. `hand` covers gestures, `path` covers turns and sideways walks, and
-    `hand_or_path` covers both. Chance is 0.5; higher is better. Rules read the sides from the
-    joints, without a network; see `read_side`.
+    `hand_or_path` covers both. The value of chance is 0.5; higher is better. Rules read the sides
+    from the joints, without a network; see `read_side`.
 
     Args:
         fps: frames per second of the motions.

@@ -1,9 +1,8 @@
-"""Checks of single actions: whether a motion shows a certain action, and with which side, count or direction.
+"""Checks of single actions: whether a motion shows an action, and with which side, count or direction.
 
-`evaluators.metrics.attributes` reads one of 22 actions from a motion. Rules cannot tell further
-actions apart: a hand at the head for half a second may be a drink, a phone call or a scratch. A
-check therefore only verifies the action that was requested. Thresholds are stated next to the
-rules.
+`evaluators.metrics.attributes` reads one of 22 actions from a motion. Rules cannot distinguish
+further actions: a hand at the head for half a second may be a drink, a phone call or a scratch. A
+check therefore only verifies the requested action. Thresholds are stated next to the rules.
 """
 
 from collections.abc import Callable
@@ -18,9 +17,7 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the directions (F, 2) to the front and to the left on the ground,
-    and the turn to the left in degrees.
-    """
+    """Returns the directions (F, 2) to the front and to the left on the ground, and the turn to the left in degrees."""
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]
@@ -37,7 +34,7 @@ def tilt_of(smooth: np.ndarray) -> np.ndarray:
 
 
 def count_rises(signal: np.ndarray, high: float, low: float) -> int:
-    """Counts how often a signal rises above `high` after having been below `low`."""
+    """Counts how often a signal rises above `high` after it was below `low`."""
     count, armed = 0, False
     for value in signal:
         if armed and value > high:
@@ -84,7 +81,7 @@ class View:
     def path(self) -> np.ndarray:
         """Returns how far the pelvis is to the left and in front of its start, (F, 2).
 
-        Left and front refer to the heading in the first frame.
+        Left and front are relative to the heading in the first frame.
         """
         moved = (self.smooth[:, PELVIS] - self.smooth[0, PELVIS])[:, [0, 2]]
         return np.stack([moved @ self.left[0], moved @ self.forward[0]], -1)
@@ -108,7 +105,7 @@ def _to_head(view: View) -> Shown:
 def _to_front(view: View) -> Shown:
     """Reads a hand that is more than 15 cm in front of its shoulder for 0.4 seconds.
 
-    The hand must also be above the height of the elbow of a hanging arm.
+    The hand must also be higher than the elbow of a hanging arm.
     """
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
@@ -117,9 +114,7 @@ def _to_front(view: View) -> Shown:
 
 
 def _point(view: View) -> Shown:
-    """Reads an arm that is stretched to 90 % of its length
-    and within 35 degrees of level for 0.4 seconds.
-    """
+    """Reads an arm that is stretched to 90 % of its length and within 35 degrees of level for 0.4 seconds."""
     side = _raised_hand(view)
     shoulder, elbow, wrist = (view.smooth[:, joint[side]] for joint in (SHOULDERS, ELBOWS, WRISTS))
     length = np.median(
@@ -132,9 +127,7 @@ def _point(view: View) -> Shown:
 
 
 def _knock(view: View) -> Shown:
-    """Counts how often a hand in front
-    of the body moves 4 cm beyond the middle of its strokes.
-    """
+    """Counts how often a hand in front of the body moves 4 cm beyond the middle of its strokes."""
     shown = _to_front(view)
     if not shown:
         return {}
@@ -145,9 +138,7 @@ def _knock(view: View) -> Shown:
 
 
 def _slash(view: View) -> Shown:
-    """Reads a hand that moves from 20 cm above the shoulder to below it,
-    and 15 cm inward, within half a second.
-    """
+    """Reads a hand that moves from 20 cm above to below the shoulder, and 15 cm inward, within 0.5 seconds."""
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
     above = (hand - shoulder)[:, 0, 1]
@@ -161,9 +152,7 @@ def _slash(view: View) -> Shown:
 
 
 def _hop(view: View) -> Shown:
-    """Reads hops on one foot and counts its flights;
-    the other foot is 12 cm higher half of the time.
-    """
+    """Reads hops on one foot and counts the flights. The other foot is 12 cm higher in half of the frames."""
     toes = view.smooth[:, TOES, 1] - view.floor
     side = int(toes.mean(0).argmin())
     if (toes[:, 1 - side] - toes[:, side] > 0.12).sum() < 0.4 * view.fps:
@@ -172,7 +161,7 @@ def _hop(view: View) -> Shown:
 
 
 def _jumping_jacks(view: View) -> Shown:
-    """Counts how often the feet are more than 45 cm apart, if the hands get above the shoulders."""
+    """Counts how often the feet are more than 45 cm apart, if the hands rise above the shoulders."""
     apart = np.linalg.norm(
         (view.smooth[:, ANKLES[0]] - view.smooth[:, ANKLES[1]])[:, [0, 2]], axis=-1
     )
@@ -190,7 +179,7 @@ def _push_ups(view: View) -> Shown:
 
 
 def _lean(view: View) -> Shown:
-    """Reads a head more than 13 cm to a side of the pelvis."""
+    """Reads a head that is more than 13 cm to one side of the pelvis."""
     aside = view.aside(view.smooth[:, [HEAD]], view.smooth[:, [PELVIS]])[:, 0]
     farthest = aside[np.abs(aside).argmax()]
     return {"direction": "left" if farthest > 0 else "right"} if abs(farthest) > 0.13 else {}
@@ -208,9 +197,7 @@ def _spin(view: View) -> Shown:
 
 
 def _dodge(view: View) -> Shown:
-    """Reads a path of more than 25 cm to a side, or backward,
-    with one quick movement (above 0.6 m/s).
-    """
+    """Reads a path of more than 25 cm sideways or backward, with one quick movement (above 0.6 m/s)."""
     path = view.path()
     speed = np.linalg.norm(np.gradient(path, 1 / view.fps, axis=0), axis=-1)
     aside, ahead = path[-3:].mean(0)
@@ -222,9 +209,7 @@ def _dodge(view: View) -> Shown:
 
 
 def _strafe(view: View) -> Shown:
-    """Reads a path of more than 33 cm to a side,
-    which is more than twice as far as forward or backward.
-    """
+    """Reads a path of more than 33 cm sideways, at least twice as long as its forward or backward part."""
     aside, ahead = view.path()[-3:].mean(0)
     if abs(aside) < max(0.33, 2 * abs(ahead)):
         return {}
@@ -234,8 +219,8 @@ def _strafe(view: View) -> Shown:
 def _limp(view: View) -> Shown:
     """Reads the leg on which the pelvis sinks while the other foot is in the air, during a walk.
 
-    The height of the pelvis correlates with the difference of the feet's heights by more than
-    0.35; in an even walk, the correlation is about 0.
+    The correlation between the height of the pelvis and the difference between the feet's heights
+    exceeds 0.35. In an even walk, it is about 0.
     """
     right_up = view.smooth[:, ANKLES[1], 1] - view.smooth[:, ANKLES[0], 1]
     low = -view.smooth[:, PELVIS, 1]

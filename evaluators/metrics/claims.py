@@ -15,26 +15,27 @@ from flame_mdm.sampling.referee.judging import SHORTEST, Verdict, verdicts
 from flame_mdm.sampling.referee.kinds import GROUPS
 from flame_mdm.sampling.referee.sentences import read_claims
 
-# An audit keeps this many seconds of each motion, so that all sets of motions have the same size
+# An audit keeps this many seconds of each motion, so that all sets of motions have equal size
 KEPT_SECONDS = 10.0
 STEP = 0.0005  # meters per unit of the kept positions
 
 
 @lru_cache(maxsize=20_000)
 def claims_of(caption: str) -> tuple[Claim, ...]:
-    """Returns the claims of a caption; cached, since many motions may have the same caption."""
+    """Returns the claims of a caption. The result is cached, because many motions may have the same caption."""
     return tuple(read_claims(caption))
 
 
 class ClaimAccuracy(Timed, MotionMean):
-    """Fraction of decided claims that are true. Claims are made by the captions and checked on
-    the motions. A metric of this project.
+    """Fraction of decided claims that are true.
 
-    The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each on
-    the joints. The values are shares in [0, 1] for each group of claims, such as "side" and
-    "count", and for "all" claims; higher is better. "decided" is the share of all claims that are
-    decided. "captions" is the share of captions with at least one decided claim. Motions shorter
-    than 0.5 seconds, and motions of other skeletons than SMPL's 22 joints, are not judged.
+    A metric of this project. The claims are stated by the captions, and the motions are checked for
+    them. The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each
+    claim on the joints. The values are fractions in [0, 1] for each group of claims, such as "side"
+    and "count", and for "all" claims; higher is better. "decided" is the fraction of all claims
+    that are decided. "captions" is the fraction of captions with at least one decided claim.
+    Motions that are shorter than 0.5 seconds, or have another skeleton than SMPL's 22 joints, are
+    not judged.
 
     Args:
         fps: frames per second of the motions.
@@ -93,10 +94,10 @@ class ClaimAccuracy(Timed, MotionMean):
         return {name: torch.tensor(values, dtype=torch.float64) for name, values in flags.items()}
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the joints of each motion, since the captions decide what is measured.
+        """Returns the joints of each motion, because the captions determine what is measured.
 
-        "positions" (N, F, 3 J) are int16, in units of `STEP`, relative to the start on the floor.
-        "frames" (N,) are the lengths of the motions.
+        "positions" (N, F, 3 J) are int16, in units of `STEP`, relative to the starting point on the
+        floor. "frames" (N,) are the lengths of the motions.
         """
         longest = round(KEPT_SECONDS * self.fps)
         motions_of = motions["joints"]
@@ -111,9 +112,7 @@ class ClaimAccuracy(Timed, MotionMean):
         return {"positions": positions, "frames": frames}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the numbers of true and decided claims (N, 2) per motion, by the name of the
-        value.
-        """
+        """Returns the numbers of true and decided claims (N, 2) per motion, by the name of the value."""
         pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for packed, frames, caption in zip(
             rows["positions"], rows["frames"], rows["captions"], strict=True

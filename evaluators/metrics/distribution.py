@@ -14,8 +14,7 @@ NEIGHBORS = 3
 
 
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Computes the Fréchet distance of normal distributions fitted
-    to the rows of a (N, E) and b (M, E).
+    """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E).
 
     In float64: |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982).
 
@@ -34,15 +33,14 @@ def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 class FrechetMotionDistance(TwoSets):
-    """Fréchet distance of motion features,
-    "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
+    """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
-    Covariances have N - 1 in the denominator, as in the authors' code. That code computes means
-    in float32 and scipy's `sqrtm` of the product. If `sqrtm` fails, it adds 1e-6 to the
-    diagonals. The relative difference from its values is 1e-8.
+    Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
+    means in float32, and scipy's `sqrtm` of the product. If `sqrtm` fails, it adds 1e-6 to the
+    diagonals. The values of this class have a relative difference of 1e-8 from it.
 
-    Lower is better. The value is biased upward, most of all with few samples: compare only values
-    for equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
+    Lower is better. The value is biased upward, especially with few samples, so compare only values
+    with equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
     `real_keys` (R,).
 
     Example:
@@ -55,16 +53,14 @@ class FrechetMotionDistance(TwoSets):
     higher_is_better = False
 
     def value(self, generated: Tensor, real: Tensor) -> float:
-        """Returns the distance of features (N, E) and (M, E); raises `UserError` if N or M is below 2."""
+        """Returns the distance of features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
         # Rounding may give a value slightly below 0
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the distance of two sets in
-        which each motion is repeated as often as it was drawn.
-        """
+        """Computes the distance of two sets in which each motion is repeated as often as it was drawn."""
         generated, real = rows["generated"], rows["real"]
         values = []
         for times in map(torch.from_numpy, weights):
@@ -98,10 +94,10 @@ class KernelMotionDistance(TwoSets):
 
     Args:
         subsets: number of random subsets.
-        subset_size: number of samples that a subset takes from each set; neither set may be
+        subset_size: number of samples that a subset takes from each set. Neither set may be
             smaller.
-        replace: whether to draw with replacement. The code of MoDi and MDM does so if there are
-            more real motions than `subset_size`. Samples that are drawn twice increase the value.
+        replace: whether to draw with replacement, as in the code of MoDi and MDM if there are more
+            real motions than `subset_size`. Samples that are drawn twice increase the value.
         seed: seed of the draws.
 
     Example:
@@ -149,9 +145,9 @@ class KernelMotionDistance(TwoSets):
 def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
     """Returns the fraction of `points` (M, E) in the manifold of `samples` (N, E).
 
-    A point is in the manifold if its distance from some sample is at most the distance between
-    that sample and its third-nearest neighbor. Kynkäänniemi et al. 2019, eq. 1 and 2. A sample is
-    not a neighbor of itself.
+    A point is in the manifold if its distance from some sample is at most the distance between that
+    sample and its third-nearest neighbor (Kynkäänniemi et al. 2019, eq. 1 and 2). A sample is not a
+    neighbor of itself.
 
     Example:
         >>> samples = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
@@ -170,10 +166,10 @@ class PrecisionRecall(TwoSets):
     """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
 
     `precision` is the fraction of generated motions in the manifold of the real motions. `recall`
-    is the fraction of real motions in the manifold of the generated motions. Higher is better;
-    see `manifold_coverage`. Neighbor distances shrink with the number of samples, so both sets
-    are cut to the size of the smaller set, in the order of the keys. The authors' code cuts in
-    the order of the files.
+    is the fraction of real motions in the manifold of the generated motions. Higher is better; see
+    `manifold_coverage`. Neighbor distances shrink with the number of samples, so both sets are cut
+    to the size of the smaller set, in the order of the keys. The authors' code cuts them in the
+    order of the files.
 
     `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
 

@@ -16,7 +16,7 @@ def pair_distance(a: Tensor, b: Tensor) -> float:
 def distances(a: Tensor, b: Tensor) -> Tensor:
     """Returns the Euclidean distances (N, M) between features a (N, E) and b (M, E).
 
-    Each distance is computed from its difference, not from products.
+    Each distance is computed from the difference of the features, not from products.
     """
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
@@ -24,7 +24,7 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
     """Draws the first and second motions (pairs,) of random pairs of `count` motions.
 
-    Each side is drawn with or without replacement.
+    The two sides are drawn with or without replacement.
     """
     draw = np.random.default_rng(seed).choice
     return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(
@@ -35,10 +35,10 @@ def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Ten
 class Diversity(SampleMetric):
     """Diversity: mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
-    The best value is the diversity of real motions. Published values use 300 pairs for
-    text-to-motion, drawn as two sets without replacement, and 200 pairs with replacement for
-    action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with
-    itself. `update` takes `generated` (B, E) and `keys` (B,).
+    The best value is the diversity of real motions. Published values for text-to-motion use 300
+    pairs, drawn as two sets without replacement. Published values for action-to-motion and
+    unconstrained synthesis use 200 pairs with replacement. In both cases, a motion may be paired
+    with itself. `update` takes `generated` (B, E) and `keys` (B,).
 
     Args:
         pairs: number of pairs.
@@ -60,7 +60,7 @@ class Diversity(SampleMetric):
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def value(self, features: Tensor) -> float:
-        """Returns the diversity of features (N, E); raises `UserError` if there are too few motions for the pairs."""
+        """Returns the diversity of features (N, E). Raises `UserError` if there are too few motions for the pairs."""
         self.need(
             len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs"
         )
@@ -76,14 +76,13 @@ class Diversity(SampleMetric):
 
 
 class TextMultimodality(SampleMetric):
-    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12):
-    mean distance of random pairs per text.
+    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): mean distance of random pairs per text.
 
-    There are 10 pairs out of 30 motions per text. As in their code, two sets of 10 motions are
-    drawn without replacement, with the same indices for all texts. A motion that is in both sets
-    may be paired with itself. Published values are for 100 texts; the code of MDM and MFM uses
-    whole batches, that is, 128 texts. `update` takes `generated` (B, E), `groups` (B,) and `keys`
-    (B,).
+    For each text, 10 pairs are drawn from 30 motions. As in the authors' code, two sets of 10
+    motions are drawn without replacement, with the same indices for all texts. A motion that is in
+    both sets may be paired with itself. Published values are for 100 texts. The code of MDM and MFM
+    uses whole batches, that is, 128 texts. `update` takes `generated` (B, E), `groups` (B,) and
+    `keys` (B,).
 
     Args:
         samples: number of motions per text.
@@ -118,7 +117,7 @@ class TextMultimodality(SampleMetric):
 class PairedMultimodality(SampleMetric):
     """Multimodality of FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
 
-    FLAME published no code for this metric. FLAME's Table 3 has 10 motions per text, but eq. 19
+    FLAME published no code for this metric. FLAME's Table 3 states 10 motions per text, but eq. 19
     uses two sets of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
 
     Args:
@@ -149,11 +148,11 @@ class PairedMultimodality(SampleMetric):
 
 
 class ActionMultimodality(SampleMetric):
-    """Multimodality of Guo et al. 2020 (MDM, eq. 7): 20 random pairs of the same class, for each class.
+    """Multimodality of Guo et al. 2020 (MDM, eq. 7): mean distance of 20 random pairs for each class.
 
-    As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The
-    authors divide the sum by the number of all classes; here, it is divided by the number of
-    classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys` (B,).
+    As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors
+    divide the sum by the number of all classes. In this implementation, it is divided by the number
+    of classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys` (B,).
 
     Args:
         pairs: number of pairs per class.
@@ -193,11 +192,11 @@ class ActionMultimodality(SampleMetric):
 class JointVariance(SampleMetric):
     """Variance of joint positions among the motions of a text, in square meters.
 
-    The variance over the `samples` motions of a text, which have equal length, is summed over x,
-    y and z, and averaged over joints, frames and texts. The denominator of the variance is n - 1.
-    The value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of
-    joints for the 10 generated motions"; according to eq. 18, this is a variance over the frames
-    of one motion. No code was published.
+    The variance over the `samples` motions of a text, which have equal length, is summed over x, y
+    and z, and averaged over joints, frames and texts. The denominator of the variance is n - 1. The
+    value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of joints
+    for the 10 generated motions", but eq. 18 defines a variance over the frames of one motion. No
+    code was published.
 
     Args:
         samples: number of motions per text.
@@ -239,7 +238,7 @@ class JointVariance(SampleMetric):
     def value(self, groups: Tensor) -> float:
         """Returns the variance.
 
-        Raises `UserError` if a text does not have `samples` motions, or they differ in length.
+        Raises `UserError` if a text does not have `samples` motions, or if their lengths differ.
         """
         order, values = self.order("keys"), []
         for members in self.by_group(groups, self.samples):

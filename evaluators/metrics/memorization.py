@@ -1,7 +1,5 @@
 # pyright: standard
-"""Memorization: whether generated motions are closer
-to training motions than held-out real motions.
-"""
+"""Memorization: whether generated motions are closer to training motions than held-out real motions are."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +9,8 @@ from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric
 
-# Only every fourth frame of a motion is compared, which takes a quarter of the time. A copy still
-# has distance 0.
+# Only every fourth frame of a motion is compared, which takes a quarter of the time. The distance
+# of a copy is still 0.
 STEP = 4
 # A motion counts as a copy if it is closer to a training motion than all but this share of the
 # held-out real motions.
@@ -22,7 +20,8 @@ CLOSE = 0.01
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
     """Returns poses (F, 3J) of joints (F, J, 3), independent of position and heading.
 
-    Joints are relative to the pelvis on the ground, and turned to face z in every frame.
+    Joints are relative to the pelvis on the ground, and turned so that the body faces +z in every
+    frame.
     """
     right_hip, left_hip, right_shoulder, left_shoulder = facing
     left = (
@@ -72,15 +71,15 @@ class TrainingMotions:
         )
         if features is None or self.features is None:
             return of_joints[:, None]
-        # With matrix products, rounding errors would dominate the distance of a copy.
+        # With matrix products, the distance of a copy would consist mainly of rounding errors.
         exact = "donot_use_mm_for_euclid_dist"
         return torch.stack(
             [of_joints, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1
         )
 
     def _closest(self, motion: Tensor, squares: Tensor, left: Tensor) -> Tensor:
-        # |a - b|^2 = |a|^2 + |b|^2 - 2 a b: one matrix product compares the motion with all
-        # windows at once. |a|^2 is the same for all windows and left out.
+        # |a - b|^2 = |a|^2 + |b|^2 - 2 a b: one matrix product compares the motion with all windows
+        # at once. |a|^2 is the same for all windows and is left out.
         compared = motion[::STEP]
         starts = len(squares) - len(motion) + 1
         if starts < 1:
@@ -93,8 +92,8 @@ class TrainingMotions:
         best = int(total.argmin())
         if total[best].isinf():
             return total[best]
-        # Computed again from the differences, since the expanded square rounds to about a
-        # millimeter.
+        # The distance is computed again from the differences, because the expanded square has
+        # rounding errors of about a millimeter.
         difference = compared - self.poses[best : best + len(motion) : STEP]
         return (difference.square().sum() / (difference.numel() / 3)).sqrt()
 
@@ -103,9 +102,9 @@ class NearestTraining(SampleMetric):
     """Distance from the nearest training motion, and the share of copies.
 
     A metric of this project. A motion counts as a copy if its joints are closer to a training
-    motion than 99 % of the held-out real motions are (all but `CLOSE`). In this sense, about 1 %
-    of real motions are copies, and all motions of a model that repeats the training set are
-    copies.
+    motion than the joints of 99 % of the held-out real motions (all but `CLOSE`). By this
+    definition, about 1 % of real motions are copies, and all motions of a model that repeats the
+    training set are copies.
 
     The values `joints`, in meters, and `features` are the medians of the distances. `copies` is
     the share of copies, in [0, 1]. `update` takes `nearest` (B, 1 or 2), `real_nearest` (B, 1 or
@@ -126,9 +125,7 @@ class NearestTraining(SampleMetric):
     summary = "copies"
 
     def value(self, nearest: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns the medians `joints` (in meters) and `features`,
-        and the share `copies` in [0, 1].
-        """
+        """Returns the medians `joints` (in meters) and `features`, and the share `copies` in [0, 1]."""
         joints, *features = nearest.quantile(0.5, dim=0).tolist()
         limit = real[:, 0].quantile(CLOSE)
         return {

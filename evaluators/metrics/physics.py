@@ -18,12 +18,12 @@ STANDING = 0.03
 class FootSkating(Timed, JointMean):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
-    A toe joint touches the floor if it is below 5 cm in two adjacent frames. It slides if it
-    moves more than 2.5 cm over the ground between these frames (Karunratanakul et al. 2023,
-    "Guided Motion Diffusion"). The 2.5 cm are for 20 frames per second; at other frame rates, the
-    same speed of 0.5 m/s is the limit. The code released with the paper also requires this speed
-    in the mean of five frames, and averages the ratios of the motions. Here, as in the paper, two
-    frames decide, and every frame transition has the same weight. Lower is better.
+    A toe joint touches the floor if it is below 5 cm in two adjacent frames. It slides if it moves
+    more than 2.5 cm over the ground between these frames (Karunratanakul et al. 2023, "Guided
+    Motion Diffusion"). The limit of 2.5 cm applies to 20 frames per second. At other frame rates,
+    the limit is the same speed of 0.5 m/s. The code released with the paper also requires this
+    speed in the mean of five frames, and averages the ratios of the motions. This metric follows
+    the paper: two frames decide, and every frame transition has the same weight. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -44,9 +44,7 @@ class FootSkating(Timed, JointMean):
         self.toes = list(toes)
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns whether a foot skates in each frame transition of a motion (F, J, 3),
-        (F - 1,) bool.
-        """
+        """Returns whether a foot skates in each frame transition of a motion (F, J, 3), (F - 1,) bool."""
         toes = motion[:, self.toes].double()
         fast = toes[..., [0, 2]].diff(dim=0).norm(dim=-1) * self.fps > LIMITS["skating"][0]
         low = toes[..., 1] < LOW
@@ -80,7 +78,7 @@ class Penetration(JointMean):
 class Floating(Penetration):
     """Mean height of the lowest joint above the floor, y = 0, in meters.
 
-    The mean is over frames; heights up to 5 mm count as 0. Jumps count as floating, too. Lower is
+    The mean is over frames; heights up to 5 mm count as 0. Jumps also count as floating. Lower is
     better.
 
     Example:
@@ -96,8 +94,8 @@ class Floating(Penetration):
 class Jitter(Timed, JointMean):
     """Mean jerk of the joints in m/s^3, as in Yi et al. 2022 (PIP).
 
-    The jerk is computed from the third difference of the positions. It grows with the frame rate:
-    compare only values for equal frame rates. Lower is better.
+    The jerk is computed from the third difference of the positions. It grows with the frame rate,
+    so compare only values for equal frame rates. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -120,8 +118,8 @@ class Jitter(Timed, JointMean):
 class StaticShare(Timed, JointMean):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
-    Real data sets have static motions, too, of standing people: compare with the value of real
-    motions. Lower is better.
+    Real data sets also contain static motions of standing people, so compare the value with the
+    value of real motions. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -138,5 +136,5 @@ class StaticShare(Timed, JointMean):
     def measure(self, motion: Tensor) -> Tensor:
         """Returns whether a motion (F, J, 3) is static, (1,) bool; (0,) for a single frame."""
         moved = motion.double().diff(dim=0).norm(dim=-1)
-        # Undefined for a single frame
+        # The speed is undefined for a single frame
         return (moved.mean() * self.fps < STANDING)[None][: len(moved)]

@@ -39,7 +39,7 @@ class PublishedPhysics(Timed, JointMean):
 
     higher_is_better = False
     summary = None
-    # the only frame rate at which the values are defined; None = any frame rate
+    # The only frame rate at which the values are defined; None = any frame rate
     required_fps: float | None = None
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
@@ -47,9 +47,7 @@ class PublishedPhysics(Timed, JointMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns the means by name;
-        raises `UserError` if they are undefined at the frame rate.
-        """
+        """Returns the means by name. Raises `UserError` if they are undefined at the frame rate."""
         if not self.defined:
             raise self.error(
                 f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
@@ -62,9 +60,7 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns by name the sum and the number (N, 2)
-        of the values of each motion; {} if undefined.
-        """
+        """Returns by name the sum and the number (N, 2) of the values of each motion; {} if undefined."""
         return super().readings(motions) if self.defined else {}
 
 
@@ -73,15 +69,16 @@ class MBenchQuality(PublishedPhysics):
 
     - `jitter_degree`: mean norm of the second difference of the joint positions, plus the same
       mean for positions relative to the root.
-    - `dynamic_degree`: the same for the first difference of the positions; higher = more motion.
+    - `dynamic_degree`: mean norm of the first difference of the joint positions, plus the same mean
+      for relative positions; higher = more motion.
     - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, otherwise 0.
-    - `foot_sliding`: mean step over the ground of toes in contact.
-    - `foot_floating`: frames in which the body moves without a foot that carries it, per frame.
-      The value can exceed 1.
+    - `foot_sliding`: mean horizontal step of toes in contact.
+    - `foot_floating`: number of frames in which the body moves without the support of a foot, per
+      frame. The value can exceed 1.
 
     A toe is in contact if it moves less than 1 cm per frame, even in the air, or if it is lower
-    than 2 cm. The published code uses z as the height, although its pipeline passes motions in
-    which y is the height. Here, the height is y.
+    than 2 cm. The published code uses z as the height, although in its pipeline, y is the height.
+    In this implementation, the height is y.
 
     Args:
         fps: frames per second of the motions; at other rates than 20, `compute` raises
@@ -153,10 +150,9 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
     The positions of the two feet are (F, 2, 3), their contacts (F, 2) bool.
 
-    Returns:
-        Three numbers of frames, one per kind. In the first kind, the feet on the ground move
-        unlike the body. In the second, a foot in the air moves much less than the body; these
-        frames count half in the score. In the third, both feet swing to and fro in the air.
+    Three numbers of frames, one per kind. In frames of the first kind, the feet on the ground do
+    not move like the body. In the second kind, a foot in the air moves much less than the body;
+    these frames count half in the score. In the third kind, both feet swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
@@ -177,24 +173,20 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
 
 def _runs(aloft: Tensor) -> list[tuple[int, int]]:
-    """Returns begin and end (exclusive) of each run
-    of at least four True values in a mask (F,).
-    """
+    """Returns the begin and end (exclusive) of each run of at least four True values in a mask (F,)."""
     runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
     return [(begin, end) for begin, end in runs if end - begin >= 4]
 
 
 class KimodoQuality(PublishedPhysics):
-    """Foot skating of Kimodo (7330e7e), in m/s,
-    from joints and from the contacts that the model predicts.
+    """Foot skating of Kimodo (7330e7e), in m/s, from joints and from the contacts that the model predicts.
 
     - `skate_from_height`: mean speed of toes that are lower than 5 cm.
     - `skate_ratio`: fraction of the toes' steps that are faster than 0.2 m/s, among steps that
       begin and end lower than 5 cm.
-    - `low`: mean fraction of steps that begin lower than 5 cm. If it is 0, the first two values
-      are 0, too.
+    - `low`: mean fraction of steps that begin lower than 5 cm. If it is 0, the first two values are
+      also 0.
 
-    If the representation has contacts:
 
     - `skate_from_contacts`, `skate_max`: mean and largest speed of heels and toes in contact.
     - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15
@@ -259,9 +251,7 @@ class KimodoQuality(PublishedPhysics):
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values of a motion (F, J, 3),
-        and of the contacts (F, 4) bool of its feet if given.
-        """
+        """Computes the values of a motion (F, J, 3), and of the contacts (F, 4) bool of its feet if given."""
         if len(motion) < 2:
             return {}
         feet = motion[:, self.feet]
@@ -283,19 +273,18 @@ class KimodoQuality(PublishedPhysics):
 
 
 class KimodoConstraints(MotionMean):
-    """Constraint errors of Kimodo (7330e7e) for edits:
-    distances of kept parts from the real motion.
+    """Constraint errors of Kimodo (7330e7e) for edits: distances of kept parts from the real motion.
 
     Distances are in meters.
 
-    - `root2d_err`: distance of the root over the ground, in frames that keep the root.
+    - `root2d_err`: horizontal distance of the root, in frames that keep the root.
     - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
     - `root2d_acc`: fraction of these frames with a distance of at most 10 cm.
     - `fullbody_keyframe`: distance of all joints, in frames that keep all joints.
     - `end_effector`: distance of the kept joints in the other frames.
 
-    In Kimodo's code, the user draws the trajectory of the root. Here, the trajectory of the real
-    motion is used.
+    In Kimodo's code, the user draws the root trajectory. In this implementation, the root
+    trajectory of the real motion is used.
 
     Example:
         >>> metric, real = KimodoConstraints(), torch.zeros(1, 5, 22, 3)
@@ -362,14 +351,13 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
 
 
 class PhysicalFootContact(PublishedPhysics):
-    """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4:
-    acceleration without a planted foot.
+    """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration without a planted foot.
 
-    The score is the mean over frames of a product of three factors: the step of each foot over
-    the ground in meters per frame (two factors), and the acceleration of the root divided by its
-    largest value. Downward accelerations count as 0. The step of a foot is the smaller step of
-    its ankle and its toe. Motions without acceleration have no value; EDGE's code averages their
-    NaN. Lower is better.
+    The score is the mean over frames of a product of three factors: the horizontal step of each
+    foot in meters per frame (two factors), and the acceleration of the root divided by its largest
+    value. Downward accelerations count as 0. The step of a foot is the smaller step of its ankle
+    and its toe. Motions without acceleration have no value. EDGE's code averages their NaN. Lower
+    is better.
 
     Args:
         fps: frames per second of the motions; at other rates than 30, `compute` raises
@@ -391,11 +379,11 @@ class PhysicalFootContact(PublishedPhysics):
     def measure(self, motion: Tensor) -> Values:
         """Computes the score of a motion (F, J, 3).
 
-        The score is NaN if the root does not accelerate, or the motion has fewer than 3 frames.
+        The score is NaN if the root does not accelerate, or if the motion has fewer than 3 frames.
         """
         motion = motion.double()
-        # EDGE's code divides by the frame duration first. The order decides whether the rounding
-        # errors of a steady root become 0.
+        # EDGE's code divides by the frame duration first. This order determines whether the
+        # rounding errors of a steady root become 0.
         acceleration = (motion[:, 0].diff(dim=0) * self.fps).diff(dim=0) * self.fps
         acceleration[:, 1].clamp_(min=0)
         acceleration = acceleration.norm(dim=-1)
@@ -407,16 +395,15 @@ class PhysicalFootContact(PublishedPhysics):
 
 
 class TransitionJerk(SampleMetric):
-    """FlowMDM's peak jerk, and area under the jerk,
-    at transitions between kept and generated frames.
+    """FlowMDM's peak jerk, and area under the jerk, at transitions between kept and generated frames.
 
-    As in FlowMDM's code (e81c67f). The jerk of a frame is the largest L1 norm, over joints, of
-    the third difference of the position, in meters per frame^3. A window is centered at the first
-    frame after each change between kept and generated frames, if the motion contains the whole
-    window. The jerk is averaged over windows, frame by frame. `peak` is the maximum of this mean
-    curve. `area` is the sum of its distances from `JERK_OF_REAL_MOTIONS`, above or below; it
-    grows with the window. `windows` is the number of windows. At frame rates without an entry in
-    `JERK_OF_REAL_MOTIONS`, there is no area.
+    The computation follows FlowMDM's code (e81c67f). The jerk of a frame is the largest L1 norm,
+    over joints, of the third difference of the position, in meters per frame^3. A window is
+    centered at the first frame after each change between kept and generated frames, if the motion
+    contains the whole window. The jerk is averaged over windows, frame by frame. `peak` is the
+    maximum of this mean curve. `area` is the sum of its absolute differences from
+    `JERK_OF_REAL_MOTIONS`, and grows with the window. `windows` is the number of windows. At frame
+    rates without an entry in `JERK_OF_REAL_MOTIONS`, there is no area.
 
     Args:
         fps: frames per second of the motions.
@@ -483,5 +470,5 @@ def transition_jerk(window: Tensor) -> Tensor:
 
 
 def peak_and_area(curve: Tensor, real: float | None) -> tuple[float, float | None]:
-    """Returns the maximum of a jerk curve, and the sum of its distances from the jerk of real motions."""
+    """Returns the maximum of a jerk curve, and the sum of its absolute differences from the jerk of real motions."""
     return curve.max().item(), None if real is None else (curve - real).abs().sum().item()

@@ -1,7 +1,5 @@
 # pyright: standard
-"""Errors of motions relative to the real motion of the same text,
-or to the motion before an edit.
-"""
+"""Errors of motions relative to the real motion of the same text, or to the motion before an edit."""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,10 +18,10 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
     """Returns the positions that TEMOS compares.
 
     The positions are root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3). The
-    motion (F, 21, 3), in KIT units, is placed on the floor. Its root starts at x = z = 0, with a
-    heading along +z. Local positions are positions of all joints except the root. For them, each
-    frame is moved and turned so that the root is at x = z = 0 and the heading is along +z.
-    `Rifke` defines floor and heading, with the peculiarities of the published code.
+    motion (F, 21, 3), in KIT units, is placed on the floor. Its root starts at x = z = 0 with a
+    heading along +z. The local positions are the positions of all joints except the root, with each
+    frame moved and turned so that the root is at x = z = 0 and the heading is along +z. `Rifke`
+    defines floor and heading, with the peculiarities of the published code.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -52,13 +50,12 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
 
 
 class PositionErrors(MotionMean):
-    """Base class of position errors:
-    APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
+    """Base class of position errors: APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
 
     Args:
-        samples: number of motions per text. With several motions, as in TEMOS, `best_ape_root`,
-            ... are the errors of the motion with the smallest APE of the root, and
-            `worst_ape_root`, ... are the errors of the motion with the largest.
+        samples: number of motions per text. If there are several motions, as in TEMOS,
+            `best_ape_root`, ... are the errors of the motion with the smallest APE of the root, and
+            `worst_ape_root`, ... are the errors of the motion with the largest APE of the root.
         upsampling: number of recorded frames per frame of a motion. If it is above 1, motions are
             interpolated and compared with the recordings.
     """
@@ -124,9 +121,7 @@ class PositionErrors(MotionMean):
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
-        """Returns the errors by name;
-        raises `UserError` if a text does not have `samples` motions.
-        """
+        """Returns the errors by name. Raises `UserError` if a text does not have `samples` motions."""
         texts = (
             self.by_group(groups, self.samples)
             if self.samples > 1
@@ -146,7 +141,7 @@ class PositionErrors(MotionMean):
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Returns the errors of a clip by name.
 
-        "ape" has one value per frame (F,), or is the mean over frames if clips have equal weight.
+        "ape" has one value per frame (F,). If clips have equal weight, it is the mean over frames.
         """
         raise NotImplementedError
 
@@ -157,7 +152,7 @@ class TemosPositionErrors(PositionErrors):
     APE is the distance between `temos_parts`, averaged over joints and over all frames of all
     clips. AVE is the distance between the variances of each coordinate over time (n - 1 in the
     denominator), averaged over joints, then over clips. The unit of both is 1000 KIT units, which
-    are 1.56 m; the tables call it meters. TEMOS compares at 100 frames per second:
+    are 1.56 m; the tables call this unit meters. TEMOS compares at 100 frames per second:
     `upsampling=8`.
 
     Args:
@@ -198,14 +193,13 @@ class TemosPositionErrors(PositionErrors):
 
 
 class FlamePositionErrors(PositionErrors):
-    """APE (in meters) and AVE (in square meters) of FLAME's code,
-    which FLAME's tables do not use.
+    """APE (in meters) and AVE (in square meters) of FLAME's code, which FLAME's tables do not use.
 
     The compared positions are `flame_parts`. The error of the trajectory is the sum of the
     distances along its two axes. The local error is the error of the bones. Variances of global
     positions are averaged over joints before they are compared. Each clip has the same weight.
-    FLAME's joints lack the orientation of the root and start from its translation. Here, `joints`
-    are compared unchanged, and the first joint is the root.
+    FLAME's joints lack the orientation of the root and start from its translation. In this
+    implementation, `joints` are compared unchanged, and the first joint is the root.
 
     Args:
         parents: parent of each joint of the skeleton, -1 for the root.
@@ -262,7 +256,7 @@ class EditErrors(MotionMean):
         keys: Tensor,
         kept: Tensor | None,
     ) -> None:
-        """Adds the errors of B pairs of motions; the arguments are described in `update`.
+        """Adds the errors of B pairs of motions. The arguments are described in `update`.
 
         Two motions are compared up to the end of the shorter one.
         """
@@ -282,19 +276,16 @@ class EditErrors(MotionMean):
         self.add(keys, errors)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool;
-        {} if there are none.
-        """
+        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool; {} if none exist."""
         raise NotImplementedError
 
 
 class DisplacementErrors(EditErrors):
-    """ADE and FDE: mean distance of the joints in all predicted frames,
-    and in the last one, in meters.
+    """ADE and FDE: mean distance of the joints in all predicted frames, and in the last one, in meters.
 
-    As usual in motion prediction (Yuan and Kitani 2020), distances are averaged over joints and
-    frames of a clip, then over clips. The part that an edit kept does not count. MFM (Table 3)
-    gives no formula, code or unit for its numbers. They are too large for meters, so they are not
+    As usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints and
+    frames of a clip, then over clips. The part that an edit kept is ignored. MFM (Table 3) gives no
+    formula, code or unit for its numbers. The numbers are too large for meters, so they are not
     comparable.
 
     Example:
@@ -334,9 +325,7 @@ class DisplacementErrors(EditErrors):
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the ADE and FDE of a motion
-        from distances (F, J) and kept joints (F, J) bool.
-        """
+        """Returns the ADE and FDE of a motion from distances (F, J) and kept joints (F, J) bool."""
         new = ~kept
         if not new.any():
             raise self.error("a motion has no generated frame to compare")
@@ -345,11 +334,11 @@ class DisplacementErrors(EditErrors):
 
 
 class KeptDrift(EditErrors):
-    """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
+    """World distance, in meters, by which the kept part of an edit has moved. A metric of this project.
 
-    `mean` is averaged over the kept joints and frames of a motion, then over motions. `largest`
-    is the maximum over all of them. If features are relative to the root, an edit can keep steps
-    and poses exactly, and still move a kept ending to the place where the new part leads.
+    `mean` is averaged over the kept joints and frames of a motion, then over motions. `largest` is
+    the maximum over all of them. If features are relative to the root, an edit can keep steps and
+    poses exactly, and still move a kept ending, because it begins where the new part ends.
 
     Example:
         >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)
@@ -387,17 +376,13 @@ class KeptDrift(EditErrors):
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the mean and the largest distance of the kept joints of a motion;
-        {} without kept joints.
-        """
+        """Returns the mean and the largest distance of the kept joints of a motion; {} without kept joints."""
         return (
             {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
         )
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `largest` over the motions with kept joints;
-        None without such motions.
-        """
+        """Returns `mean` and `largest` over the motions with kept joints; None without such motions."""
         drift = sums[counts[:, 0] > 0]
         values = (
             (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)

@@ -20,7 +20,8 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.seeds import key
 
-# Captions with a larger cosine are the same. TMR's threshold of 0.95 applies to (cosine + 1) / 2.
+# Captions with a larger cosine count as the same. TMR's threshold of 0.95 applies to (cosine + 1) /
+# 2.
 SAME = 0.9
 # The k of recall
 TMR_TOP = (1, 2, 3, 5, 10)
@@ -35,8 +36,7 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of a caption, of norm 1;
-    `config` is the JSON of an encoder's mapping.
+    """Returns the vector (C,) of a caption, of norm 1. `config` is the JSON of an encoder's mapping.
 
     The caption is encoded alone, not in a batch.
     """
@@ -61,9 +61,8 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
         correct: (N, N) bool, symmetric, True = correct pair. The best correct candidate counts.
             None = only the diagonal is correct.
 
-    Returns:
-        Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for
-        texts. The values of texts for motions begin with `m2t_`.
+    Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for texts.
+    The names of the values of texts for motions begin with `m2t_`.
 
     Example:
         >>> values = whole_set_retrieval(torch.eye(4))
@@ -137,18 +136,18 @@ class CaptionMetric(SampleMetric):
 
 
 class MultiPositiveRPrecision(CaptionMetric):
-    """R-precision, motions for a text, in which motions with the same caption are correct, too.
+    """R-precision, motions for a text, in which all motions with the text's caption are correct.
 
     A metric of this project.
 
-    - `topK`: the fraction of texts with a correct motion among the K nearest; ties share their
-      mean rank.
+    - `topK`: the fraction of texts with a correct motion among the K nearest motions. Ties share
+      their mean rank.
     - `proper`: R-precision as in information retrieval. A text with R correct motions adds the
       fraction of them among its R nearest motions.
     - `single_topK`: only the text's own motion is correct. Except for ties, the values equal the
       values of `MotionsForText`.
-    - `chance_topK`: values expected from a random order, for comparison: similar captions raise
-      all values.
+    - `chance_topK`: the expected values of a random order. They show how much similar captions
+      raise all values.
     - `positives`: the mean number R of correct motions.
 
     Args:
@@ -206,9 +205,7 @@ class MultiPositiveRPrecision(CaptionMetric):
 
 
 def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | None]:
-    """Computes hit rates, R-precision and chance
-    from the similarity (N, M) and correctness (N, M) of candidates.
-    """
+    """Computes hit rates, R-precision and chance from the similarity (N, M) and correctness (N, M) of candidates."""
     rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
     values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in TOP}
     # In a random order, the first k candidates are k draws without replacement. The probability
@@ -228,23 +225,22 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
 
 
 class TMRRetrieval(CaptionMetric):
-    """Retrieval by cosine with the protocols of Petrovich et al.
-    2023 (TMR, 6d74688), in both directions.
+    """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), in both directions.
 
-    - `all`: among all motions; only the text's own motion is correct.
-    - `threshold`: motions with the same captions are correct, too.
+    - `all`: among all motions. Only the text's own motion is correct.
+    - `threshold`: among all motions. Motions with the same caption are also correct.
     - `dissimilar`: among 100 motions with different captions, or half of all motions if this is
       less. Without an encoder, there is no value.
-    - `batches`: in batches of 32; an incomplete last batch is left out. The medians of the
-      batches are averaged.
+    - `batches`: in batches of 32. An incomplete last batch is left out. The medians of the batches
+      are averaged.
 
     Each protocol has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of
-    motions for texts. The values of texts for motions begin with `m2t_`.
+    motions for texts. The names of the values of texts for motions begin with `m2t_`.
 
     TMR's encoder of captions is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
-    for HumanML3D and KIT. Here, batches are drawn. Without `ids`, the dissimilar subset starts
-    with the first motion by key. The motion whose caption is least similar to the captions
-    already chosen is added next, until the subset is complete.
+    for HumanML3D and KIT. In this implementation, batches are drawn. Without `ids`, the dissimilar
+    subset starts with the first motion by key. The motion whose caption is least similar to the
+    captions already chosen is added next, until the subset is complete.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
@@ -313,9 +309,7 @@ class TMRRetrieval(CaptionMetric):
 
 
 def dissimilar(meaning: Tensor) -> list[int]:
-    """Returns the indices of the `dissimilar` motions of `TMRRetrieval`,
-    from caption vectors (N, C).
-    """
+    """Returns the indices of the `dissimilar` motions of `TMRRetrieval`, from caption vectors (N, C)."""
     # Greedy farthest-point selection. `nearest` is the similarity of each caption to its most
     # similar chosen caption.
     chosen = [0]

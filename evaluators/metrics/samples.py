@@ -22,21 +22,19 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class of metrics:
-    declarations about values, and values of single samples and of resamples.
+    """Base class of metrics: declarations about values, and values of single samples and of resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
         units: units of single values by name, if they differ from `unit`.
-        directions: whether higher is better, by the names of the values that differ from
+        directions: whether higher is better, by name, for the values that differ from
             `higher_is_better`; None = neither direction is better.
-        summary: name of the value that sums up the other values; None = there is no such value.
+        summary: name of the value that summarizes the other values; None = there is no such value.
         audited: names of the values that audits show; None = all values.
-        sees_meaning: whether the metric may notice that a motion does not show what was
-            requested.
-        exact: name of the value that reads the requested attributes without a network; None =
-            there is no such value.
-        depends_on_count: whether the number of motions biases the value.
+        sees_meaning: whether the metric may detect that a motion does not show what was requested.
+        exact: name of the value that reads the requested attributes without a network; None = there
+            is no such value.
+        depends_on_count: whether the bias of the value depends on the number of motions.
     """
 
     higher_is_better: bool | None
@@ -50,7 +48,7 @@ class Declared:
     depends_on_count = False
 
     def unit_of(self, name: str) -> str:
-        """Returns the unit of the value with this name; an only value has the name ""."""
+        """Returns the unit of the value with this name. The name of a single value is ""."""
         return self.units.get(name, self.unit)
 
     def direction_of(self, name: str) -> bool | None:
@@ -61,7 +59,7 @@ class Declared:
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns what the metric reads from motions without their conditions, by name.
+        """Returns the metric's readings of motions without their conditions, by name.
 
         Each reading is an array with N rows. Metrics of features need no readings.
         """
@@ -70,9 +68,9 @@ class Declared:
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
         """Returns the value and the weight (N, 2) of each sample, by the name of the value.
 
-        The metric is the weighted mean; a metric with random pools is also averaged over all
-        draws. Returns {} for metrics without values of single samples. `rows` has the inputs of
-        the metric and its `readings`. Raises `UserError` if there are too few samples.
+        The metric is the weighted mean. A metric with random pools is also averaged over all draws.
+        Returns {} for metrics without values of single samples. `rows` contains the inputs of the
+        metric and its `readings`. Raises `UserError` if there are too few samples.
         """
         return {}
 
@@ -91,10 +89,9 @@ class Declared:
 
 
 class SampleMetric(Declared, Metric):
-    """Base class of all metrics,
-    which compute their value from one row per sample, sorted by key.
+    """Base class of all metrics, which compute their value from one row per sample, sorted by key.
 
-    The value therefore does not depend on the batches, their order or the number of ranks. A rank
+    Therefore, the value does not depend on the batches, their order or the number of ranks. A rank
     may have no samples. `value` is the formula. If a metric draws at random, its argument `seed`
     determines the draws.
 
@@ -102,9 +99,9 @@ class SampleMetric(Declared, Metric):
 
     Attributes:
         states: names of the tensors with one row per sample, in the order of the arguments of
-            `value`. Each row also has a key. Unless a class overrides `update`, these are its
+            `value`. Each row also has a key. Unless a class overrides `update`, the states are its
             inputs.
-        names: names of the values; empty if there is only one.
+        names: names of the values; empty if there is only one value.
 
     Example:
         >>> class MeanFeature(SampleMetric):  # a metric is its inputs and a formula
@@ -128,9 +125,7 @@ class SampleMetric(Declared, Metric):
 
     @property
     def update_called(self) -> bool:
-        """Always True, so that torchmetrics does not warn about a metric
-        without samples, which returns None.
-        """
+        """Always True, so that torchmetrics does not warn about a metric without samples, which returns None."""
         return True
 
     def update(self, *_: Any, **rows: Any) -> None:
@@ -247,7 +242,7 @@ class SampleMetric(Declared, Metric):
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
         """Gathers the rows of all ranks.
 
-        The default of torchmetrics fails if a rank has no rows.
+        The default implementation of torchmetrics fails if a rank has no rows.
         """
         states = {name: [rows.cpu() for rows in getattr(self, name)] for name in self._reductions}
         group = process_group or self.process_group
@@ -266,13 +261,13 @@ class Timed(SampleMetric):
 
 
 class MotionMean(SampleMetric):
-    """Base class of means over values of motions.
+    """Base class of means over the values of motions.
 
-    A motion adds one value, one per frame, or any other number.
+    A motion adds one value, one value per frame, or any other number of values.
     """
 
     states = ("sums", "counts")
-    #: Names of the values that a motion has, if `names` contains further names.
+    #: Names of the values of a motion, if `names` contains further names.
     parts: Sequence[str] = ()
 
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
@@ -300,9 +295,7 @@ class MotionMean(SampleMetric):
         return self.means(*rows)
 
     def means(self, sums: Tensor, counts: Tensor) -> Any:
-        """Returns the mean of all values,
-        by name if the metric has `names`; None without values.
-        """
+        """Returns the mean of all values, by name if the metric has `names`; None without values."""
         totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in totals]
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
@@ -356,9 +349,7 @@ class JointMean(MotionMean):
 
 
 class TwoSets(SampleMetric):
-    """Base class of metrics that compare two sets of features:
-    generated motions and real motions.
-    """
+    """Base class of metrics that compare two sets of features: generated motions and real motions."""
 
     states = ("generated",)
     depends_on_count = True

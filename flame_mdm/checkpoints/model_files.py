@@ -243,7 +243,7 @@ def state_sha256(state: Mapping[str, Tensor]) -> str:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint or model file without running code; raises `UserError` if it is damaged."""
+    """Reads a checkpoint or model file without running code. Raises `UserError` if it is damaged."""
     if path.suffix == ".safetensors":
         return read_model_file(path)
     checkpoint = checked(path, read_torch(path))

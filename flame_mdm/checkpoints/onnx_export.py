@@ -210,6 +210,7 @@ class Probe:
 
 def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
     """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one per denoiser call.
+
     The denoiser is called at time t and returns y. The clean estimate is x0 = p x + q y. The next
     noisy motion is a x + b x0 + c x0' + d noise, where x0' is the clean estimate of the previous
     call. Raises `UserError` for samplers without this form.
@@ -274,6 +275,7 @@ class Graph(NamedTuple):
 
 class Call(nn.Module):
     """One call of a model's denoiser with condition encoder and guidance, without a learned variance.
+
     Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
     condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)
     int64 and `counts` (B,), the number of tokens of each caption. `ContinuingCall` also reads the

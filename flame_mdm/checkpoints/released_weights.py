@@ -22,8 +22,7 @@ ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 def read_released(
     path: Path, *, run_code: bool = False, advice: str = "Save only its state dict"
 ) -> Mapping[str, Any]:
-    """Reads a released file.
-    With `run_code`, pickles of other objects are also read, which runs any code in them.
+    """Reads a released file. With `run_code`, pickles of other objects are also read, which runs any code in them.
 
     Raises `UserError` if the file is damaged, or if it contains such objects. `advice` is the end
     of the error message.

@@ -215,7 +215,7 @@ class Sampler:
     """
 
     def __init__(self, folder: str | Path, threads: int = 1):
-        """Opens a folder; raises `ValueError` if a file is missing, damaged, too large or of another version."""
+        """Opens a folder. Raises `ValueError` if a file is missing, damaged, too large or of another version."""
         self.folder = Path(folder)
         try:
             self.content = self._description()

@@ -1,5 +1,4 @@
-"""Configuration: command lines, recipes composed by Hydra,
-checks against signatures, instantiation.
+"""Configuration: command lines, recipes composed by Hydra, checks against signatures, instantiation.
 
 These modules do not import torch or Lightning, so that `--help` and errors about misspelled keys
 are immediate.

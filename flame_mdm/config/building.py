@@ -1,6 +1,4 @@
-"""Instantiates configurations, checks untrusted configurations,
-and reads and writes their files.
-"""
+"""Instantiates configurations, checks untrusted configurations, and reads and writes their files."""
 
 import ast
 import copy
@@ -51,8 +49,7 @@ With it, `run.dir=...` changes all paths in the run directory.
 
 
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
-    """Checks that the content of the untrusted file `where` only
-    has plain values and no interpolations.
+    """Checks that the content of the untrusted file `where` only has plain values and no interpolations.
 
     Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any
     environment variable. The interpolation `but` is allowed at the beginning of a text. Raises
@@ -86,9 +83,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Returns a configuration, perhaps of an earlier version,
-    with the current names of its classes.
-    """
+    """Returns a configuration, perhaps of an earlier version, with the current names of its classes."""
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config
@@ -187,8 +182,7 @@ def save(config: Config, path: Path, head: str = "") -> None:
 
 
 def trust(config: Config) -> None:
-    """Checks that the parts
-    of a checkpoint's configuration only name legal classes and arguments.
+    """Checks that the parts of a checkpoint's configuration only name legal classes and arguments.
 
     A class is legal for a part if `MODULES` lists its module for this part, or if a file in the
     part's folder of `experiments/` names it. The environment variable FLAME_MDM_TRUST adds

@@ -1,6 +1,4 @@
-"""Command lines, with one dataclass per command that declares its keys;
-signals, errors, exit codes.
-"""
+"""Command lines, with one dataclass per command that declares its keys; signals, errors, exit codes."""
 
 import os
 import re
@@ -40,9 +38,7 @@ BUG = 70  # exit code for a bug, as in sysexits.h
 NO_MEMORY = re.compile(
     "allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map"
 )
-"""Messages of errors that a lack of memory causes in torch,
-in threads, and in loading libraries.
-"""
+"""Messages of errors that a lack of memory causes in torch, in threads, and in loading libraries."""
 
 
 def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:

@@ -130,8 +130,7 @@ def _options(group: str) -> list[str]:
 
 
 def find_recipe(name: str) -> ConfigSource:
-    """Returns the location of an experiment's recipe:
-    a .yaml file, or a name such as `humanml3d/mdm`.
+    """Returns the location of an experiment's recipe: a .yaml file, or a name such as `humanml3d/mdm`.
 
     Raises `UserError` for a name or file that does not exist.
     """
@@ -219,9 +218,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 
 
 def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
-    """Composes a configuration with prepared overrides;
-    raises `UserError` for errors of Hydra.
-    """
+    """Composes a configuration with prepared overrides. Raises `UserError` for errors of Hydra."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):

@@ -83,9 +83,7 @@ def _alternatives(kind: type[Any], word: str) -> list[str]:
 
 
 def _launch(jobs: Sequence[Callable[[], int]], words: Sequence[str]) -> None:
-    """Passes jobs to the launcher of Hydra that `launch=NAME` and its keys select, and waits for
-    the jobs.
-    """
+    """Passes jobs to the launcher of Hydra that `launch=NAME` and its keys select, and waits for the jobs."""
     compose("quickstart", words)  # checks the words
     launchers = [word.partition("=")[2] for word in words if word.startswith(f"{LAUNCH}=")]
     check_launcher(launchers)

@@ -77,9 +77,7 @@ DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that reci
 
 
 def check_top_level(config: Config) -> None:
-    """Raises `UserError` for unknown keys and wrong values outside
-    of mappings with a `_target_`.
-    """
+    """Raises `UserError` for unknown keys and wrong values outside of mappings with a `_target_`."""
     for key, annotation in TOP_LEVEL.items():
         group, _, name = key.rpartition(".")
         node = config.get(group) if group else config
@@ -133,9 +131,7 @@ def _alternatives(annotation: ast.expr) -> list[ast.expr]:
 
 
 def _mismatch(value: Any, kind: ast.expr) -> str:
-    """Returns the requirement of an annotation without unions;
-    "" if the value meets the requirement.
-    """
+    """Returns the requirement of an annotation without unions; "" if the value meets the requirement."""
     name = _name(kind)
     if name in KINDS:
         types, description = KINDS[name]
@@ -229,9 +225,7 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
 def walk(
     node: Any, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
-    """Yields the path and the content of each mapping in a configuration,
-    beginning with the whole configuration.
-    """
+    """Yields the path and the content of each mapping in a configuration, beginning with the whole configuration."""
     if isinstance(node, Mapping):
         yield path, node
         for name, child in node.items():
@@ -242,9 +236,7 @@ def walk(
 
 
 def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
-    """Returns the error message for a key with the unknown part `parts[depth]`
-    in the parent `node`.
-    """
+    """Returns the error message for a key with the unknown part `parts[depth]` in the parent `node`."""
     key = ".".join(parts)
     if parts[0] == "data" and not depth:
         return (
@@ -265,17 +257,13 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
 
 
 def parameters(target: str) -> frozenset[str]:
-    """Returns the argument names of a class or function from its source;
-    "**" stands for any argument.
-    """
+    """Returns the argument names of a class or function from its source; "**" stands for any argument."""
     return frozenset(_signature(target))
 
 
 @functools.cache
 def _signature(target: str) -> dict[str, str]:
-    """Returns the names of the arguments of a class or function,
-    with their annotations ("" = none).
-    """
+    """Returns the names of the arguments of a class or function, with their annotations ("" = none)."""
     module, _, name = target.rpartition(".")
     node = definition(module, name)
     if node is None:
@@ -329,9 +317,7 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_file(module: str) -> Path | None:
-    """Returns the source file of a module;
-    None without a file, or if the name is not a module's name.
-    """
+    """Returns the source file of a module; None without a file, or if the name is not a module's name."""
     # a name with a slash could name any file
     if not all(part.isidentifier() for part in module.split(".")):
         return None

@@ -1,6 +1,4 @@
-"""The command line of `train`, which Hydra composes,
-with sweeps and jobs of Hydra's launchers.
-"""
+"""The command line of `train`, which Hydra composes, with sweeps and jobs of Hydra's launchers."""
 
 import shutil
 import sys
@@ -149,9 +147,7 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe lacks a part,
-    or has a value that training would only refuse later.
-    """
+    """Raises `UserError` if a recipe lacks a part, or has a value that training would only refuse later."""
     plain(config, name)  # otherwise, the checkpoints of the run would be refused
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]

@@ -173,9 +173,7 @@ class LessonData(MotionDataModule):
     """Serves a `Lesson`: half of each batch are the user's clips, and half prior clips."""
 
     def halves(self) -> list[np.ndarray]:
-        """Returns the indices of the user's training clips, and the indices of the clips of the
-        prior store.
-        """
+        """Returns the indices of the user's training clips, and the indices of the clips of the prior store."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
             raise UserError(

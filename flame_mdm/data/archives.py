@@ -38,8 +38,7 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 
 
 def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
-    """Yields names and contents of the files in a zip or tar archive for which `is_wanted` is
-    true.
+    """Yields names and contents of the files in a zip or tar archive for which `is_wanted` is true.
 
     Raises:
         UserError: If the archive is damaged, expands disproportionately or has too many members.

@@ -400,8 +400,7 @@ def _encoded(
 
 
 def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.ndarray:
-    """Returns the features of a motion. `named` is its name, its published representation and the
-    motion.
+    """Returns the features of a motion. `named` is its name, its published representation and the motion.
 
     The representation is "" if the motion is not published as features.
     """

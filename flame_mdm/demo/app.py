@@ -123,9 +123,7 @@ class Writers:
 
 
 def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
-    """Adds the blocks of streams at `/live`,
-    the files of streams, and the page of their player.
-    """
+    """Adds the blocks of streams at `/live`, the files of streams, and the page of their player."""
     waiting = 0
 
     @app.get("/live.html")
@@ -168,9 +166,7 @@ def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
 
 
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
-    """Returns the application: the page at `/`,
-    and files at `/motion.bvh?...` with the query string of a link.
-    """
+    """Returns the application: the page at `/`, and files at `/motion.bvh?...` with the query string of a link."""
     app = FastAPI(openapi_url=None)
     writers = Writers()
 

@@ -77,9 +77,7 @@ def _step(
 
 
 def _action_label(action: str) -> str:
-    """Returns the words for an action without its usual direction,
-    which another chip may contradict.
-    """
+    """Returns the words for an action without its usual direction, which another chip may contradict."""
     return predicate(Mention(action)).removesuffix(f" {actions()[action].usual}")
 
 

@@ -1,6 +1,4 @@
-"""Connections of the demo's server, with deadlines,
-and limits on the number in total and per address.
-"""
+"""Connections of the demo's server, with deadlines, and limits on the number in total and per address."""
 
 import asyncio
 from dataclasses import dataclass
@@ -62,9 +60,7 @@ class Connection(H11Protocol):
         self.stall: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Watches a new connection,
-        and closes the longest-waiting connections if there are too many.
-        """
+        """Watches a new connection, and closes the longest-waiting connections if there are too many."""
         super().connection_made(transport)
         self.network = _network(self.client[0]) if self.client else None
         self._watch()
@@ -113,9 +109,7 @@ class Connection(H11Protocol):
         self.transport.close()
 
     def _watch(self) -> None:
-        """Starts the deadline when the connection begins to wait,
-        and stops it when a request has arrived.
-        """
+        """Starts the deadline when the connection begins to wait, and stops it when a request has arrived."""
         if self.transport.is_closing():
             return
 
@@ -151,9 +145,7 @@ class Connection(H11Protocol):
 
 
 def _network(address: str) -> IPv4Address | IPv6Network:
-    """Returns an address, or the 64-bit network of an IPv6 address,
-    since a subscriber has a whole network.
-    """
+    """Returns an address, or the 64-bit network of an IPv6 address, since a subscriber has a whole network."""
     parsed = ip_address(address.partition("%")[0])
     if isinstance(parsed, IPv6Address):
         return parsed.ipv4_mapped or IPv6Network((parsed, 64), strict=False)

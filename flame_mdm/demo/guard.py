@@ -1,6 +1,4 @@
-"""Guard of the demo's server:
-it passes on requests of the page itself, and refuses all others.
-"""
+"""Guard of the demo's server: it passes on requests of the page itself, and refuses all others."""
 
 import asyncio
 import ipaddress
@@ -83,9 +81,7 @@ Meters = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)]
 
 
 class LiveCall(Post):
-    """A request for the frames of a stream, starting at frame `begin`;
-    `stream` is "" for a new stream.
-    """
+    """A request for the frames of a stream, starting at frame `begin`; `stream` is "" for a new stream."""
 
     stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
     text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]
@@ -243,9 +239,7 @@ async def _body(request: Request) -> bytes:
 
 
 def _network_location(address: str) -> str:
-    """Returns host and port of an address in lower case;
-    "" for an invalid address, such as http://[.
-    """
+    """Returns host and port of an address in lower case; "" for an invalid address, such as http://[."""
     try:
         return urlsplit(address).netloc.lower()
     except ValueError:

@@ -154,15 +154,13 @@ class LiveStreams:
         return name, self._streams[name]
 
     def _running(self, name: str) -> LiveStream:
-        """Returns a stream by its name; raises `UserError` if it has ended."""
+        """Returns a stream by its name. Raises `UserError` if it has ended."""
         if name not in self._streams:
             raise UserError("this stream has ended. Reload the page to begin another one")
         return self._streams[name]
 
     def _count(self, live: LiveStream) -> None:
-        """Counts a block; raises `UserError` if a stream computes more blocks
-        than a visitor can watch.
-        """
+        """Counts a block. Raises `UserError` if a stream computes more blocks than a visitor can watch."""
         now = self.clock()
         live.allowance = min(BURST, live.allowance + RATE * (now - live.used))
         live.used = now

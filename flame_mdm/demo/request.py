@@ -1,6 +1,4 @@
-"""Requests of the demo within the limits of a public page,
-with links and equivalent Python programs.
-"""
+"""Requests of the demo within the limits of a public page, with links and equivalent Python programs."""
 
 import json
 from collections.abc import Iterable
@@ -73,9 +71,7 @@ class DemoEdit(BaseModel):
 
 
 class DemoRequest(BaseModel):
-    """Everything that determines the motions in the demo,
-    with the same keys as `flame-mdm sample`.
-    """
+    """Everything that determines the motions in the demo, with the same keys as `flame-mdm sample`."""
 
     model_config = RULES
     model: str = "package"
@@ -100,15 +96,12 @@ class DemoRequest(BaseModel):
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
 
     def targets(self, kind: str) -> dict[str, Any]:
-        """Returns the targets of `flame_mdm.generate` along the path,
-        for a model trained on `kind`.
-        """
+        """Returns the targets of `flame_mdm.generate` along the path, for a model trained on `kind`."""
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps: for each, the number of the motion to edit,
-        and keywords of `generate` or `edit`.
+        """Returns the steps: for each, the number of the motion to edit, and keywords of `generate` or `edit`.
 
         In the first step, which generates, the number is None.
         """
@@ -140,9 +133,7 @@ class DemoRequest(BaseModel):
         return steps
 
     def python(self, kind: str, device: str) -> str:
-        """Returns Python code that makes the same motions;
-        `kind` is the model's kind of condition.
-        """
+        """Returns Python code that makes the same motions; `kind` is the model's kind of condition."""
         model, _, adapter = self.model.partition(PLUS)
         options = ("" if device == "cpu" else f", {device!r}") + (
             f", adapter={adapter!r}" if adapter else ""
@@ -157,7 +148,7 @@ class DemoRequest(BaseModel):
 
 
 def query_pairs(query: str) -> list[tuple[str, str]]:
-    """Returns the keys and values of a query string; raises `UserError` if it has more than `MAX_FIELDS`."""
+    """Returns the keys and values of a query string. Raises `UserError` if it has more than `MAX_FIELDS`."""
     try:
         return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_FIELDS)
     except ValueError:
@@ -166,7 +157,7 @@ def query_pairs(query: str) -> list[tuple[str, str]]:
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
-    """Returns the request in the query string of a link; raises `UserError` if it is invalid.
+    """Returns the request in the query string of a link. Raises `UserError` if it is invalid.
 
     Keys with "__" belong to the host.
     """

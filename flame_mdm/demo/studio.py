@@ -1,6 +1,4 @@
-"""Motions for the page: the model handles one request at a time;
-the latest results stay in memory.
-"""
+"""Motions for the page: the model handles one request at a time; the latest results stay in memory."""
 
 import tempfile
 import time
@@ -57,7 +55,7 @@ class Studio:
         self.live = LiveStreams(streaming[0]) if streaming else None
 
     def model(self, name: str) -> MotionGenerator:
-        """Returns a model by its name on the page; raises `UserError` for other names.
+        """Returns a model by its name on the page. Raises `UserError` for other names.
 
         A model with an adapter is loaded at its first use.
         """
@@ -79,9 +77,7 @@ class Studio:
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns the reader of texts for a model whose captions have single actions;
-        None for other models.
-        """
+        """Returns the reader of texts for a model whose captions have single actions; None for other models."""
         self.model(name)
         return self._readers.get(name)
 
@@ -147,9 +143,7 @@ class Studio:
         return checked(request.model_dump() | {"text": text})
 
     def readings(self, request: DemoRequest) -> list[Reading]:
-        """Returns the meaning of each part of a request's text;
-        [] for models that read any words.
-        """
+        """Returns the meaning of each part of a request's text; [] for models that read any words."""
         reader = self.reader(request.model)
         if reader is None or not request.text or not request.split:
             return []

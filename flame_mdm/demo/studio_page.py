@@ -166,9 +166,7 @@ def build_page(studio: Studio) -> gr.Blocks:
 
 
 def _with_live(studio: Studio, live: LiveStreams) -> SimpleNamespace:
-    """Places the components of the page in a tab,
-    next to the tab of the stream, and returns them.
-    """
+    """Places the components of the page in a tab, next to the tab of the stream, and returns them."""
     fps = live.model.representation.fps
     walk = f'data-walk="{WALK}"' if live.can_lead else ""
     with gr.Tabs():
@@ -363,9 +361,7 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Returns texts or actions of the training data with the addresses of their pictures;
-    "" = no picture.
-    """
+    """Returns texts or actions of the training data with the addresses of their pictures; "" = no picture."""
     if model.conditioned_on == "text" and Reader.fits(model.facts):
         doable = Abilities(model.facts).actions
         return {

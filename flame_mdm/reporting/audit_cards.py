@@ -19,9 +19,7 @@ from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
 SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
-"""Perturbations of the set that show the bias of a metric,
-and the measured motions at their strongest grade.
-"""
+"""Perturbations of the set that show the bias of a metric, and the measured motions at their strongest grade."""
 ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
@@ -110,8 +108,7 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns a tuple by which cards are compared:
-        the larger, the better the card fits the evaluated data.
+        """Returns a tuple by which cards are compared: the larger, the better the card fits the evaluated data.
 
         Cards with the same length limits are best, then cards of the test split, cards of the
         same data, and cards of more motions.
@@ -129,8 +126,7 @@ class CitedCard:
 
 
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
-    """Returns the strongest card of an extractor that fits the evaluated data;
-    None without such a card.
+    """Returns the strongest card of an extractor that fits the evaluated data; None without such a card.
 
     Without an extractor, the card is about the metrics of joints. Cards are in the folder of
     FLAME_MDM_AUDITS (default: runs/audit) and in the repository, whose cards are listed in
@@ -151,7 +147,7 @@ def card_of(data: Data, sha256: str | None) -> CitedCard | None:
 
 
 def read_card(path: Path) -> AuditCard:
-    """Reads the JSON of a card; raises `UserError` if it is damaged or from an older version."""
+    """Reads the JSON of a card. Raises `UserError` if it is damaged or from an older version."""
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
@@ -202,9 +198,7 @@ def _section(card: AuditCard) -> dict[str, object]:
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
-    """Returns one row per perturbation, with one cell per metric and card,
-    and with curves by metric.
-    """
+    """Returns one row per perturbation, with one cell per metric and card, and with curves by metric."""
     by_name = [
         {perturbation.name: perturbation for perturbation in card.perturbations} for card in cards
     ]
@@ -255,9 +249,7 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def findings(card: AuditCard) -> list[str]:
-    """Returns sentences on perturbations that metrics do not notice,
-    or rate better than real motions.
-    """
+    """Returns sentences on perturbations that metrics do not notice, or rate better than real motions."""
     table = {
         (perturbation.name, metric): seen(card, perturbation, metric)
         for perturbation in card.perturbations
@@ -341,9 +333,7 @@ def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: st
 def _curve(
     card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
 ) -> dict[str, str] | None:
-    """Returns the response curve over real motions and all grades;
-    None if the metric never changes.
-    """
+    """Returns the response curve over real motions and all grades; None if the metric never changes."""
     if perturbation is None or metric not in card.metrics:
         return None
     pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
@@ -371,7 +361,5 @@ def _curve(
 
 
 def _metric_text(name: str) -> str:
-    """Returns the name of a metric as Markdown;
-    names of this project's metrics need no escapes.
-    """
+    """Returns the name of a metric as Markdown; names of this project's metrics need no escapes."""
     return name if re.fullmatch(r"[\w/.-]+", name) else markdown_text(name)

@@ -22,8 +22,7 @@ SECONDS = 15  # only the first seconds of a longer clip are shown, to keep the p
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
-    """Returns the clips of a split (None = all) whose id
-    and captions contain all words of `search`.
+    """Returns the clips of a split (None = all) whose id and captions contain all words of `search`.
 
     Upper and lower case do not matter. Each clip is grouped with its mirrored copy, original
     first. A group matches if one of its clips matches.

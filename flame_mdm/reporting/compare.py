@@ -190,9 +190,7 @@ def _player(
     body: Mesh | None,
     evidence: Callable[[Motion], Sequence[Mark]],
 ) -> str:
-    """Returns a player of the motions for the prompts that all runs have,
-    in the order of the first run.
-    """
+    """Returns a player of the motions for the prompts that all runs have, in the order of the first run."""
     from flame_mdm.visualize import player_page
 
     scene = [
@@ -214,8 +212,7 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD`:
-    the differences of all metrics of two results, or a reason for no comparison.
+    """Returns rows for `HEAD`: the differences of all metrics of two results, or a reason for no comparison.
 
     Both results are of the same evaluation.
     """
@@ -269,9 +266,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
-    """Groups the results of the same protocol, data and extractor by title,
-    with the labels of their runs.
-    """
+    """Groups the results of the same protocol, data and extractor by title, with the labels of their runs."""
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, run in runs.items():
         for result in run.results.values():
@@ -281,9 +276,7 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 
 
 def in_common(runs: Mapping[str, Run]) -> list[str]:
-    """Returns the reason why no evaluation can be compared;
-    [] if two runs have the same evaluation.
-    """
+    """Returns the reason why no evaluation can be compared; [] if two runs have the same evaluation."""
     groups = grouped(runs)
     if len(runs) < 2 or any(
         len({label for label, _ in columns}) > 1 for columns in groups.values()
@@ -296,9 +289,7 @@ def in_common(runs: Mapping[str, Run]) -> list[str]:
 
 
 def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:
-    """Returns titles and rows (see `HEAD`) of the differences between each result
-    and the first result.
-    """
+    """Returns titles and rows (see `HEAD`) of the differences between each result and the first result."""
     (first, base), *others = columns
     tables = []
     for index, (label, result) in enumerate(others, 2):

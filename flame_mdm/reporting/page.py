@@ -64,9 +64,7 @@ def number(value: float | None) -> str:
 
 
 def filled(head: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Returns a table without empty columns and rows;
-    the first column has the names of the rows.
-    """
+    """Returns a table without empty columns and rows; the first column has the names of the rows."""
     rows = [row for row in rows if {*row[1:]} - {"–", ""}]
     kept = [k for k in range(len(head)) if not k or {row[k] for row in rows} - {"–", ""}]
     return [head[k] for k in kept], [[row[k] for k in kept] for row in rows]

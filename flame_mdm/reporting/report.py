@@ -162,9 +162,7 @@ def labeled(name: str, value: Value | None) -> str:
 
 
 def sampling(result: Result) -> str:
-    """Returns the origin of a result's motions:
-    checkpoint or baseline, and options of the sampler.
-    """
+    """Returns the origin of a result's motions: checkpoint or baseline, and options of the sampler."""
     checkpoint = result.checkpoint
     words = [f"baseline {result.baseline}" if result.baseline else "motions from other systems"]
     if checkpoint is not None:

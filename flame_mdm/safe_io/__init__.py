@@ -97,8 +97,7 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
 @contextmanager
 def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Yields a temporary folder whose files are moved to the folder `path` at the end:
-    all files or none.
+    """Yields a temporary folder whose files are moved to the folder `path` at the end: all files or none.
 
     If `path` exists, files of the same names are replaced and other files are kept. Temporary
     folders that killed processes left behind are removed. `within` is the folder that links must
@@ -159,9 +158,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Returns the reason why a file could not be written,
-    and the free space if the disk may be full.
-    """
+    """Returns the reason why a file could not be written, and the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -203,9 +200,7 @@ def write_json(
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` without it,
-    and converts `errors` to such errors.
-    """
+    """Adds the name of a file to every `UserError` without it, and converts `errors` to such errors."""
     try:
         yield
     except UserError as error:
@@ -300,9 +295,7 @@ def _begins(path: str | Path, content: bytes) -> bool:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns the content of a UTF-8 text file of
-    at most `limit` bytes; otherwise raises `UserError`.
-    """
+    """Returns the content of a UTF-8 text file of at most `limit` bytes; otherwise raises `UserError`."""
     regular_file(path, limit)
     with (
         naming(path, UnicodeDecodeError, prefix="not a UTF-8 text file: "),
@@ -312,17 +305,13 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
-    """Returns the content of a JSON file, which must not contain NaN,
-    infinity and lone surrogates.
-    """
+    """Returns the content of a JSON file, which must not contain NaN, infinity and lone surrogates."""
     with naming(path, ValueError, prefix="not a JSON file: "):
         return parse_json(read_text(path, limit))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON text;
-    raises `ValueError` for content that `read_json` refuses.
-    """
+    """Returns the content of a JSON text. Raises `ValueError` for content that `read_json` refuses."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
@@ -368,9 +357,7 @@ def read_package_yaml(path: Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of nodes of a YAML file
-    after expanding its aliases; infinite for cycles.
-    """
+    """Returns the number of nodes of a YAML file after expanding its aliases; infinite for cycles."""
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
@@ -484,8 +471,7 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 
 @contextmanager
 def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip archive for reading;
-    raises `UserError` if it has more than `MAX_MEMBERS` members.
+    """Opens a zip archive for reading. Raises `UserError` if it has more than `MAX_MEMBERS` members.
 
     `zipfile` reads the directory of the archive at once and creates an object for each entry,
     even if the archive states a smaller number of entries. Therefore, the size of the directory
@@ -508,9 +494,7 @@ def check_members(count: int) -> None:
 
 
 class _DirectoryReader:
-    """A file from which only a limited number of bytes can be read at once,
-    until `limit` is None.
-    """
+    """A file from which only a limited number of bytes can be read at once, until `limit` is None."""
 
     def __init__(self, file: IO[bytes]):
         self.file, self.limit = file, DIRECTORY_LIMIT

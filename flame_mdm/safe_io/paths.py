@@ -111,9 +111,7 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _machine() -> str:
-    """Returns eight hexadecimal digits that identify the host and,
-    in a container, its process namespace.
-    """
+    """Returns eight hexadecimal digits that identify the host and, in a container, its process namespace."""
     numbering = ""
     with suppress(OSError):  # a system without /proc
         numbering = str(Path("/proc/self/ns/pid").readlink())

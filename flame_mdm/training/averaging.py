@@ -67,9 +67,7 @@ class MovingAverage(WeightAveraging):
         )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Copies the initial weights before the first step,
-        after pretraining or a teacher has set them.
-        """
+        """Copies the initial weights before the first step, after pretraining or a teacher has set them."""
         if self.from_initial_weights and not self.begun:
             self._copy_weights()
             self.begun = True

@@ -52,9 +52,7 @@ Values = Mapping[str, float]  # values by metric, or by metric/part
 
 
 class Interrupted(Exception):
-    """Raised after a signal stopped training at the end
-    of a step and a checkpoint was written.
-    """
+    """Raised after a signal stopped training at the end of a step and a checkpoint was written."""
 
     def __init__(self, signum: int, step: int):
         super().__init__(f"{signal.Signals(signum).name} at step {step}")
@@ -256,9 +254,7 @@ class Report(Callback):
 
 
 def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
-    """Returns the name of the package's extractor for the motions of a model;
-    "" without such an extractor.
-    """
+    """Returns the name of the package's extractor for the motions of a model; "" without such an extractor."""
     name = f"motion_clip_{facts.get('dataset')}"
     if name not in SHIPPED or "captions" not in facts:
         return ""
@@ -267,9 +263,7 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics with their docstrings,
-    and values of generated and real motions.
-    """
+    """Returns lines that explain metrics with their docstrings, and values of generated and real motions."""
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -339,8 +333,7 @@ def are_same(motions: Sequence[Motion]) -> bool:
 
 
 class SampleMotions(Callback):
-    """Samples fixed prompts with fixed noise,
-    writes files to the run directory, and logs a video.
+    """Samples fixed prompts with fixed noise, writes files to the run directory, and logs a video.
 
     Args:
         folder: folder of the samples. Samples of a step are in a subfolder such as
@@ -472,9 +465,7 @@ class SampleMotions(Callback):
         return sample(model, resolve(request, model, check_words=False))
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
-        """Computes all metrics of up to `REAL` training clips
-        with the attributes that all prompts request.
-        """
+        """Computes all metrics of up to `REAL` training clips with the attributes that all prompts request."""
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
         common, all_names = (
@@ -492,9 +483,7 @@ class SampleMotions(Callback):
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
-        """Computes all metrics of motions (F, J, 3) in meters;
-        metrics without a value are left out.
-        """
+        """Computes all metrics of motions (F, J, 3) in meters; metrics without a value are left out."""
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()

@@ -54,9 +54,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         self.folder, self.resumed = folder, resumed
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
-        """Returns the content of the checkpoint from which the run resumes;
-        `newest` has checked it.
-        """
+        """Returns the content of the checkpoint from which the run resumes; `newest` has checked it."""
         assert self.resumed is not None
         content = self.resumed.content
         # The checkpoint is released, since it takes as much memory as the model and its
@@ -74,7 +72,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
     ) -> None:
-        """Writes a checkpoint; raises `UserError` if it cannot be written.
+        """Writes a checkpoint. Raises `UserError` if it cannot be written.
 
         Earlier checkpoints remain.
         """
@@ -101,9 +99,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 
 def newest(folder: Path) -> Resumed | None:
-    """Returns the checkpoint from which to resume:
-    the last one, or the previous one if it is damaged.
-    """
+    """Returns the checkpoint from which to resume: the last one, or the previous one if it is damaged."""
     paths = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
     for path in paths:
         try:
@@ -129,8 +125,7 @@ def newest(folder: Path) -> Resumed | None:
 
 
 def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
-    """Raises `UserError` if the saved state of the optimizer
-    and its schedule does not fit the recipe.
+    """Raises `UserError` if the saved state of the optimizer and its schedule does not fit the recipe.
 
     PyTorch accepts any values, and would fail in the first step of the training.
     """
@@ -177,9 +172,7 @@ def _is_alike(value: Any, usual: Any) -> bool:
 
 
 def _is_state(value: Any, weight: Tensor) -> bool:
-    """Whether a saved value can be the state of a weight:
-    a number, or a tensor up to the weight's size.
-    """
+    """Whether a saved value can be the state of a weight: a number, or a tensor up to the weight's size."""
     if isinstance(value, Tensor):
         return value.numel() <= max(1, weight.numel()) and not value.dtype.is_complex
     return isinstance(value, int | float)

@@ -58,9 +58,7 @@ class DistillationTask(GeneratorTask):
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Reads the teacher and copies its weights;
-        raises `UserError` if it is missing or does not fit.
-        """
+        """Reads the teacher and copies its weights. Raises `UserError` if it is missing or does not fit."""
         options = self.config["distillation"]
         name = options["teacher"]
         try:
@@ -172,7 +170,7 @@ class DistillationTask(GeneratorTask):
 
 
 def read_teacher(path: Path) -> MotionGenerator:
-    """Loads a teacher; raises `UserError` if it predicts noise, or is a student itself."""
+    """Loads a teacher. Raises `UserError` if it predicts noise, or is a student itself."""
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(

@@ -1,6 +1,4 @@
-"""Safeguards for long runs:
-run lock, divergence detection, and explanations of killed processes.
-"""
+"""Safeguards for long runs: run lock, divergence detection, and explanations of killed processes."""
 
 import re
 import shutil
@@ -75,9 +73,7 @@ class BadLoss(Callback):
         batch: MotionBatch,
         batch_idx: int,
     ) -> None:
-        """Stores the loss of the batch on its device,
-        and checks all stored losses at the log interval.
-        """
+        """Stores the loss of the batch on its device, and checks all stored losses at the log interval."""
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
@@ -86,15 +82,11 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Checks the losses before a checkpoint is written,
-        so that it cannot hold weights after a bad loss.
-        """
+        """Checks the losses before a checkpoint is written, so that it cannot hold weights after a bad loss."""
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
-        """Raises `UserError` on all ranks at the same step, if a loss since the last check is
-        bad.
-        """
+        """Raises `UserError` on all ranks at the same step, if a loss since the last check is bad."""
         if not self.seen:
             return
         recent = torch.stack([loss for *_, loss in self.seen])
@@ -131,9 +123,7 @@ class BadLoss(Callback):
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns an explanation for errors that mean
-    that a data loading process died, otherwise None.
-    """
+    """Returns an explanation for errors that mean that a data loading process died, otherwise None."""
     # If a worker dies while a checkpoint is written, its error is the cause of another error.
     message = f"{error} {error.__cause__ or ''}"
     lost = re.search(

@@ -23,9 +23,7 @@ PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "
 
 
 class WriteProvenance(Callback):
-    """Writes and logs `config.yaml` and `provenance.json`
-    at the start of training; prints a summary.
-    """
+    """Writes and logs `config.yaml` and `provenance.json` at the start of training; prints a summary."""
 
     def __init__(self, config: Config):
         self.config = config

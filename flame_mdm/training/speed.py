@@ -87,9 +87,7 @@ class CheapDropout(nn.Module):
         self.threshold = round(p * 2**16) - 2**15
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns `x` with some elements dropped and the others scaled;
-        in evaluation mode, returns `x`.
-        """
+        """Returns `x` with some elements dropped and the others scaled; in evaluation mode, returns `x`."""
         if not self.training or self.p == 0:
             return x
         words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64).random_(-(2**63), None)

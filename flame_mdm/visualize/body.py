@@ -14,8 +14,7 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22, Skeleton
 from flame_mdm.safe_io import naming, read_npz
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
-"""Limbs with a helper bone, by their first joint,
-and the share of a twist that the helper bone takes.
+"""Limbs with a helper bone, by their first joint, and the share of a twist that the helper bone takes.
 
 The twist is the twist of the hip or shoulder; for the elbow, it is the twist of the wrist.
 """
@@ -74,7 +73,7 @@ class Figure:
 
 
 def target(path: str | Path, motions: Sequence[Figure]) -> Path:
-    """Returns the path of a file; raises `UserError` if there are no motions to write to it."""
+    """Returns the path of a file. Raises `UserError` if there are no motions to write to it."""
     if not motions:
         raise UserError(f"{path}: no motions to show")
     return Path(path)
@@ -102,8 +101,7 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose:
-    an A-pose with the pelvis at 0. `tools/mannequin.py` writes it.
+    """A closed mesh in its stored pose: an A-pose with the pelvis at 0. `tools/mannequin.py` writes it.
 
     Attributes:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
@@ -136,8 +134,7 @@ class Mesh:
 
 
 def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the four bones (V, 4) with the largest weights,
-    and integer weights (V, 4) with a sum of 255.
+    """Returns the four bones (V, 4) with the largest weights, and integer weights (V, 4) with a sum of 255.
 
     The input is (V, B).
     """
@@ -155,7 +152,7 @@ def mannequin() -> Mesh:
 
 
 def read_body(name: str) -> Mesh:
-    """Returns the mannequin or the body in a file; raises `UserError` if the file is damaged."""
+    """Returns the mannequin or the body in a file. Raises `UserError` if the file is damaged."""
     with naming(name, KeyError, ValueError, IndexError, prefix="not a body: "):
         return mannequin() if name == "mannequin" else Mesh(Path(name))
 

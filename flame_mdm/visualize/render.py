@@ -264,9 +264,7 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
 
 
 def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a function that projects points (N, 3) in meters to (N, 4):
-    x, y, pixels per meter and depth.
-    """
+    """Returns a function that projects points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth."""
 
     def project(points: np.ndarray) -> np.ndarray:
         offset = points - center
@@ -385,9 +383,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns at most three lines of a motion's caption,
-    and a fourth line if it is drawn as a skeleton.
-    """
+    """Returns at most three lines of a motion's caption, and a fourth line if it is drawn as a skeleton."""
     lines, font = [""], _font(size)
     # The caption has room for three lines.
     for word in shortened(motion.text or motion.id, width).split():

@@ -46,7 +46,7 @@ def sampler() -> Sampler:
 
 
 def sample(sentence: str, seconds: float, seed: int, in_place: bool) -> Sampled:
-    """Samples a motion; raises `ValueError` for a sentence or length that the model does not know."""
+    """Samples a motion. Raises `ValueError` for a sentence or length that the model does not know."""
     model = sampler()
     unknown = model.unknown(sentence)
     joints = model.decode(model.generate(sentence, seconds, seed))

@@ -174,9 +174,7 @@ def _condition_notes(
 def _warnings(
     lines: Sequence[Line], values: Sequence[str], columns: Sequence[str]
 ) -> list[tuple[str, str]]:
-    """Returns the footnotes on invalid rows, on the choice of checkpoints,
-    and on columns with distances of 0.
-    """
+    """Returns the footnotes on invalid rows, on the choice of checkpoints, and on columns with distances of 0."""
     invalid = [(line.label, line.facts.get("not valid because")) for line in lines]
     texts = [(label, f"NOT VALID: {reason}") for label, reason in invalid if reason]
     for line in lines:
@@ -421,9 +419,7 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
 
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
-    """Marks the best and second-best values among rows
-    of the same kind with the same footnotes.
-    """
+    """Marks the best and second-best values among rows of the same kind with the same footnotes."""
     for kind, real in (("measured", "real"), ("reported", "reported real")):
         for marks in {line.marks for line in lines}:
             same = [x for x in lines if x.marks == marks]

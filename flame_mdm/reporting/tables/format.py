@@ -45,9 +45,7 @@ SHARED = (
 
 @dataclass
 class Cell:
-    """A cell: printed text, number, half width of the 95 % interval,
-    and rank (1 = best, 2 = second best).
-    """
+    """A cell: printed text, number, half width of the 95 % interval, and rank (1 = best, 2 = second best)."""
 
     text: str
     value: float | None = None
@@ -130,9 +128,7 @@ def write(table: Table, out: Path) -> None:
 
 
 def rendered(table: Table, suffix: str) -> Markup:
-    """Returns a table as "md",
-    "tex" (for booktabs and threeparttable) or "html" (without a page).
-    """
+    """Returns a table as "md", "tex" (for booktabs and threeparttable) or "html" (without a page)."""
     values = {
         "several": len(table.parts) > 1,
         "sources": _sources(table),

@@ -26,9 +26,7 @@ def hyperparameters(name: str) -> dict[str, Any]:
 
 
 def value(config: Config, key: str) -> Any:
-    """Returns the value of a dotted key in a recipe,
-    by default the default of the class, or None.
-    """
+    """Returns the value of a dotted key in a recipe, by default the default of the class, or None."""
     *path, name = key.split(".")
     node: Any = config
     for part in path:

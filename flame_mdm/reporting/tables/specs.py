@@ -129,9 +129,7 @@ def as_list(value: Any) -> list[Any]:
 
 
 class Figure(ClosedSchema):
-    """A figure that plots columns of a part over an option of its rows;
-    a scatter plot with `points`.
-    """
+    """A figure that plots columns of a part over an option of its rows; a scatter plot with `points`."""
 
     part: str
     x: str
@@ -202,7 +200,7 @@ def _at_most(noun: str, count: int, most: int) -> None:
 
 
 def load_mapping(path: Path) -> Config:
-    """Reads a YAML file that contains one mapping of plain values; raises `UserError` otherwise."""
+    """Reads a YAML file that contains one mapping of plain values. Raises `UserError` otherwise."""
     content = (read_package_yaml if path.parent == SPECS else read_yaml)(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: not a mapping")
@@ -218,9 +216,7 @@ class Evaluation:
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Returns the path of the result, which depends only on the keys,
-        so that tables share results.
-        """
+        """Returns the path of the result, which depends only on the keys, so that tables share results."""
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         subject = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(

@@ -33,7 +33,7 @@ class ConditionEncoder(nn.Module, ABC):
     features: int
     #: What the encoder reads: captions ("text") or class labels ("action").
     reads: Literal["text", "action"] = "text"
-    #: Maximum number of words per caption; None if the encoder does not count words.
+    #: Maximum number of words per caption; None = no limit.
     max_words: int | None = None
     #: Words of the training captions; None before they are known.
     seen: Collection[str] | None = None
@@ -49,7 +49,7 @@ class ConditionEncoder(nn.Module, ABC):
             The condition, with its null condition, on the device of `batch.x`.
 
         Raises:
-            UserError: If the batch has no captions or labels.
+            UserError: If the batch contains no captions or labels.
         """
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
@@ -65,13 +65,13 @@ class ConditionEncoder(nn.Module, ABC):
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
         """Fills the encoder's cache on disk for these captions.
 
-        By default, the method does nothing. Only one process calls it.
+        By default, the method does nothing. It is called by only one process.
         """
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
         """Opens the cache of `precompute` in every process and returns its size in bytes.
 
-        Without a cache, it returns 0.
+        Returns 0 if there is no cache.
 
         Raises:
             UserError: If the cache is damaged.
@@ -83,7 +83,7 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """No condition: vectors and tokens of width 0. They are also the null condition.
+    """No condition: vectors and tokens of width 0, which are also the null condition.
 
     Example:
         >>> x = torch.zeros(2, 5, 3)

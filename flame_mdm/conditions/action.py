@@ -13,8 +13,8 @@ class ActionLabels(ConditionEncoder):
 
     The null condition is the zero vector.
 
-    Source: Tevet et al. 2023 (MDM), section 3. There is one token, equal to the pooled vector,
-    for denoisers that read tokens.
+    Source: Tevet et al. 2023 (MDM), section 3. For denoisers that read tokens, there is one token,
+    equal to the pooled vector.
 
     Args:
         features: C, the width of the vectors.
@@ -47,7 +47,7 @@ class ActionLabels(ConditionEncoder):
         """Returns the vectors of the labels `batch.action` (B,).
 
         Raises:
-            UserError: If the batch has no labels.
+            UserError: If the batch contains no labels.
         """
         if batch.action is None:
             raise UserError(

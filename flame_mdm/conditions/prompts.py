@@ -1,5 +1,5 @@
 # pyright: standard
-"""Prompts as models read them: parts with captions, what was understood, and words that a model does not know."""
+"""Prompts as models read them: parts with captions, the understood content, and unknown words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,11 +14,12 @@ class ReadPrompt:
     """A prompt as a model reads it.
 
     Attributes:
-        parts: words of each part, and its seconds if the prompt gives them.
-        captions: what the model reads for each part.
-        unknown: words that the model has never seen in training, or does not read.
-        summary: what was understood, in one line; "" unless the model's captions have single actions.
-        changes: lines about what is sampled differently from what the prompt says.
+        parts: words of each part, and its seconds if the prompt states them.
+        captions: the caption that the model reads for each part.
+        unknown: words that never occur in the training captions, or that the model does not read.
+        summary: one line that says how the prompt was understood. It is "" unless each caption of
+            the model describes a single action.
+        changes: lines about differences between the prompt and what is sampled.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -37,19 +38,20 @@ def read_prompt(
     splits: bool = False,
     check_words: bool = True,
 ) -> ReadPrompt:
-    """Returns a text as a model reads it.
+    """Reads a text as a model reads it.
 
     Args:
         prompt: the text.
-        parts: words of its parts, "walks @3 | sits", and their seconds if the text gives them.
+        parts: words of its parts, "walks @3 | sits", and their seconds if the text states them.
         facts: facts of the model.
         max_words: maximum number of words that the model reads in a caption; None = no limit.
-        splits: whether a sentence of several actions becomes one part per action; for texts of a single part.
-        check_words: whether the model's words for actions replace the words of the text, and a
-            text is refused if the model knows none of its content words.
+        splits: whether a sentence of several actions is split into one part per action. Only for
+            texts of a single part.
+        check_words: whether the model's words for actions replace the words of the text. A text is
+            then also refused if the model knows none of its content words.
 
     Raises:
-        UserError: If the model does not know what a part says.
+        UserError: If the model does not understand a part.
 
     Example:
         >>> read = read_prompt("walks happily", [("walks happily", None)], {"vocabulary": ["walks"]})
@@ -77,10 +79,10 @@ def _with_actions(
     max_words: int | None,
     splits: bool,
 ) -> ReadPrompt:
-    """Returns a text as a model of single actions reads it.
+    """Reads a text as a model of single actions reads it.
 
-    Unless it is split, a text keeps its parts. If a part names several actions, the model reads
-    the words of the part as they are.
+    Unless it is split, a text keeps its parts. If a part names several actions, the model reads the
+    words of the part unchanged.
     """
     readings: list[Reading]
     if splits:

@@ -1,11 +1,12 @@
 """Target conditions: where joints should be at the end of a motion.
 
-Source: Tevet et al. 2025, "CLoSD", section 3.1. A target (B, 8, 4) has a slot for each name in
-`SLOTS`. A slot contains x, y, z, and 1 = requested or 0 = free. Free slots are 0.
+Source: Tevet et al. 2025, "CLoSD", section 3.1. A target (B, 8, 4) contains a slot for each name in
+`SLOTS`. A slot contains x, y, z, and a flag, which is 1 if the slot is requested and 0 if it is
+free. Free slots are 0.
 
-Positions are in meters relative to the first predicted frame: its root is at x = z = 0 and faces
-+z. y is the height above the floor. "traj" is the pelvis projected on the floor, y = 0. The x of
-"heading" is the direction that hips and shoulders face, in radians: 0 = +z, positive to +x.
+Positions are in meters relative to the first predicted frame, whose root is at x = z = 0 and faces
++z. y is the height above the floor. "traj" is the pelvis projected onto the floor, y = 0. The x of
+"heading" is the direction that hips and shoulders face, in radians: 0 = +z, positive toward +x.
 """
 
 import math
@@ -21,10 +22,10 @@ JOINTS = ("pelvis", "left_foot", "right_foot", "left_wrist", "right_wrist", "hea
 SLOTS = (*JOINTS, "traj", "heading")
 HEADING = SLOTS.index("heading")
 COORDINATES = Constant([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-"""Coordinates (8, 3) of the slots that are lengths. The x of the heading is an angle."""
+"""Coordinates (8, 3) of the slots that are lengths. The x of the heading is an angle instead."""
 
 FLOOR = Constant([1.0, 0.0, 1.0])
-"""Factors (3,) of x, y and z that project a position on the floor."""
+"""Factors (3,) of x, y and z that project a position onto the floor."""
 
 # Added to the number of requested values, as in the authors' code, so that the error of a target
 # that requests nothing is 0
@@ -37,16 +38,17 @@ class TargetConditions:
     Args:
         joints: names of the joints of the skeleton, in the order of its positions.
         facing: joint indices of right hip, left hip, right shoulder and left shoulder.
-        choices: sets of slots. Each training motion draws one set; all have equal probability. An
-            empty set gives a target that requests nothing. This differs from having no target.
+        choices: sets of slots. Each training motion draws one of the sets with equal probability.
+            An empty set results in a target that requests nothing, which differs from having no
+            target.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
-        heading_modulo_pi: compute the error of the heading modulo pi, as in MDM's code. Facing
-            backwards then costs nothing.
+        heading_modulo_pi: compute the error of the heading modulo pi, as in MDM's code. A body that
+            faces backwards then has no error.
 
     Raises:
-        UserError: If the skeleton lacks a joint, a choice is unknown, or the probability is not
-            in [0, 1].
+        UserError: If the skeleton lacks a joint, if a choice is unknown, or if the probability is
+            not in [0, 1].
 
     Example:
         >>> from flame_mdm.representations.skeleton import SMPL22

@@ -30,37 +30,38 @@ class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
     A frozen language model is not part of the state dict or the parameters. It is loaded only if
-    a caption is not in the cache. Its tokens are always rounded to float16, even without a cache.
+    the cache lacks a caption. Its tokens are always rounded to float16, even without a cache.
 
     Args:
         model: name on the Hugging Face hub, or a folder.
         features: C, width of the model's outputs.
-        max_tokens: maximum number of word pieces per caption, including special ones. Longer
+        max_tokens: maximum number of word pieces per caption, including special tokens. Longer
             captions are truncated.
-        pooling: how a caption becomes one vector. "projection" is CLIP's projected text
+        pooling: how a caption is converted to one vector. "projection" is CLIP's projected text
             embedding, not normalized. "mean" is the mean of the real tokens, including special
-            ones (Reimers & Gurevych 2019). "pooler" is tanh of a linear map of the first token,
-            as in BERT. RoBERTa is published without this map, and transformers initializes it
-            with new random numbers each time. FLAME was trained with one such map. Here, the map
-            is drawn with a fixed seed, and a released checkpoint can replace it.
+            tokens (Reimers & Gurevych 2019). "pooler" is tanh of a linear map of the first token,
+            as in BERT. RoBERTa is published without this map, and transformers initializes it with
+            new random numbers each time. FLAME was trained with one such map. In this
+            implementation, the map is drawn with a fixed seed, and a released checkpoint can
+            replace it.
         revision: commit on the hub, 40 hex digits; required for models from the hub.
         package: installed Python package that contains the files, instead of the hub. `model` is
             then the folder in the package.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
         normalize: scale the pooled vector to norm 1.
-        tokens: return the last hidden states as tokens. Otherwise, there are 0 tokens.
+        tokens: return the last hidden states as tokens. Otherwise, no tokens are returned.
         attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME
             and MFM do.
-        encode_null: the null condition is the encoded "" (FLAME). Otherwise, it is zeros with
-            the sample's token mask (MDM).
+        encode_null: use the encoded "" as the null condition (FLAME). Otherwise, the null condition
+            is zeros with the sample's token mask (MDM).
         freeze: False = fine-tune the language model together with the motion model.
 
     Raises:
-        UserError: When a caption is encoded and the model is not pinned, its file is not the
-            published one, or its width is not `features`.
-        FileNotFoundError: When a caption is encoded and the model is not in the cache and cannot
-            be downloaded.
+        UserError: When a caption is encoded, if the model is not pinned, if its file is not the
+            published file, or if its width is not `features`.
+        FileNotFoundError: When a caption is encoded, if the model is not in the cache and cannot be
+            downloaded.
 
     Example:
         >>> encoder = PretrainedText("openai/clip-vit-base-patch32", 512, 22, "projection")
@@ -120,7 +121,7 @@ class PretrainedText(ConditionEncoder):
         """Returns the encoded captions.
 
         Raises:
-            UserError: If the batch has no captions.
+            UserError: If the batch contains no captions.
         """
         if batch.text is None:
             name = self._pretrained.model
@@ -142,7 +143,7 @@ class PretrainedText(ConditionEncoder):
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
         """Encodes the captions with a frozen model and writes them to a file in `folder`.
 
-        If the file exists already, nothing is encoded.
+        If the file already exists, nothing is encoded.
         """
         if not self.freeze:
             return
@@ -258,7 +259,7 @@ class PretrainedText(ConditionEncoder):
     def _look_up(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Like `_encode`, but reads the captions from the cache if it contains all of them."""
+        """Same as `_encode`, but reads the captions from the cache if it contains all of them."""
         encoded, distinct = self._cache, set(captions)
         if encoded is None or not encoded.rows.keys() >= distinct:
             encoded = self._encode_frozen(sorted(distinct, key=len), device)
@@ -284,7 +285,7 @@ class Pretrained:
         return self.load_network().eval().requires_grad_(False)
 
     def load_network(self) -> nn.Module:
-        """Loads a new copy of the network, float32.
+        """Loads a new copy of the network in float32.
 
         Raises:
             FileNotFoundError: If the model cannot be found or downloaded.
@@ -312,7 +313,7 @@ class Pretrained:
         # BERT's published pooler is not used, and RoBERTa has no pooler: see PretrainedText.
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
-        # Otherwise, transformers lists the weights of the unused half of CLIP or T5 as not loaded
+        # Otherwise, transformers reports the weights of the unused half of CLIP or T5 as not loaded
         logging.set_verbosity_error()
         try:
             network, info = self._load(
@@ -327,7 +328,8 @@ class Pretrained:
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
-        # Never executes code of a model. Without this option, transformers asks the user.
+        # Code in model repositories is never executed. Without this option, transformers asks the
+        # user.
         options["trust_remote_code"] = False
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
@@ -400,7 +402,7 @@ class EncodedCaptions:
     def gather(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the outputs for some captions, float32, on a device.
+        """Returns the outputs for some captions in float32, on a device.
 
         The outputs are vectors (N, C), tokens (N, S, C) and the mask of the tokens (N, S).
         """

@@ -17,9 +17,9 @@ from flame_mdm.seeds import key, seed_generator
 PAIRS, TEMPERATURE = 64, 0.1
 
 START = "<start>"
-"""Inserted before every caption, so that the empty caption also has a token.
+"""Token before every caption, so that the empty caption also has a token.
 
-No caption has it.
+No caption contains this token.
 """
 
 
@@ -29,14 +29,14 @@ class LearnedTokens(ConditionEncoder):
     The null condition is one learned vector.
 
     A word is the sum of two rows of the table, selected by its hash; see `vocabulary.hashed`. The
-    vector of a word that the training captions do not contain would be random. Such a word is
-    replaced by another of its forms that the captions contain (walked, walks), or dropped.
+    vector of a word that does not occur in the training captions would be random. Such a word is
+    replaced by another form of it that occurs in the captions (walked, walks), or dropped. Samples
+    with the same caption share its dropout, because each caption is encoded once. Linear layers
+    skip the padding.
 
-    Samples with the same caption share its dropout, because a caption is encoded once. Linear
-    layers skip the padding.
-
-    The pooled vector is the mean of the tokens, and the null token is the null vector. Therefore
-    all parameters receive gradients, whether a denoiser reads the pooled vector or the tokens.
+    The pooled vector is the mean of the tokens, and the null token is the null vector. Therefore,
+    all parameters receive gradients, regardless of whether a denoiser reads the pooled vector or
+    the tokens.
 
     Args:
         features: C, the width of the tokens and of the pooled vector.
@@ -103,10 +103,10 @@ class LearnedTokens(ConditionEncoder):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
-        Pooled vectors of captions of the same clip are pulled together, and vectors of different
-        clips are pushed apart. Each step compares two captions from each of `PAIRS` clips.
-        Without this training, a small model learns many words slowly, because only the loss of
-        the motions teaches them. Clips with a single caption are not used.
+        Pooled vectors of captions of the same clip are pulled together, and pooled vectors of
+        different clips are pushed apart. Each step compares two captions from each of `PAIRS`
+        clips. Without this training, a small model learns many words slowly, because it learns them
+        only from the loss of the motions. Clips with a single caption are not used.
         """
         groups, device = (
             [captions for captions in groups if len(set(captions)) > 1],
@@ -138,7 +138,7 @@ class LearnedTokens(ConditionEncoder):
         """Returns the encoded captions.
 
         Raises:
-            UserError: If the batch has no captions.
+            UserError: If the batch contains no captions.
         """
         if batch.text is None:
             raise UserError(
@@ -150,7 +150,8 @@ class LearnedTokens(ConditionEncoder):
             self._rows[caption] = np.array(self.rows(caption), np.int64)
         rows = [self._rows[caption] for caption in numbers]
         lengths = np.array([len(words) for words in rows])
-        # The host computes what depends on values: the device would have to be waited for.
+        # The host computes everything that depends on values, because otherwise it would wait for
+        # the device.
         is_real = np.arange(lengths.max()) < lengths[:, None]
         of_caption = np.array([numbers[caption] for caption in batch.text])
         words, index, token_mask, of_sample = (

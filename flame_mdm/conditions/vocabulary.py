@@ -12,7 +12,7 @@ from flame_mdm.conditions.language.tokens import is_known
 from flame_mdm.errors import UserError, shortened
 
 WORD = re.compile(r"[^\W_]+")
-# Maximum number of training captions that a checkpoint keeps
+# Maximum number of training captions in a checkpoint
 MAX_CAPTIONS = 1000
 FUNCTION_WORDS = frozenset(
     WORD.findall(
@@ -23,7 +23,8 @@ FUNCTION_WORDS = frozenset(
 )
 """Function words, which do not say what happens.
 
-A text of only these words says nothing. A model that does not know them gives no warning.
+A text that contains only these words says nothing. No warning is given if a model does not know
+them.
 """
 NUMBERS = frozenset(
     [
@@ -64,10 +65,10 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
 
     The vector of a word is the sum of both rows.
 
-    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Words
+    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Two words
     are confused only if both parts are equal. The hash (CRC-32) is the same on every machine.
     """
-    # Two hashes of the word with different prefixes would not do: CRC is linear, so both would
+    # Two hashes of the word with different prefixes would not suffice: CRC is linear, so both would
     # collide together.
     number = zlib.crc32(word.encode())
     return number % buckets, number // buckets % buckets
@@ -105,7 +106,7 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
     if word in NUMBERS:  # "four" is not a form of "fours"
         return None
     stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
-    # The stem of "waving" is "wave"; the stem of "hopping" is "hop".
+    # The stem of "waving" is "wave", and the stem of "hopping" is "hop".
     stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
     forms = (
         stem + ending
@@ -166,11 +167,11 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     """Returns the question " Did you mean '...'?" for a text with unknown words.
 
-    The question quotes the text with known words in place of the unknown words. Without such
-    words, it quotes the nearest training caption that contains a content word of the text.
+    The question quotes the text with its unknown words replaced by known words. If there are no
+    such words, it quotes the nearest training caption that contains a content word of the text.
 
-    A word that is not English is replaced by a known word with a similar spelling. An English
-    word is replaced only by a known word with a similar meaning ("shelf" never becomes "she").
+    A word that is not English is replaced by a known word with a similar spelling. An English word
+    is replaced only by a known word with a similar meaning ("shelf" never becomes "she").
     """
     fixed = text.lower()
     for word in (unknown := unknown_words(text, facts)):
@@ -186,7 +187,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 
 
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
-    """Returns the known word that an unknown word probably stands for; None if there is none.
+    """Returns the known word for which an unknown word probably stands; None if there is none.
 
     The unknown word is a typo of the known word, or has a similar meaning.
     """
@@ -202,11 +203,11 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
     For example, "walks, turns left and waves. Then she sits" has four parts.
 
-    A text is split at ends of sentences and at "then". With `verbs`, it is also split at each
-    comma that a verb follows. After such a comma, "and" before a verb splits, too. Otherwise, it
-    does not: "raises both hands and waves" is one action. A part without a verb is joined with
-    its neighbor.
-    "In limp style" at the end, which adapters teach, is added to all parts.
+    A text is split at ends of sentences and at "then". With `verbs`, it is also split at each comma
+    that is followed by a verb. After such a comma, an "and" before a verb also splits the text.
+    Otherwise, "and" does not: "raises both hands and waves" is one action. A part without a verb is
+    joined with its neighbor. "In limp style" at the end, which adapters teach, is added to all
+    parts.
 
     Args:
         text: the sentence.
@@ -262,9 +263,9 @@ def plainest(captions: Iterable[str]) -> list[str]:
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
-    """Returns the captions that share the largest part of their words with a text, best first.
+    """Returns the captions that share the largest fraction of their words with a text, best first.
 
-    The list is empty if no caption shares a word.
+    The list is empty if no caption shares a word with the text.
     """
     prompt = set(words(text))
     content = prompt - FUNCTION_WORDS or prompt

@@ -11,8 +11,8 @@ class Denoiser(nn.Module, ABC):
     """Base class of all denoisers.
 
     A denoiser predicts the target of a process from a noisy motion. Subclasses take some of the
-    following arguments. `Parts.build` passes the first three, which depend on other parts. The
-    others come from the configuration.
+    following arguments. The first three depend on other parts, and `Parts.build` passes them. All
+    other arguments are set in the configuration.
 
     Args:
         in_features: D, the number of features of a frame.
@@ -36,8 +36,8 @@ class Denoiser(nn.Module, ABC):
         torch.Size([2, 5, 3])
     """
 
-    #: Whether padding has no influence on real frames. If False, the network attends to padding
-    #: and is sampled with the padded length of its training.
+    #: Whether padding has no influence on real frames. If False, the network attends to padding,
+    #: and sampling uses the padded length of the training.
     mask_padding: bool = True
 
     #: Number of clean frames before the motion that the network reads in `Condition.prefix`.
@@ -53,9 +53,9 @@ class Denoiser(nn.Module, ABC):
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time as a row of the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
-            cond: the condition. Dropped samples have the null condition already.
+            cond: the condition. Dropped samples already have the null condition.
 
         Raises:
-            UserError: If a motion is too long for the network, condition tokens are missing or
-                too many, or the prefix does not have `context_frames` frames.
+            UserError: If a motion is too long for the network, if condition tokens are missing or
+                too many, or if the prefix does not have `context_frames` frames.
         """

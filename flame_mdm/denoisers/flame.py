@@ -34,7 +34,7 @@ class FLAME(Denoiser):
         condition_frames: also add TS and CLS to every frame. A small network then learns to
             follow the text in fewer steps.
         length_unit: unit of the windows in training, in frames. ML embeds the length rounded down
-            to a multiple of it.
+            to a multiple of this unit.
 
     Example:
         >>> denoiser = FLAME(
@@ -70,7 +70,7 @@ class FLAME(Denoiser):
             condition_frames,
             length_unit,
         )
-        # A table of max_frames rows is enough for the lengths 1 to max_frames. Row 0, which the
+        # A table of max_frames rows is sufficient for the lengths 1 to max_frames. Row 0, which the
         # authors' code never reads, is used for the longest motion.
         self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
         self.input = nn.Linear(in_features, latent_dim)
@@ -123,7 +123,7 @@ class FLAME(Denoiser):
 def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
     """Embeds positions or times (N,) as (N, features) float32.
 
-    The first half are cosines, the second half sines.
+    The first half of the features are cosines, the second half sines.
     """
     half = features // 2
     frequency = torch.exp(

@@ -22,8 +22,8 @@ class MDMGRU(Denoiser):
         dropout: probability of dropout after the positions.
         project_condition: False adds the condition to the time without projection.
         recur_over_batch: recur from sample to sample instead of from frame to frame, as MDM's
-            released code does because of swapped axes. This is only for reproduction: results
-            then depend on the order of the batch.
+            released code does because of swapped axes. For reproduction only: results then depend
+            on the order of the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

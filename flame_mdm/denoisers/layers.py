@@ -1,4 +1,4 @@
-"""Layers shared by the denoisers: sinusoids, transformer, embedded time and condition."""
+"""Layers shared by the denoisers: sinusoids, transformer, and embedding of time and condition."""
 
 import math
 from collections.abc import Callable
@@ -13,8 +13,8 @@ from flame_mdm.errors import UserError
 def sinusoid(position: Tensor, features: int) -> Tensor:
     """Returns the sinusoids (N, features) of positions (Vaswani et al. 2017, section 3.5).
 
-    Even channels are sines, odd channels are cosines. They are computed in float32 for any
-    precision of the network, as in the training of the released weights.
+    Even channels are sines, odd channels are cosines. They are computed in float32, regardless of
+    the precision of the network, as in the training of the released weights.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
@@ -27,9 +27,9 @@ def with_prefix(mask: Tensor, prefix: int) -> Tensor:
 
 
 class Attention(nn.Module):
-    """Multi-head attention of x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
+    """Multi-head attention from x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), as in released weights. Self-attention then
+    Query, key and value share one matrix (3C, C), as in released weights, so that self-attention
     needs only one projection.
     """
 
@@ -76,7 +76,7 @@ class Attention(nn.Module):
 class TransformerLayer(nn.Module):
     """Self-attention, optional cross-attention and feed-forward, each followed by a norm.
 
-    The norm is after the residual sum.
+    The norm is applied after the residual sum.
     """
 
     def __init__(
@@ -120,9 +120,9 @@ class TransformerLayer(nn.Module):
 
 
 class Transformer(nn.Module):
-    """A stack of post-norm layers without causal mask.
+    """A stack of post-norm layers without a causal mask.
 
-    With cross-attention, it is a decoder, otherwise an encoder.
+    With cross-attention, it is a decoder; otherwise, it is an encoder.
     """
 
     def __init__(
@@ -163,7 +163,8 @@ class TimeAndCondition(nn.Module):
     """z_tk of MDM (Tevet et al. 2023, section 3).
 
     It is the sinusoid of the time after two linear layers, plus the projected condition. The null
-    condition is a zero vector *before* the projection, so only the projection's bias remains.
+    condition is a zero vector *before* the projection, so that only the bias of the projection
+    remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):

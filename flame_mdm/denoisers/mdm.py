@@ -25,9 +25,9 @@ class MDMEncoder(Denoiser):
         num_heads: number of attention heads; divides `latent_dim`.
         dropout: probability of dropout after the positions and inside the layers.
         project_condition: False adds the condition to the time without projection.
-        max_tokens: 0 = the pooled condition is added to the time. Otherwise, it is the maximum
-            number of condition tokens between the time and the frames (MFM with T5: 30). The
-            positions of the frames do not depend on the number of tokens.
+        max_tokens: maximum number of condition tokens between the time and the frames (MFM with T5:
+            30). 0 = no tokens; the pooled condition is added to the time instead. The positions of
+            the frames do not depend on the number of tokens.
         mask_padding: False lets frames attend to padding, as in the released models of MDM and
             MFM. Motions are then sampled with the padded length of training, and cropped.
         condition_frames: also add time + condition (with `max_tokens`, only the time) to every
@@ -72,7 +72,7 @@ class MDMEncoder(Denoiser):
         """See `Denoiser.forward`.
 
         Raises:
-            UserError: If `max_tokens` is above 0 and there are no tokens, or too many.
+            UserError: If `max_tokens` is above 0, and tokens are missing or too many.
         """
         token_mask = mask[:, :0]
         if self.max_tokens:
@@ -115,13 +115,13 @@ class MDMDecoder(Denoiser):
         num_heads: number of attention heads; divides `latent_dim`.
         dropout: probability of dropout after the positions and inside the layers.
         project_condition: False adds the condition to the time without projection.
-        input_token: token before the frames. "condition" is time + condition, as in the paper's
-            "+ input token" and in the released model. "time" is the time alone, as in MDM's code
-            since February 2025.
+        input_token: token before the frames. "condition" is time + condition, as in the paper's "+
+            input token" and in the released model. "time" is only the time, as in MDM's code since
+            February 2025.
         token_memory: use all condition tokens as memory and add the time to each of them, as MDM
             does with DistilBERT.
-        memory: how the time enters the memory of all tokens. "add": it is added to each token;
-            "concat": it is a token before them.
+        memory: how the time enters a memory of all tokens. "add": the time is added to each token.
+            "concat": the time is a token before them.
         mask_padding: False lets frames attend to padding, as in the released models without
             `mask_frames`.
         context_frames: number of clean frames before the motion, in `Condition.prefix`.
@@ -233,7 +233,7 @@ class MDMDecoder(Denoiser):
         return torch.cat([cond.prefix.to(x_t), x_t], 1)
 
     def _memory(self, time: Tensor, cond: Condition) -> tuple[Tensor, Tensor | None]:
-        """Returns the memory (B, S, C) and its mask (B, S); None = all are real.
+        """Returns the memory (B, S, C) and its mask (B, S); None = all entries are real.
 
         Args:
             time: (B, C), embedded times.
@@ -250,7 +250,7 @@ class MDMDecoder(Denoiser):
 
 
 def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
-    """Returns the tokens (B, S, C) and their mask (B, S). Raises `UserError` without tokens."""
+    """Returns the tokens (B, S, C) and their mask (B, S). Raises `UserError` if there are no tokens."""
     if cond.token_mask is None or not cond.tokens.shape[1]:
         raise UserError(
             "this denoiser needs condition tokens, but the condition encoder has none: choose another one"

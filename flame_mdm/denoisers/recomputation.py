@@ -1,4 +1,4 @@
-"""Activation checkpointing: the backward pass computes the inside of layers again."""
+"""Activation checkpointing: the backward pass recomputes the activations inside layers."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,16 +10,16 @@ from torch.utils.checkpoint import checkpoint
 
 
 def stacked_layers(denoiser: nn.Module) -> list[nn.Module]:
-    """Returns the layers of a denoiser that are stacked: all members of its `nn.ModuleList`s."""
+    """Returns the stacked layers of a denoiser: all members of its `nn.ModuleList`s."""
     stacks = [module for module in denoiser.modules() if isinstance(module, nn.ModuleList)]
     return [layer for stack in stacks for layer in stack]
 
 
 def recompute_activations(denoiser: nn.Module) -> None:
-    """Makes the backward pass compute the inside of stacked layers again instead of keeping it.
+    """Makes the backward pass recompute the activations inside stacked layers instead of storing them.
 
-    Only the inputs of the layers are kept, which takes less memory and about a third more operations
-    (Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost"). Random draws are
+    Only the inputs of the layers are stored, which takes less memory and about a third more
+    operations (Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost"). Random draws are
     repeated, so that the gradients are the same, bit for bit.
     """
     for layer in stacked_layers(denoiser):

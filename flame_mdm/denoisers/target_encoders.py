@@ -1,7 +1,7 @@
 """Encoders of target conditions: where joints should be at the end of a motion.
 
-Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) has a slot per joint. Each slot is x, y, z,
-and 1 = requested or 0 = free.
+Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) contains one slot per joint. Each slot is x,
+y, z, and a flag, which is 1 if the joint is requested and 0 if it is free.
 """
 
 from abc import ABC, abstractmethod
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.errors import UserError
 
-# Number of slots of a target: six joints, the place on the floor and the heading; see
+# Number of slots of a target: six joints, the position on the floor and the heading; see
 # `flame_mdm.conditions.target`
 SLOTS = 8
 
@@ -20,8 +20,8 @@ SLOTS = 8
 class TargetEncoder(nn.Module, ABC):
     """Embeds the target of a condition as (B, features). Without a target, the embedding is 0.
 
-    A target that requests no joint differs from no target: the biases of the network are in its
-    embedding.
+    A target that requests no joint differs from no target, because its embedding contains the
+    biases of the network.
 
     Example:
         >>> encoder = SingleTarget(features=16, layers=1)
@@ -54,7 +54,7 @@ class SingleTarget(TargetEncoder):
 
 
 class SplitTarget(TargetEncoder):
-    """One network per slot; their outputs are concatenated."""
+    """One network per slot, whose outputs are concatenated."""
 
     def __init__(self, features: int, layers: int):
         super().__init__()

@@ -21,9 +21,9 @@ from flame_mdm.errors import UserError
 class MDMUNet(Denoiser):
     """U-Net over time, for motions of any length. The features of a frame are channels.
 
-    Padding does not affect real frames. Padded frames are set to 0 before every convolution, as
-    if the motion ended there, and are excluded from the statistics of the norms. A frame of a
-    coarser level is real if the first of its two finer frames is real.
+    Padding does not affect real frames. Padded frames are set to 0 before every convolution, as if
+    the motion ended there, and are excluded from the statistics of the norms. A frame of a coarser
+    level is real if the first of its two finer frames is real.
 
     Args:
         in_features: D.
@@ -111,7 +111,7 @@ class ResidualBlock(nn.Module):
         )
 
     def forward(self, x: Tensor, token: Tensor, mask: Tensor) -> Tensor:
-        """Returns (B, out_channels, F).
+        """Returns the output (B, out_channels, F).
 
         Args:
             x: (B, in_channels, F), the input.

@@ -13,9 +13,9 @@ from flame_mdm.processes.samplers import Sampler
 from flame_mdm.sampler_options import SamplerOptions
 
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
-"""The function (x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> losses by name.
+"""Signature of additional losses: (x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> losses by name.
 
-The losses (B,) of the clean estimate x0_hat are weighted; there is one per sample.
+Each loss (B,) of the clean estimate x0_hat is weighted, with one value per sample.
 """
 
 
@@ -23,9 +23,9 @@ class Process(nn.Module, ABC):
     """Base class of generative processes: paths between noise and data.
 
     Subclasses are Gaussian diffusion and flow matching. A process corrupts motions in training,
-    defines what the denoiser predicts, and samples motions from noise. Only the process
-    interprets the time t; the denoiser just embeds it. B is the batch size, F the number of
-    frames, D the number of features.
+    defines what the denoiser predicts, and samples motions from noise. Only the process interprets
+    the time t; the denoiser only embeds it. B is the batch size, F the number of frames, and D the
+    number of features.
 
     Example:
         >>> import torch
@@ -42,7 +42,7 @@ class Process(nn.Module, ABC):
     #: What the denoiser returns: "x0" (the clean motion), "epsilon" (the noise) or "velocity".
     prediction: str
 
-    #: Modes of `Edit` that sampling supports. The first is the mode of the authors.
+    #: Modes of `Edit` that sampling supports. The first mode is the authors' mode.
     edit_modes: Sequence[str] = ()
 
     #: Samplers by name.
@@ -64,9 +64,9 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Returns the noisy motion x_t (B, F, D) at times t (B,).
+        """Computes the noisy motion x_t (B, F, D) at times t (B,).
 
-        The noisy motion is computed from the clean motion `x` and `noise` (B, F, D).
+        It is computed from the clean motion `x` and `noise` (B, F, D).
         """
 
     @abstractmethod
@@ -95,7 +95,7 @@ class Process(nn.Module, ABC):
     def grid(self, count: int) -> list[float]:
         """Returns `count` evenly spaced times from pure noise to one interval before the data.
 
-        There are at most as many as the process has times.
+        If the process has fewer than `count` times, all of them are returned.
         """
 
     def loss(
@@ -118,7 +118,7 @@ class Process(nn.Module, ABC):
             cond: conditions of the batch.
             t: (B,) times. Default: drawn from torch's default generator.
             noise: (B, F, D). Default: drawn from torch's default generator.
-            auxiliary: further losses of the clean estimate, such as
+            auxiliary: additional losses of the clean estimate, such as
                 `flame_mdm.losses.MotionLosses`.
 
         Returns:
@@ -164,7 +164,7 @@ class Process(nn.Module, ABC):
 
         Args:
             denoise: the denoiser, with or without guidance; `options.guidance_scale` is ignored.
-            noise: function that returns the draw with a number 0, 1, 2, ..., (B, F, D). Sampling
+            noise: function from the number of a draw (0, 1, 2, ...) to noise (B, F, D). Sampling
                 starts from draw 0.
             mask: (B, F) bool, True = real frame.
             cond: conditions of the batch.
@@ -174,7 +174,7 @@ class Process(nn.Module, ABC):
                 denoiser.
 
         Returns:
-            Normalized motion (B, F, D); frames past the end of a motion are 0.
+            Normalized motion (B, F, D). Frames past the end of a motion are 0.
 
         Raises:
             UserError: If the process does not support the sampler, the number of steps or the
@@ -185,7 +185,7 @@ class Process(nn.Module, ABC):
         """Returns the requested sampler.
 
         Raises:
-            UserError: If there is no such sampler, or it lacks one of the options.
+            UserError: If there is no such sampler, or if it lacks one of the options.
         """
         name = options.sampler
         if name is None or name not in self.samplers:

@@ -1,8 +1,8 @@
-"""Consistency distillation: a student learns to do many small steps of its teacher in one call.
+"""Consistency distillation: a student learns to take many small steps of its teacher in one call.
 
-f(x_t, t) is the clean estimate of a network at time t. Along a path of the teacher, f should be
-the same at all times (Song et al. 2023, "Consistency Models"). The teacher's steps are guided, so
-the student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
+f(x_t, t) is the clean estimate of a network at time t. Along a path of the teacher, f should be the
+same at all times (Song et al. 2023, "Consistency Models"). The teacher's steps are guided, so the
+student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
 "MotionLCM").
 """
 
@@ -31,14 +31,15 @@ def consistency_terms(
     """Computes the losses of a student.
 
     The student's estimate at x_t is compared with an estimate after one step of the teacher. The
-    step is DDIM's with eta = 0, or Euler's for a flow. After the last time of the grid, the
-    target is the teacher's own estimate of the data.
+    step is a DDIM step with eta = 0 or, for a flow, an Euler step. After the last time of the grid,
+    the target is the teacher's own estimate of the data.
 
     Args:
-        process: process of student and teacher; it predicts the clean motion or the velocity.
+        process: process of the student and the teacher. It predicts the clean motion or the
+            velocity.
         student: the network to train.
-        follower: computes the target, the estimate after the step, without gradient. It is the
-            student or an average of its weights.
+        follower: the network that computes the target, the estimate after the step, without
+            gradient. It is the student or an average of its weights.
         teacher: the guided teacher.
         x: (B, F, D) normalized clean motion.
         mask: (B, F) bool, True = real frame.
@@ -49,8 +50,7 @@ def consistency_terms(
         auxiliary: geometric losses of the estimate against the target.
 
     Returns:
-        Losses (B,) per sample by name: "consistency", the auxiliary losses, and "loss", their
-        sum.
+        Losses (B,) per sample by name: "consistency", the auxiliary losses, and "loss", their sum.
     """
     # The step follows the teacher's path to the next time, from the teacher's clean estimate and
     # the noise that this estimate implies.

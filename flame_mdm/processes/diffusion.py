@@ -22,39 +22,39 @@ from flame_mdm.sampler_options import SamplerOptions
 class GaussianDiffusion(Process):
     """Gaussian diffusion over T steps, the process of MDM and FLAME (Ho et al. 2020).
 
-    The time t is the step 0 ... T - 1 as a float. The denoiser gets it unchanged. x_t =
-    sqrt(ab) x + sqrt(1 - ab) noise, where ab ("alpha bar") comes from the schedule.
+    The time t is the step 0 ... T - 1 as a float, and is passed to the denoiser unchanged. x_t =
+    sqrt(ab) x + sqrt(1 - ab) noise, where ab ("alpha bar") is given by the schedule.
 
     Args:
         num_train_timesteps: T.
         schedule: name of the noise schedule, "cosine" or "linear".
-        prediction: what the first D channels of the denoiser's output are: the clean motion, the
+        prediction: content of the first D channels of the denoiser's output: the clean motion, the
             noise, or the velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
         variance: variance of the reverse process. "fixed_small" is the variance of the posterior.
-            "fixed_large" is beta. "learned_range" is between the two and learned, from D more
-            channels (Nichol and Dhariwal 2021, eq. 15).
+            "fixed_large" is beta. "learned_range" is between the two, and is learned from D
+            additional channels (Nichol and Dhariwal 2021, eq. 15).
         vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is
             learned. L_vlb is a sum over T steps, so it is T times the term of one step. The value
-            0.001 at T = 1000 (Nichol and Dhariwal) is 1 in FLAME's code.
+            0.001 at T = 1000 (Nichol and Dhariwal) corresponds to 1 in FLAME's code.
         average_padding: average losses over the padded length with zero noise in the padding, as
             in FLAME's code. Short motions then have less weight. The denoiser must return 0 in
             the padding.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
         timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
-        skip: requires prediction epsilon. The noise is sqrt(1 - ab) x_t + sqrt(ab) times the
-            output (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a
-            velocity, trained with the error of the noise. The network need not pass its input
-            through, and computing the clean estimate needs no division by the signal.
-        min_snr: weight the squared error of each step as if the clean motion was predicted with
-            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1 for
-            every prediction.
-        noise_scale: factor of the ratio of noise to signal at each step. With 263 features that
-            depend on each other, the text matters only at high noise. A factor above 1 gives more
+        skip: only for prediction epsilon. The noise is sqrt(1 - ab) x_t + sqrt(ab) times the output
+            (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a velocity,
+            trained with the error of the noise. The network need not pass its input through, and
+            the clean estimate is computed without division by the signal.
+        min_snr: weight the squared error of each step as if the clean motion were predicted with
+            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4, who use 5). None = weight 1 for every
+            prediction.
+        noise_scale: factor of the noise-to-signal ratio at each step. With 263 features that depend
+            on each other, the text is informative only at high noise. A factor above 1 assigns more
             steps to high noise (Hoogeboom et al. 2023, section 2.2).
 
     Raises:
-        UserError: If T or `noise_scale` is out of range, `skip` is combined with another
-            prediction, or `min_snr` is not above 0.
+        UserError: If T or `noise_scale` is out of range, if `skip` is combined with another
+            prediction, or if `min_snr` is not above 0.
 
     Example:
         >>> import torch
@@ -142,7 +142,7 @@ class GaussianDiffusion(Process):
     ) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`.
 
-        A fixed log-variance is a number or (B, 1, 1); a learned one is (B, F, D).
+        A fixed log-variance is a number or (B, 1, 1). A learned log-variance is (B, F, D).
         """
         # The logarithm of a learned variance is interpolated between its two bounds.
         small = schedule.factor("posterior_log_variance", i, x_t)
@@ -214,8 +214,8 @@ class GaussianDiffusion(Process):
     ) -> Tensor:
         """See `Process.sample`. The denoiser is called once per step.
 
-        Draws of noise are numbered in the order of their use. `options.num_inference_steps` is a
-        number of steps from 2 to T, which `options.spacing` places, or a list of steps in
+        Draws of noise are numbered in the order of their use. `options.num_inference_steps` is
+        either a number of steps from 2 to T, placed by `options.spacing`, or a list of steps in
         increasing order. The sampler "consistency" takes 1 to T steps of `grid`. An edit of mode
         "x0" reproduces the kept part exactly.
         """

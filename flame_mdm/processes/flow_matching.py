@@ -15,22 +15,23 @@ from flame_mdm.sampler_options import SamplerOptions
 class FlowMatching(Process):
     """Straight path from noise at t = 0 to motion at t = 1, the process of MFM.
 
-    Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser predicts the velocity of the path or
-    the clean motion. The denoiser gets the time 1000 t. With s = `sigma_min`, x_t = t x + (1 - (1
-    - s) t) noise, and the velocity is x - (1 - s) noise.
+    Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser gets the time 1000 t, and predicts the
+    velocity of the path or the clean motion. With s = `sigma_min`, x_t = t x + (1 - (1 - s) t)
+    noise, and the velocity is x - (1 - s) noise.
 
     Args:
-        sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
-        prediction: output of the denoiser: the velocity of the path (MFM) or the clean motion.
-            The velocity is computed from the clean motion. A network narrower than the motion
-            cannot represent the noise in the velocity.
+        sigma_min: standard deviation of the noise that is left at t = 1 (Lipman et al. 2023, eq.
+            20-23).
+        prediction: output of the denoiser: the velocity of the path (MFM) or the clean motion, from
+            which the velocity is computed. A network narrower than the motion cannot represent the
+            noise in the velocity.
         time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a
             normal variable, which favors the middle (Esser et al. 2024, eq. 19).
         quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's
             code.
         odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in
-            MFM's code. For some N, the row of a time in the table is then one lower than with N
-            equal steps. This never happens for N = 10, 20 or 30.
+            MFM's code. For some N, the table row of a time is then lower by one than with N equal
+            steps. This never happens for N = 10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).
@@ -126,13 +127,12 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. A flow takes N >= 1 equal steps; "dopri5" chooses its own steps.
+        """See `Process.sample`. A flow takes N >= 1 equal steps, except that "dopri5" chooses its own steps.
 
-        Only "consistency" adds noise. An edit of mode "trajectory" acts before each step at a
-        time <= `until`. The straight path from the noise of the kept part to the known motion
-        then replaces the kept part (MFM, algorithm 1). After this time, the model changes the
-        kept part freely. Mode "x0" overwrites the clean estimate of every call, which reproduces
-        the kept part exactly.
+        Only "consistency" adds noise. An edit of mode "trajectory" is applied before each step at a
+        time <= `until`: the kept part is replaced by the straight path from its noise to the known
+        motion (MFM, algorithm 1). After this time, the model changes the kept part freely. Mode
+        "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):

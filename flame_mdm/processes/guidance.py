@@ -1,4 +1,4 @@
-"""Guidance by a condition, and guidance by positions in the world."""
+"""Guidance by a condition, and guidance by world positions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ STEERING_STEPS = 2
 STEERING_LIMIT = 0.02
 """Maximum length of a gradient step, as RMS over normalized features.
 
-If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noisy motions of the
-training. In one trial, arms became longer by a third.
+If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noisy motions in
+training. In one experiment, arms became longer by a third.
 """
 CLOSE, MOST_STEPS = 0.005, 8
 """Limits of the search for a motion that reaches positions.
 
-It ends when the error is below `CLOSE` meters, or after `MOST_STEPS` steps.
+The search ends when the error is below `CLOSE` meters, or after `MOST_STEPS` steps.
 """
 RELAXATION = 1e-3
-"""Variance of the error that may remain, relative to the variance of the position.
+"""Variance of the remaining error, relative to the variance of the position.
 
-It limits the changes.
+It limits the size of the changes.
 """
 
 
@@ -37,14 +37,14 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
     MDM and FLAME (eq. 5) use, scale 1 means no guidance.
 
     Args:
-        denoise: the denoiser; its condition must have a null.
-        scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise`
-            itself is returned.
-        features: D. Channels from D on contain a learned variance. These channels are not guided,
-            but come from the conditional half.
+        denoise: the denoiser; its condition must have a null condition.
+        scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise` itself
+            is returned.
+        features: D. Channels from D on contain a learned variance. These channels are not guided;
+            they are taken from the conditional half.
 
     Returns:
-        A function with the arguments and the result of `denoise`.
+        A function with the same arguments and result as `denoise`.
 
     Example:
         >>> null = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
@@ -79,7 +79,7 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
 @dataclass
 class Positions:
-    """M coordinates of joints in the world that a motion should reach.
+    """M coordinates of world joint positions that a motion should reach.
 
     Attributes:
         frames: (M,) int64, indices of the frames.
@@ -94,7 +94,7 @@ class Positions:
     values: Tensor
 
     def of(self, joints: Tensor) -> Tensor:
-        """Returns the values (..., M) that a motion (..., F, J, 3) has at these coordinates."""
+        """Returns the values (..., M) of these coordinates in a motion (..., F, J, 3)."""
         return joints[..., self.frames, self.joints, self.axes]
 
 
@@ -104,7 +104,7 @@ def steer(
     to_joints: Callable[[Tensor], Tensor],
     positions: Positions,
 ) -> Tensor:
-    """Leads noisy motions toward positions in the world.
+    """Leads noisy motions toward world positions.
 
     Each step follows the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
     sampling"), so the entire body moves with the joints in a way that is plausible to the
@@ -117,9 +117,9 @@ def steer(
         positions: the positions.
 
     Returns:
-        Noisy motions (B, F, D) with clean estimates that are nearer to the positions.
+        Noisy motions (B, F, D) whose clean estimates are closer to the positions.
     """
-    # Polyak's step: if the loss was linear, it would be 0 after the distance loss / slope.
+    # Polyak's step: if the loss were linear, it would be 0 after the distance loss / slope.
     for _ in range(STEERING_STEPS):
         with torch.enable_grad():
             x = x_t.detach().requires_grad_()
@@ -139,7 +139,7 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` that have joints at given positions in the world.
+    """Returns the motions nearest to `x` whose joints are at given world positions.
 
     Each Gauss-Newton step takes the smallest change of the normalized features that reaches the
     positions. A Gaussian-process prior keeps the change smooth in time. In the frames of the
@@ -151,8 +151,8 @@ def reach(
         x: (B, F, D) normalized motions.
         to_joints: converts normalized features (F, D) to joints (F, J, 3) in meters.
         positions: the positions.
-        bones: (3, N) int64: frame, parent and child of bones that the change could stretch. Each
-            frame has all bones.
+        bones: (3, N) int64: frame, parent and child of the bones whose length the change could
+            affect. All bones are listed for each frame.
         free: (B, F, D) bool, True = this feature may change.
         smoothness: standard deviation of the Gaussian process, in frames.
 

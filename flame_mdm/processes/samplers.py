@@ -1,8 +1,8 @@
 """Samplers: functions that take one step from noise toward motion, with their capabilities.
 
-Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, the samplers
-get the clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field.
-Coefficients and times are Python numbers, so no step waits for the device.
+Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they get the
+clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field. Coefficients
+and times are Python numbers, so that no step waits for the device.
 """
 
 import math
@@ -17,7 +17,7 @@ from flame_mdm.processes.schedules import Schedule
 from flame_mdm.sampler_options import SamplerOptions
 
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
-"""The function (x_t (B, F, D), step i) -> clean estimate (B, F, D), log-variance of x_{t-1}.
+"""Signature: (x_t (B, F, D), step i) -> clean estimate (B, F, D), log-variance of x_{t-1}.
 
 The log-variance is a number or (B, F, D).
 """
@@ -34,10 +34,10 @@ class Sampler:
         ('spacing', 'eta')
     """
 
-    #: Takes one step. In a diffusion: (x_t, `Descent`, step i) -> x_{t-1}. In a flow: (x, `Flow`,
-    #: time, next time) -> x at the next time.
+    #: Takes one step. Diffusion: (x_t, `Descent`, step i) -> x_{t-1}. Flow: (x, `Flow`, time, next
+    #: time) -> x at the next time.
     step: Callable[..., Tensor]
-    #: Fields of `SamplerOptions` that the sampler uses, besides guidance_scale, sampler and
+    #: Fields of `SamplerOptions` that the sampler uses, in addition to guidance_scale, sampler and
     #: num_inference_steps.
     options: tuple[str, ...] = ()
     #: Edits that the sampler does not support: modes of `Edit`, or "resample".
@@ -107,8 +107,8 @@ def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
 def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
     """Takes a step of DDIM.
 
-    It is deterministic with eta = 0 (the default) and as random as `ancestral` with eta = 1.
-    Source: Song et al. 2021, eq. 12 and 16 (non-Markovian sampling).
+    The step is deterministic with eta = 0 (the default), and as random as a step of `ancestral`
+    with eta = 1. Source: Song et al. 2021, eq. 12 and 16 (non-Markovian sampling).
 
     Args:
         x: (B, F, D) noisy motion at step i.
@@ -140,8 +140,8 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
 def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
     """Takes a step of DPM-Solver++ (2M), a deterministic multistep solver of order 2.
 
-    It calls the denoiser once per step. The first step has order 1, since there is no history.
-    The last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
+    It calls the denoiser once per step. The first step has order 1, because there is no previous
+    step. The last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
 
     Args:
         x: (B, F, D) noisy motion at step i.
@@ -162,8 +162,8 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
         [[[1.0, 1.0]]]
     """
     # The time is half the logarithm of the signal-to-noise ratio. With this time, the linear part
-    # of the equation is solved exactly. The clean estimate remains under the integral. It is
-    # extrapolated from this step and the previous step.
+    # of the equation is solved exactly. The remaining integral contains the clean estimate, which
+    # is extrapolated from this step and the previous step.
     schedule, last = run.schedule, run.last
     x0_hat, _ = run.estimate(x, i)
     run.last = x0_hat
@@ -182,7 +182,7 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
 def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
     """Estimates the clean motion and adds new noise for the next step.
 
-    This is how distilled models are sampled. Source: Song et al. 2023, "Consistency Models",
+    This is the sampler of distilled models. Source: Song et al. 2023, "Consistency Models",
     algorithm 1.
 
     Args:
@@ -209,10 +209,10 @@ def blended(
 ) -> Tensor:
     """Samples with an edit of mode "x_t".
 
-    At each step, the known motion with the current amount of noise replaces the kept part. With
-    the blend "after", the kept part of the first x_t has the noise of the start, as if a step had
-    been blended before. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step after adding
-    its noise again.
+    At each step, the known motion with the current amount of noise replaces the kept part. With the
+    blend "after", the kept part of the first x_t has the noise of the start, as if a previous step
+    had been blended. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step after adding its
+    noise again.
 
     Args:
         sampler: a diffusion sampler.
@@ -345,8 +345,8 @@ def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     """Integrates with adaptive steps of order 5 (Dormand and Prince 1980).
 
-    As in MFM, rtol = atol = 1e-5. The error is measured over the entire batch, so a motion varies
-    with the other motions in its batch, but only within the tolerance. The last step may go
+    As in MFM, rtol = atol = 1e-5. The error is measured over the entire batch. Therefore, a motion
+    depends on the other motions in its batch, but only within the tolerance. The last step may go
     beyond the last time; the solver then interpolates back.
 
     Args:
@@ -372,7 +372,7 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def consistency_flow(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Goes straight to the data and adds new noise for the next time; see `consistency`.
+    """Jumps to the data and adds new noise for the next time; see `consistency`.
 
     Args:
         x: (B, F, D) motion at time t.

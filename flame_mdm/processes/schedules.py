@@ -35,8 +35,8 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns the noise variances (T,) float64 of Ho et al. 2020, section 4.
 
-    The variances rise from 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T, so
-    that the final noise is the same, as in guided-diffusion. All variances are clipped at 0.999.
+    The variances increase from 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T,
+    so that the final noise is the same, as in guided-diffusion. All variances are clipped at 0.999.
 
     Example:
         >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]
@@ -52,7 +52,7 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
 def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
     """Returns noise variances (T,) with more noise.
 
-    At each step, the ratio of noise to signal is multiplied by `noise_scale`. This shifts the
+    At each step, the noise-to-signal ratio is multiplied by `noise_scale`. This shifts the
     logarithm of the signal-to-noise ratio (Hoogeboom et al. 2023, "simple diffusion", section 2.2).
     The variances are clipped at 0.999.
 
@@ -69,11 +69,11 @@ def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
 
 
 class Schedule:
-    """Coefficients of a Gaussian diffusion, by step i = 0 (least noise) to N - 1.
+    """Coefficients of a Gaussian diffusion, by step i from 0 (least noise) to N - 1.
 
-    Tables are float64 on the CPU and rounded once, when they are used. The tables are not
-    buffers: casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al.
-    2020, eq. 4 and 7.
+    Tables are float64 on the CPU, and are rounded once, when they are used. They are not buffers,
+    because casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020,
+    eq. 4 and 7.
 
     Args:
         betas: (N,) float64, variances of the noise that each step adds.
@@ -89,8 +89,8 @@ class Schedule:
         alphas_cumprod = (1 - betas).cumprod(0)
         previous = torch.cat([betas.new_ones(1), alphas_cumprod[:-1]])
         posterior_variance = betas * (1 - previous) / (1 - alphas_cumprod)
-        # The posterior of step 0 has variance 0 and therefore an infinite logarithm. The
-        # logarithm of step 1 replaces it (Nichol and Dhariwal 2021).
+        # The posterior of step 0 has variance 0 and therefore an infinite logarithm, which is
+        # replaced by the logarithm of step 1 (Nichol and Dhariwal 2021).
         clipped = torch.cat([posterior_variance[:2][-1:], posterior_variance[1:]])
         self.tables = {
             "betas": betas,
@@ -132,7 +132,7 @@ class Schedule:
         return self.number(name, i) if isinstance(i, int) else self.at(name, i, x)
 
     def respace(self, steps: list[int]) -> "Schedule":
-        """Returns the schedule for some of the steps, given in increasing order.
+        """Returns the schedule for a subset of the steps, given in increasing order.
 
         Source: Nichol and Dhariwal 2021, section 4.
         """
@@ -159,10 +159,10 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
     Args:
         name: "cosine" or "linear".
         num_train_timesteps: T, 2 to `MAX_STEPS`.
-        noise_scale: see `with_more_noise`; 1 = the schedule itself.
+        noise_scale: see `with_more_noise`; 1 = unchanged.
 
     Raises:
-        UserError: If the number of steps is out of range, or `noise_scale` is not above 0.
+        UserError: If the number of steps is out of range, or if `noise_scale` is not above 0.
 
     Example:
         >>> len(build_schedule("linear", 50))
@@ -188,16 +188,16 @@ def timesteps(
     Args:
         num_train_timesteps: T.
         num_inference_steps: N, 1 to T.
-        spacing: "linspace" includes both ends and rounds half to even. It is "N" in the code of
-            MDM and FLAME, after Nichol and Dhariwal 2021. "stride" counts from 0 with the
+        spacing: "linspace" includes both ends and rounds half to even. It is called "N" in the code
+            of MDM and FLAME, after Nichol and Dhariwal 2021. "stride" counts from 0 with the
             smallest integer stride that gives N steps, so the noisiest step may be well below T -
-            1. It is "ddimN" in their code, after Song et al. 2021.
+            1. It is called "ddimN" in their code, after Song et al. 2021.
 
     Returns:
         N increasing steps from 0 ... T - 1.
 
     Raises:
-        UserError: If N is out of range, or no stride gives N steps.
+        UserError: If N is out of range, or if no stride gives N steps.
 
     Example:
         >>> timesteps(1000, 5), timesteps(1000, 5, "stride")
@@ -216,7 +216,7 @@ def timesteps(
             f"no stride gives {count} of {total} steps: choose another number or spacing=linspace"
         )
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
-    # This is a running sum, not i * stride, because its rounding decides ties. The released
+    # This is a running sum instead of i * stride, because its rounding decides ties. The released
     # models were sampled at these steps.
     steps, position = [], 0.0
     for _ in range(count):

@@ -1,9 +1,9 @@
-"""Long motions from overlapping windows: a wrapper with the same interface as the denoiser.
+"""Long motions from overlapping windows: a wrapper with the interface of a denoiser.
 
 At each sampling step, the denoiser processes all windows of a motion in one batch, each with its
-own condition. Their outputs are averaged where windows overlap (Bar-Tal et al. 2023,
+own condition. The outputs are averaged where windows overlap (Bar-Tal et al. 2023,
 "MultiDiffusion"; Zhang et al. 2023, "DiffCollage"). For equal x_t and t, outputs are affine in the
-clean estimate, so this blends the clean estimates.
+clean estimate, so averaging them also blends the clean estimates.
 """
 
 from collections.abc import Sequence
@@ -65,10 +65,11 @@ def spans(
         lengths: number of frames of each part.
         longest: maximum number of frames of a window.
         overlap: number of frames that neighboring windows share, an even number.
-        loop: whether the first part follows the last one. Windows may then begin before frame 0.
+        loop: whether the last part is followed by the first one. Windows may then begin before
+            frame 0.
 
     Returns:
-        Part, first frame and number of frames of each window.
+        Index of the part, first frame and number of frames of each window.
 
     Example:
         >>> spans([10, 10], longest=16, overlap=4)
@@ -98,8 +99,8 @@ def cover(
     """Returns the frames and weights of windows, without conditions.
 
     The weight of a window rises over the overlap at its start and falls over the overlap at its
-    end. Past its end, a window contains the next frames of the motion. The last frame of a motion
-    is followed by its first frame.
+    end. Past its end, a window contains the following frames of the motion. The last frame of a
+    motion is followed by its first frame.
 
     Args:
         windows: W windows, each as the index of its motion, its first frame and its number of

@@ -17,7 +17,7 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set. The frames can be read in parts, any number of times."""
+    """The frames (N, D) of a data set. They can be read in parts, any number of times."""
 
     # Returns arrays (F, D) of any length, in the same order each time
     arrays: Callable[[], Iterable[np.ndarray]]
@@ -29,7 +29,7 @@ class Frames:
     def split(self, size: int) -> Iterator[Tensor]:
         """Yields consecutive parts (size, D), like `Tensor.split`.
 
-        The last one may be shorter.
+        The last part may be shorter.
         """
         pending: list[np.ndarray] = []
         for array in self.arrays():
@@ -45,10 +45,10 @@ class Frames:
 class Representation(nn.Module, ABC):
     """Base class of all representations: conversions of motions to features and back.
 
-    Mean and std are buffers, so sampling needs no data set.
+    Mean and std are buffers, so that sampling needs no data set.
 
     Args:
-        name: name in stores and checkpoints. Features with different names are never mixed.
+        name: name in stores and checkpoints. Features with different names are never combined.
         features: D, the number of features of a frame.
         fps: frames per second, 1 to 1000.
         skeleton: the skeleton of the decoded joints.
@@ -75,10 +75,10 @@ class Representation(nn.Module, ABC):
     mean: Tensor
     #: (D,) standard deviation of the features.
     std: Tensor
-    #: Name of a longer representation that begins with these features, so that its features can
-    #: be cut to these.
+    #: Name of a longer representation that begins with these features, so that its features can be
+    #: cut to them.
     part_of: str = ""
-    #: Whether the root moves by steps between frames. Any window of frames is then a motion.
+    #: Whether the root moves by steps between frames. If so, any window of frames is a motion.
     relative: bool = True
     #: Columns of the features by name.
     slices: Mapping[str, slice] = {}
@@ -101,14 +101,14 @@ class Representation(nn.Module, ABC):
         """Encodes a raw motion as features (F', D) float32 in the data's units."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions. Subclasses may do so in one pass."""
+        """Encodes several motions. Subclasses may encode them in one pass."""
         return [self.encode(motion) for motion in motions]
 
     @abstractmethod
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3).
 
-        Joints are in meters, y up. The decoding is differentiable.
+        The joints are in meters, y up. The decoding is differentiable.
         """
 
     def rotations6d(self, features: Tensor) -> Tensor:
@@ -141,9 +141,9 @@ class Representation(nn.Module, ABC):
         return mask
 
     def contacts(self, features: Features) -> Features | None:
-        """Returns columns (..., F, N) for contacts of `skeleton.feet` with the floor.
+        """Returns the columns (..., F, N) for contacts of `skeleton.feet` with the floor.
 
-        Values are about 0 to 1. Returns None if the features contain no contacts.
+        The values are about 0 to 1. Returns None if the features contain no contacts.
         """
         columns = self.slices.get("contacts")
         return None if columns is None else features[..., columns]
@@ -151,7 +151,7 @@ class Representation(nn.Module, ABC):
     def rebase(self, features: Features) -> Features:
         """Adapts features (..., F, D) of cuts, so that they start like complete motions.
 
-        By default, returns them unchanged.
+        By default, the features are returned unchanged.
         """
         return features
 
@@ -166,7 +166,7 @@ class Representation(nn.Module, ABC):
     def to_joints(self, x: Tensor) -> Tensor:
         """Decodes normalized features (..., F, D) to joints (..., F, J, 3).
 
-        Joints are in meters, y up. The decoding is differentiable.
+        The joints are in meters, y up. The decoding is differentiable.
         """
         return self.decode(self.denormalize(x))
 
@@ -178,8 +178,8 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
         raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
 
 
-# Smallest standard deviation of a group of features that is not constant. Positions in KIT's
-# units have rounding errors of 3e-5.
+# Smallest standard deviation of a group of features that is not constant. Positions in KIT's units
+# have rounding errors of 3e-5.
 SMALLEST_STD = 1e-4
 
 

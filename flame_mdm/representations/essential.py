@@ -1,4 +1,4 @@
-"""MARDM's essential features: the part of HumanML3D's features that determines the positions."""
+"""MARDM's essential features: the features of HumanML3D that determine the positions."""
 
 from flame_mdm.representations.humanml import HumanML
 

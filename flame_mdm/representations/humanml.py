@@ -23,8 +23,8 @@ The published value is 20 frames at 20 fps.
 class HumanML(Representation):
     """Features of Guo et al. 2022 (HumanML3D).
 
-    There are 263 for 22 joints, 251 for KIT's 21, and 12 J - 1 for J joints. A motion of T frames
-    gives T - 1 rows. Columns by name, in `slices`:
+    There are 263 features for 22 joints, 251 for KIT's 21 joints, and 12 J - 1 for J joints. A
+    motion of T frames is encoded as T - 1 rows. Columns by name, in `slices`:
 
     | name | width | content |
     |---|---|---|
@@ -40,18 +40,18 @@ class HumanML(Representation):
     Motions are first made canonical: the lowest joint is at y = 0, and in the first frame, the
     root is at x = z = 0 and the body faces +z.
 
-    The variant "legacy" equals the published data with all its peculiarities. Its heading
-    subtracts the hips from the shoulders instead of adding them. In the first frame, the heading
-    is 0, although the smoothed heading is not. `turn` is half the turn to the right, and changes
-    sign where the heading crosses 180 degrees. The root velocity is in the body coordinates of
-    the next frame. Rotations are rotations of bones in the world relative to the inverse heading,
-    also at the shoulders. `decode` is the published decoding. If a bone is exactly opposite to
-    its rest direction, the published code gives NaN; here, the rotation is a half turn.
+    The variant "legacy" equals the published data with all its peculiarities. Its heading subtracts
+    the hips from the shoulders instead of adding them. In the first frame, the heading is 0,
+    although the smoothed heading is not. `turn` is half the turn to the right, and changes its sign
+    where the heading crosses 180 degrees. The root velocity is in the body coordinates of the next
+    frame. Rotations are world rotations of the bones relative to the inverse heading, also at the
+    shoulders. `decode` is the published decoding. If a bone is exactly opposite to its rest
+    direction, the published code returns NaN. In this implementation, the rotation is a half turn.
 
-    The variant "clean" has none of these. Headings are unwrapped before smoothing. Before
-    smoothing, headings are padded point-symmetrically at both ends, which preserves steady turns
-    and the first and last heading. Rotations are computed after the body is turned to +z, and are
-    relative to the parent in the skeleton.
+    The variant "clean" has none of these peculiarities. Headings are unwrapped before smoothing.
+    They are also padded point-symmetrically at both ends, which preserves steady turns and the
+    first and last heading. Rotations are computed after the body is turned to +z, and are relative
+    to the parent in the skeleton.
 
     Input and output joints are in meters. Features are in units of 1 / `units_per_metre` meters
     (KIT: 1/640).
@@ -60,15 +60,15 @@ class HumanML(Representation):
         skeleton: key in `SKELETONS`.
         variant: "clean" for the intended features, "legacy" for the published features.
         fps: frames per second.
-        bone_lengths: J lengths in the features' unit. Each is the length of the bone that ends in
-            a joint. All motions are retargeted to these lengths. None keeps the lengths of each
-            motion.
+        bone_lengths: J lengths in the features' unit. Each is the length of the bone that ends in a
+            joint. All motions are retargeted to these lengths. None = each motion keeps its own
+            lengths.
         units_per_metre: units of the features per meter.
-        contact_threshold: squared displacement of a foot per frame, in the features' unit. Below
-            it, the foot is in contact. HumanML3D uses 0.002, KIT 0.05.
+        contact_threshold: squared displacement of a foot per frame, in the features' unit, below
+            which the foot is in contact. HumanML3D uses 0.002, KIT 0.05.
 
     Raises:
-        UserError: If the skeleton is unknown, or `bone_lengths` do not fit it.
+        UserError: If the skeleton is unknown, or if `bone_lengths` do not fit the skeleton.
 
     Example:
         >>> representation = HumanML()
@@ -117,7 +117,7 @@ class HumanML(Representation):
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions in one pass over all their frames, for speed."""
+        """Encodes several motions in one pass over all their frames, which is faster."""
         joints, lengths = self._canonical(motions)
         heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
         last = torch.tensor(lengths).cumsum(0) - 1
@@ -227,7 +227,7 @@ class HumanML(Representation):
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns x and z (N, 2) of the direction that hips and shoulders face.
 
-        The direction is the cross product of the vertical and the direction to the right, and is
+        The direction is the cross product of the vertical and the direction to the right. It is
         shorter if the body lies on its side. `hips` is the weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[

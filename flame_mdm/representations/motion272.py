@@ -25,10 +25,10 @@ class Motion272(Representation):
     | velocities | 66 | differences of `positions` from the previous frame, without the root's displacement and turn |
     | rotations | 132 | SMPL's rotations as 6D rows, of the root in body coordinates |
 
-    In the first row, `turn` is the identity, and velocities are 0. The heading is the heading of
-    the root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z.
-    Raw motions have z up; `smpl.read_pose` describes them. Bones have the lengths of `offsets`.
-    The authors keep the bone lengths of each subject instead.
+    In the first row, `turn` is the identity, and velocities are 0. The heading is computed from the
+    root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z. Raw
+    motions have z up; `smpl.read_pose` describes them. Bones have the lengths of `offsets`, whereas
+    the authors keep the bone lengths of each subject.
 
     Args:
         fps: frames per second.
@@ -95,9 +95,9 @@ class Motion272(Representation):
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes the velocity, turn and positions in the features into joints (..., F, 22, 3).
+        """Decodes the velocity, turn and positions of features (..., F, 272) to joints (..., F, 22, 3).
 
-        Features are (..., F, 272). The decoding is differentiable.
+        The decoding is differentiable.
         """
         inverse, ground = self._root(features)
         local = features[..., self.slices["positions"]].unflatten(-1, (22, 3))
@@ -106,7 +106,8 @@ class Motion272(Representation):
     def poses(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Decodes features (..., F, 272) to SMPL poses, y up.
 
-        These are the pelvis (..., F, 3) and SMPL's rotations (..., F, 22, 3, 3).
+        The poses consist of the pelvis position (..., F, 3) and SMPL's rotations (..., F, 22, 3,
+        3).
         """
         inverse, ground = self._root(features)
         turned = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 1:, :], "rows")
@@ -119,7 +120,7 @@ class Motion272(Representation):
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Returns rotations to body coordinates (..., F, 3, 3) and positions (..., F, 3).
 
-        Positions are the root's x and z, with y = 0.
+        The positions are the root's x and z, with y = 0.
         """
         inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1
@@ -140,7 +141,7 @@ class Motion272(Representation):
     def rebase(self, features: Features) -> Features:
         """Sets the velocities and the turn in the first frame of cuts (..., F, D).
 
-        The new values are the values in the first frame of any motion: zeros and the identity.
+        They are set to the values in the first frame of any motion: zeros and the identity.
         """
         cut = deepcopy(features)
         for name in ("root_velocity", "turn", "velocities"):
@@ -160,7 +161,7 @@ class Motion272(Representation):
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
     """Turns a motion about y, so that the root faces +z in the first frame.
 
-    The motion is the translation (F, 3) and rotations (F, J, 3, 3).
+    The motion consists of the translation (F, 3) and rotations (F, J, 3, 3).
     """
     turn = _to_body(rotations[:1])
     return translation @ turn[0].T, torch.cat(

@@ -15,14 +15,14 @@ KNEES_AND_ELBOWS = [
 ]
 """Joints that the published code uses as hips and shoulders.
 
-The code applies the indices of hips and shoulders after it has removed the root.
+The published code removes the root, and then applies the original indices of hips and shoulders.
 """
 
 
 class Rifke(Representation):
     """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, also used by FLAME.
 
-    A motion of T frames gives T rows.
+    A motion of T frames is encoded as T rows.
 
     | columns | content |
     |---|---|
@@ -37,7 +37,7 @@ class Rifke(Representation):
 
     Args:
         fps: frames per second.
-        units_per_metre: units of the features per meter. KIT's unit is 1/640 meters. Joints are
+        units_per_metre: units of the features per meter. KIT's unit is 1/640 meters. The joints are
             in meters.
 
     Example:
@@ -85,9 +85,9 @@ class Rifke(Representation):
         )
 
     def floor(self, joints: Tensor) -> Tensor:
-        """Returns the floor height of joints (T, 21, 3) in KIT's unit.
+        """Returns the height of the floor below joints (T, 21, 3) in KIT's unit.
 
-        The floor is a soft minimum over time of the height of the lowest foot.
+        It is a soft minimum over time of the height of the lowest foot.
         """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()

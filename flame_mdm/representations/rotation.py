@@ -15,10 +15,10 @@ from torch import Tensor
 from flame_mdm.errors import UserError
 
 SixD = Literal["rows", "columns"]
-"""Which vectors of the matrix are kept.
+"""Which vectors of the matrix a 6D vector contains.
 
-These are the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the first two
-columns (HumanML3D). rows(R) = columns(R^T), so decoding with the wrong convention gives the
+They are the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the first two
+columns (HumanML3D). rows(R) = columns(R^T), so decoding with the wrong convention results in the
 inverse rotation.
 """
 
@@ -89,12 +89,13 @@ def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    Every finite pair of vectors gives a rotation. If one vector has no direction, a basis vector
-    replaces it: the one that is least parallel to the other vector. If both vectors are parallel,
-    such a basis vector replaces the second one. Two zeros give the identity.
+    Every finite pair of vectors results in a rotation. If one vector has no direction, it is
+    replaced by the basis vector that is least parallel to the other vector. If the vectors are
+    parallel, such a basis vector replaces the second one. Two zero vectors result in the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
-    # No branch, because exported graphs and torch.func.vmap, used in guidance, cannot contain one
+    # No branches, because neither exported graphs nor torch.func.vmap, used in guidance, can
+    # contain them
     first, across = _orthogonal(torch.where(degenerate, _completed(rot6d), rot6d))
     second = F.normalize(across, dim=-1)
     rows = torch.stack([first, second, torch.linalg.cross(first, second)], -2)
@@ -104,8 +105,8 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 def is_degenerate(rot6d: Tensor) -> Tensor:
     """Returns (...,) bool: whether a pair of vectors (..., 6) defines no rotation.
 
-    This is the case if one vector is 0, or if both are parallel. `rot6d_to_matrix` completes such
-    pairs.
+    This is the case if one vector is 0, or if the vectors are parallel. `rot6d_to_matrix` completes
+    such pairs.
     """
     return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
 
@@ -146,7 +147,7 @@ def _shorter(normalized: Tensor) -> Tensor:
 
 
 def _completed(rot6d: Tensor) -> Tensor:
-    """Returns pairs of vectors (..., 6) in which basis vectors replace one or both vectors."""
+    """Returns pairs of vectors (..., 6) in which basis vectors replace one vector or both vectors."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
     basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
     replaced = _shorter(first)
@@ -217,7 +218,7 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
 
 
 def _scaled(vectors: Tensor) -> Tensor:
-    """Returns vectors scaled so that their largest entry is 1; 0 stays 0.
+    """Returns vectors scaled so that their largest entry is 1. Zero vectors remain 0.
 
     Squares of tiny vectors then do not underflow.
     """
@@ -273,7 +274,7 @@ def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
 
 
 def continuous(quaternion: Tensor, dim: int) -> Tensor:
-    """Flips signs along the time axis `dim`, so that neighbors are in one hemisphere.
+    """Flips signs along the time axis `dim`, so that neighboring quaternions are in one hemisphere.
 
     The first quaternion is unchanged.
     """

@@ -30,14 +30,14 @@ class Skeleton:
     parents: tuple[int, ...]
     # Kinematic chains of HumanML3D's inverse kinematics
     chains: tuple[tuple[int, ...], ...]
-    # (J, 3), rest direction of the bone that ends in each joint, of unit length; 0 for the root.
+    # (J, 3), rest direction of the bone that ends in each joint, with unit length; 0 for the root.
     # From HumanML3D's `paramUtil.py`.
     raw_offsets: tuple[tuple[int, int, int], ...]
     # Right hip, left hip, right shoulder, left shoulder. They define the heading.
     facing: tuple[int, int, int, int]
     # Joints that touch the ground, in the order of HumanML3D's contact features
     feet: tuple[int, ...]
-    leg: tuple[int, int]  # (knee, ankle); the lengths of their bones measure the size of a body
+    leg: tuple[int, int]  # (knee, ankle); the lengths of their bones determine the size of a body
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -49,9 +49,9 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """For each joint, the joint to which HumanML3D's rotation is relative.
+        """For each joint, the joint relative to which HumanML3D expresses its rotation.
 
-        It is the parent or, at the start of a chain, the root.
+        This is the parent or, at the start of a chain, the root.
         """
         starts = {chain[1] for chain in self.chains}
         return tuple(0 if joint in starts else parent for joint, parent in enumerate(self.parents))
@@ -91,10 +91,10 @@ def forward_kinematics(
 
     Args:
         skeleton: the tree of joints.
-        rotations: (..., J, 3, 3), relative to the parents. They apply to the bones that leave a
+        rotations: (..., J, 3, 3), relative to the parents. They apply to the bones that begin at a
             joint, as in SMPL and BVH.
-        offsets: (J, 3), positions relative to the parents in the rest pose. The offset of the
-            root is not used.
+        offsets: (J, 3), positions relative to the parents in the rest pose. The offset of the root
+            is ignored.
         root: (..., 3), position of the root.
     """
     turned = global_rotations(rotations, skeleton.parents)
@@ -105,7 +105,7 @@ def forward_kinematics(
 
 
 def global_rotations(rotations: Tensor, parents: Sequence[int]) -> Tensor:
-    """Converts rotations (..., J, 3, 3) from the frames of the parents to the world.
+    """Converts rotations (..., J, 3, 3) relative to the parents to world rotations.
 
     Each level of the tree takes one matrix product.
     """
@@ -203,10 +203,10 @@ SMPL24 = Skeleton(
     leg=SMPL22.leg,
 )
 
-# The order is MMM's: root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH,
-# RK, RA, RMrot, RF. KIT's coordinates are mirrored: the left side of a body that faces +z is at
-# -x. Therefore the published code calls MMM's leg L the right leg. `facing` and `feet` keep the
-# order of the published code, whereas the names here are MMM's.
+# The order is MMM's: root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH, RK,
+# RA, RMrot, RF. KIT's coordinates are mirrored: the left side of a body that faces +z is at -x.
+# Therefore, the published code calls MMM's leg L the right leg. `facing` and `feet` keep the order
+# of the published code, whereas the names in this table are MMM's.
 KIT21 = Skeleton(
     name="kit21",
     joints=(
@@ -274,10 +274,10 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the indices of joints, given by names of joints or body parts.
+    """Returns the indices of joints, given the names of joints or body parts.
 
     Raises:
-        UserError: If a name is unknown; the message suggests similar names.
+        UserError: If a name is unknown. The message suggests similar names.
     """
     indices = part_names(skeleton) | {name: [index] for index, name in enumerate(skeleton.joints)}
     chosen: list[Any] = list(names) if isinstance(names, list | tuple) else [names]

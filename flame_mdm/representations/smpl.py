@@ -20,29 +20,29 @@ ADULT = (
 )
 """Position of each of SMPL's 24 joints relative to its parent in the rest pose, in meters.
 
-In the rest pose, the arms are stretched out to the sides, the body faces +z, and y points up. The
-positions replace the licensed model files. They are bone lengths of HumanML3D's reference clip,
-rounded and symmetric.
+In the rest pose, the arms are stretched out to the sides, the body faces +z, and y points up. These
+positions replace the licensed model files. They are the bone lengths of HumanML3D's reference clip,
+rounded and made symmetric.
 """
 
 
 AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
 """Number of joints by the size of a frame of axis-angle vectors.
 
-The kinds are the body alone, SMPL, SMPL+H and SMPL-X.
+The sizes are for the body alone, SMPL, SMPL+H and SMPL-X.
 """
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     """Splits a raw SMPL motion (F, 3 + 3 K) into a translation and rotation matrices, float64.
 
-    The motion is a translation in meters, then axis-angle vectors of K = 24, 52 or 55 joints. The
-    results are (F, 3) and (F, 24, 3, 3). As in FLAME's code, the first 24 of SMPL+H's 52 joints
-    are used, so the hands are its left_index1 and left_index2.
+    The motion consists of a translation in meters, followed by the axis-angle vectors of K = 24, 52
+    or 55 joints. The results are (F, 3) and (F, 24, 3, 3). As in FLAME's code, the first 24 of
+    SMPL+H's 52 joints are used, so the hands are its left_index1 and left_index2.
 
     Raises:
-        UserError: If the motion has another shape, for example 24 rotation matrices, or a number
-            is not finite.
+        UserError: If the motion has the wrong shape, for example 24 rotation matrices, or if a
+            number is not finite.
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:

@@ -32,7 +32,7 @@ WORDS_OF_VALUES: dict[Value, tuple[str, ...]] = {
 }
 """Parts of words by value of an attribute.
 
-A caption that states the value contains one of them.
+A caption that states the value contains one of these parts.
 """
 
 
@@ -40,7 +40,7 @@ class Abilities:
     """Actions and attributes that a model knows. Each of its captions names one action of a list.
 
     Args:
-        facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".
+        facts: facts of the model: "actions", "vocabulary" and, if known, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -64,7 +64,7 @@ class Abilities:
 
     @cached_property
     def is_simultaneous(self) -> bool:
-        """Whether a caption of the model has two actions at the same time."""
+        """Whether a caption of the model describes two simultaneous actions."""
         marked = [
             text for text in self.captions if " while " in text or " at the same time" in text
         ]
@@ -77,8 +77,8 @@ class Abilities:
     def supports(self, action: str, name: str, value: Value) -> bool:
         """Returns whether the model knows an action with this value of an attribute.
 
-        A caption must state both the action and the value. If the model has no captions, the
-        vocabulary must have all words for the action and the value.
+        A caption must state both the action and the value. If the facts contain no captions, the
+        vocabulary must contain all words for the action and the value.
         """
         key = (action, name, value)
         if key not in self._supported:
@@ -119,13 +119,13 @@ class Abilities:
         return {name: values for name, values in listed.items() if values}
 
     def ranked(self, action: str) -> list[str]:
-        """Returns the actions that the model knows, ordered by how near their meaning is."""
+        """Returns the actions that the model knows, ordered by similarity of meaning."""
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:
-        """Returns captions of the three known actions nearest in meaning to a sentence.
+        """Returns captions of the three known actions that are nearest in meaning to a sentence.
 
-        If no meaning is known, these are the first three known actions.
+        If no meaning is known, returns captions of the first three known actions.
         """
         names = [action for action in understood.nearest if action in self.actions]
         ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])

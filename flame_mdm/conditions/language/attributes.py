@@ -49,7 +49,7 @@ class Reader:
     def read(self) -> dict[str, Value]:
         """Returns the attributes that the clause states and that the action can have.
 
-        Afterward, `used` contains the tokens that state such attributes. `dropped` contains the
+        Afterward, `used` contains the tokens that state such attributes, and `dropped` contains the
         tokens that state attributes which the action cannot have.
         """
         for position, number in enumerate(self.numbers):
@@ -64,7 +64,7 @@ class Reader:
         return {name: value for name, value in self.attributes.items() if name in self.entry.takes}
 
     def _word(self, position: int) -> str:
-        """Returns the word at a position in the clause; "" outside of the clause."""
+        """Returns the word at a position in the clause; "" outside the clause."""
         return self.tokens[self.numbers[position]].word if 0 <= position < len(self.numbers) else ""
 
     def _state(self, name: str, value: Value, *numbers: int) -> None:
@@ -127,7 +127,7 @@ class Reader:
         self._state("direction", self._around(value), number)
 
     def _around(self, value: str) -> str:
-        """Returns a direction. In a circle, left and right become the direction of turning."""
+        """Returns a direction. In a circle, left and right are converted to the direction of turning."""
         earlier = str(self.attributes.get("direction", ""))
         turns = {"left": "counterclockwise", "right": "clockwise"}
         if earlier == "circle":

@@ -32,16 +32,16 @@ CONNECTORS = {
     ("simultaneously",): WHILE,
     ("meanwhile",): WHILE,
 }
-"""Words that say in which order two clauses happen, the longest first."""
+"""Words that state the order of two clauses, longest first."""
 AT_THE_END = {
     (word,)
     for word in ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")
 }
 """First words of connectors that may also be at the end of their clause."""
 NEED_SUBJECT = ("once", "as")
-"""Connectors only before a subject: "once they have", but not "jumps once"."""
+"""Connectors that only occur before a subject: "once they have", but not "jumps once"."""
 NEED_CLAUSE = ("next", "later")
-"""Connectors only at the beginning of a clause, so not in "next to the table"."""
+"""Connectors that only occur at the beginning of a clause, so not in "next to the table"."""
 
 
 @dataclass
@@ -50,8 +50,8 @@ class Clause:
 
     Attributes:
         numbers: indices of its tokens.
-        link: when the clause happens, compared with the clause before; "" if the sentence does
-            not say so.
+        link: when the clause happens, relative to the previous clause; "" if the sentence does not
+            state it.
         is_first: whether it is the first clause of its sentence.
         after_comma: whether a comma precedes it.
         matches: phrases in it that name actions.
@@ -67,7 +67,7 @@ class Clause:
 def split(tokens: Sequence[Token], matches: Sequence[Match]) -> list[Clause]:
     """Returns the clauses of a sentence.
 
-    They end at punctuation, at "and" and at connectors, but never inside a phrase.
+    Clauses end at punctuation, at "and" and at connectors, but never inside a phrase.
     """
     clauses = list(_clauses(tokens, matches))
     for clause in clauses:
@@ -123,8 +123,8 @@ def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
 def joined(clauses: Sequence[Clause]) -> list[Clause]:
     """Merges clauses so that each has an action.
 
-    A clause without an action is joined to the clause before, or to the next clause if it is the
-    first one. A clause such as "then faster" is not merged, because it repeats the previous
+    A clause without an action is merged with the previous clause or, if it is the first clause,
+    with the next one. A clause such as "then faster" is not merged, because it repeats the previous
     action.
     """
     merged: list[Clause] = []

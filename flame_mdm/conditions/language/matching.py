@@ -104,7 +104,7 @@ def _is_negated(tokens: Sequence[Token], number: int) -> bool:
 def _is_weak(tokens: Sequence[Token], used: Sequence[int], phrase: Phrase) -> bool:
     """Returns whether a match is weak.
 
-    This is a general verb, such as "go", or a noun after an article, such as "the guard".
+    A weak match is a general verb, such as "go", or a noun after an article, such as "the guard".
     """
     if phrase.size > 1:
         return phrase.words in WEAK_PHRASES

@@ -1,4 +1,4 @@
-"""Meanings of words that are in no table: the nearest actions, and words for things."""
+"""Meanings of words that are in no table: the nearest actions, and whether a word names a thing."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,7 +9,7 @@ from flame_mdm.conditions.language.tables import actions, words_of
 from flame_mdm.conditions.language.vectors import word_table
 
 SIMILAR = 0.65
-"""Minimum similarity with which a word is read as the nearest action.
+"""Minimum similarity at which a word is read as the nearest action.
 
 docs/language.md reports precision and recall.
 """
@@ -17,22 +17,22 @@ NEIGHBORS = 5  # number of nearest listed words that decide whether a word names
 
 
 def nearest_actions(word: str) -> list[tuple[str, float]]:
-    """Returns the actions and their similarities to a word, the nearest first.
+    """Returns the actions with their similarities to a word, nearest first.
 
-    The result is empty if the table of vectors lacks the word.
+    The result is empty if the table of vectors does not contain the word.
     """
     vector = word_table().vector(word)
     return [] if vector is None else _ranked(vector)
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions and their similarities to the mean of some words, the nearest first."""
+    """Returns the actions with their similarities to the mean of some words, nearest first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 
 
 def similarity(action: str, other: str) -> float:
-    """Returns the similarity of two actions: the cosine between the means of their words."""
+    """Returns the similarity of two actions: the cosine of the means of their words."""
     names, _, _ = _action_vectors()
     first, second = names.index(action), names.index(other)
     centers = _centers()
@@ -83,7 +83,7 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
     """Returns the names of the actions, and the single words that name them.
 
-    Each word comes with the index of its action and with its vector.
+    Each word is given with the index of its action and with its vector.
     """
     table, weak = word_table(), words_of("weak")
     names = list(actions())

@@ -12,8 +12,8 @@ VOWELS = "aeiou"
 def base_forms(word: str) -> tuple[str, ...]:
     """Returns the possible base forms of a word, the word itself first.
 
-    For "waving", these are waving, wav and wave. Not all of them are words. The caller looks for
-    forms that it knows.
+    For "waving", these are waving, wav and wave. Not all of them are words, so the caller must
+    select the forms that it knows.
     """
     return tuple(dict.fromkeys([word, *_irregular().get(word, ()), *_stems(word)]))
 
@@ -65,7 +65,7 @@ def _doubles(verb: str) -> bool:
 
 @cache
 def _irregular() -> dict[str, tuple[str, ...]]:
-    """Returns the base forms of irregular forms."""
+    """Returns the base forms of irregular words."""
     bases: dict[str, tuple[str, ...]] = {}
     for base, forms in phrases()["irregular"].items():
         for form in forms.split():

@@ -67,7 +67,7 @@ def is_explained(word: str) -> bool:
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
     """Returns the actions nearest in meaning to the words of a sentence that are in no table.
 
-    If all words are in the tables, all of them count.
+    If all words are in the tables, all of them are used.
     """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
@@ -75,7 +75,7 @@ def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
 
 
 class _Sentence:
-    """The actions of a sentence, from its tokens and the phrases for actions in them."""
+    """The actions of a sentence, given its tokens and the phrases that name actions."""
 
     def __init__(self, text: str, tokens: Sequence[Token], matches: Sequence[Match]):
         self.text, self.tokens = text, tokens
@@ -91,9 +91,9 @@ class _Sentence:
     def steps(self) -> list[Step]:
         """Returns the actions in their order."""
         steps: list[Step] = []
-        # Actions of "While walking,", which are added to the clause that follows
+        # Actions of "While walking,", which are added to the following clause
         during: list[Step] = []
-        # Actions of "Before sitting down,", which happen after the clause that follows
+        # Actions of "Before sitting down,", which happen after the following clause
         later: list[Step] = []
         for clause in self.clauses:
             added = self._actions(clause, steps)
@@ -140,7 +140,7 @@ class _Sentence:
     def _choose(self, clause: Clause) -> None:
         """Keeps the phrases of a clause that name its actions.
 
-        If there is none, a word with the meaning of an action counts.
+        If there are none, a word with a meaning similar to an action is used.
         """
         strong = [match for match in clause.matches if not match.is_weak]
         if strong:
@@ -228,7 +228,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause happens during the clause before: "stands still, waving"."""
+        """Returns whether a clause happens during the previous clause: "stands still, waving"."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]
@@ -253,7 +253,7 @@ class _Sentence:
 
 
 def _is_same(step: Step, other: Step) -> bool:
-    """Returns whether two steps are the same action, named twice with attributes that agree."""
+    """Returns whether two steps are the same action, named twice with compatible attributes."""
     if len(step) > 1 or len(other) > 1 or step[0].action != other[0].action:
         return False
     first, second = step[0].attributes, other[0].attributes
@@ -261,6 +261,6 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Returns a step without repetitions, and without "stands still" beside another action."""
+    """Returns a step without repetitions, and without "stands still" next to another action."""
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

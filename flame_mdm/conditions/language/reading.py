@@ -1,4 +1,4 @@
-"""How a model reads a sentence: captions for the model, and words that it does not know."""
+"""How a model reads a sentence: the captions that are passed to it, and the words that it does not know."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -25,8 +25,8 @@ class Reading:
         steps: the actions to sample, in order; the model knows all of them.
         captions: one caption per step, for the model.
         texts: the words of the sentence for each step.
-        changes: differences between the sentence and what is sampled, one line each.
-        ignored: words and attributes without effect, as typed or in words.
+        changes: differences between the sentence and the sampled motion, one line each.
+        ignored: words and attributes that have no effect, as typed or as words.
     """
 
     understanding: Understanding
@@ -37,7 +37,7 @@ class Reading:
     ignored: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """Returns in one line what was understood, such as "walks forward, then waves twice"."""
+        """Returns a summary of the understood actions, such as "walks forward, then waves twice"."""
         if not self.steps:
             return self.texts[0]
         return ", then ".join(
@@ -45,7 +45,7 @@ class Reading:
         )
 
     def warnings(self) -> list[str]:
-        """Returns lines about differences between the sentence and what is sampled."""
+        """Returns lines about differences between the sentence and the sampled motion."""
         ignored = [f"not understood: {', '.join(self.ignored)}"] if self.ignored else []
         return [*self.changes, *ignored]
 
@@ -54,7 +54,7 @@ class Reader:
     """Reads sentences for a model in which each caption names one action of a list.
 
     Args:
-        facts: facts of the model: "actions", "vocabulary" and, if it has them, "captions".
+        facts: facts of the model: "actions", "vocabulary" and, if known, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -62,7 +62,7 @@ class Reader:
 
     @staticmethod
     def fits(facts: Mapping[str, Any]) -> bool:
-        """Returns whether a model with these facts has captions of single actions."""
+        """Returns whether each caption of a model with these facts describes a single action."""
         return (
             bool(facts.get("verbs"))
             and bool(facts.get("actions"))
@@ -72,9 +72,8 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are not changed. The first are training captions whose action the
-        model does not list. The second are sentences whose words are in no table, but are all
-        known to the model.
+        Two kinds of sentences are not changed: training captions with an action that the model does
+        not list, and sentences whose words are in no table, but are all known to the model.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not
@@ -173,7 +172,7 @@ class Reader:
     def _known_action(self, mention: Mention) -> tuple[str | None, dict[str, Value]]:
         """Returns a known action and the attributes that it needs.
 
-        If the model does not know the action itself, the returned action shows nearly the same.
+        If the model does not know the action itself, a nearly equivalent action is returned.
         Returns None if there is no such action.
         """
         if mention.action in self.abilities.actions:
@@ -184,9 +183,9 @@ class Reader:
         return None, {}
 
     def _possible(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns the steps that the model can do instead of a step.
+        """Returns the steps that the model can sample instead of a step.
 
-        If the model knows no simultaneous actions, they follow each other.
+        If the model knows no simultaneous actions, the actions follow each other.
         """
         distinct = tuple({mention.action: mention for mention in step}.values())
         if len(distinct) == 1 or self.abilities.is_simultaneous:
@@ -221,9 +220,9 @@ class Reader:
 
 
 class NotUnderstood(UserError):
-    """The error for a sentence without an action that the model knows.
+    """Error for a sentence without an action that the model knows.
 
-    `nearest` are captions with similar meanings.
+    `nearest` contains captions with similar meanings.
     """
 
     def __init__(self, message: str, nearest: Sequence[str]):
@@ -280,8 +279,8 @@ def _shown(text: str) -> str:
 def _caption(step: Step, words: str, special: Set[str]) -> str:
     """Returns the caption of a step.
 
-    If the model knows a word of the sentence that no table explains, the caption has the words of
-    the sentence.
+    If the model knows a word of the sentence that no table explains, the caption contains the words
+    of the sentence.
     """
     return words if special & set(words.lower().split()) else caption(step)
 

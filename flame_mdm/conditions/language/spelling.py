@@ -1,4 +1,4 @@
-"""Corrections of typos by one or two letters to words for motions, attributes and subjects."""
+"""Corrections of typos (one or two letters) to words for motions, attributes and subjects."""
 
 from functools import cache
 
@@ -27,8 +27,8 @@ FREQUENT = (
 def distance(first: str, second: str, most: int) -> int:
     """Returns the number of edits between two words; `most` + 1 if there are more than `most`.
 
-    An edit inserts, removes or replaces a letter, or swaps two neighbors. This is the optimal
-    string alignment distance (Damerau 1964; Levenshtein 1966).
+    An edit inserts, removes or replaces a letter, or swaps two neighboring letters. This is the
+    optimal string alignment distance (Damerau 1964; Levenshtein 1966).
 
     Example:
         >>> distance("wlak", "walk", most=2), distance("dance", "walk", most=2)
@@ -54,10 +54,10 @@ def distance(first: str, second: str, most: int) -> int:
 
 @cache
 def corrections(word: str) -> tuple[str, ...]:
-    """Returns the words of the tables that a misspelled word may mean; () if none is near.
+    """Returns the words of the tables that a misspelled word may stand for; () if none is similar.
 
     All returned words have the same number of edits. A word of up to four letters may have one
-    wrong letter; a longer word may have two. Numbers are not corrected.
+    wrong letter, and a longer word may have two. Numbers are not corrected.
     """
     if len(word) <= NEVER_CORRECTED or any(char.isdecimal() for char in word):
         return ()
@@ -65,7 +65,7 @@ def corrections(word: str) -> tuple[str, ...]:
     near: dict[int, list[str]] = {}
     for other in _correct_words():
         if len(other) > NEVER_CORRECTED and (far := distance(word, other, most)) <= most:
-            # A wrong first letter and a replaced letter are rarer than a missing, an added or a
+            # A wrong first letter or a replaced letter is rarer than a missing, an additional or a
             # swapped letter.
             begins_otherwise = sorted(other[:2]) != sorted(word[:2]) and other[0] != word[0]
             has_replaced = len(other) == len(word) and sorted(other) != sorted(word)
@@ -84,9 +84,9 @@ def action_words() -> frozenset[str]:
 
 @cache
 def _correct_words() -> tuple[str, ...]:
-    """Returns the words that a typo may mean.
+    """Returns the words that a typo may stand for.
 
-    Frequent words are first, then words for actions, then all others.
+    Frequent words are first, followed by words for actions, and then by all other words.
     """
     tables = phrases()
     listed = words_of("body") | words_of("people") | words_of("function") | words_of("objects")

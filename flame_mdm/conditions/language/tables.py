@@ -17,7 +17,7 @@ class Phrase:
     """Words that name an action.
 
     Attributes:
-        words: base forms; `GAP` represents up to four words.
+        words: base forms; `GAP` stands for up to four words.
         action: name of the action.
         attributes: attributes that the phrase states.
     """
@@ -34,7 +34,7 @@ class Phrase:
 
 @dataclass(frozen=True)
 class ActionEntry:
-    """An action: the attributes that it can have and its words in captions.
+    """An action, with the attributes that it can have and its words in captions.
 
     `actions.yaml` describes the fields.
     """
@@ -62,7 +62,7 @@ def phrases() -> dict[str, Any]:
 def words_of(*keys: str) -> frozenset[str]:
     """Returns the words of a list in `phrases.yaml`.
 
-    Several keys lead to a nested list: `words_of("speed", "slow")`.
+    Several keys select a nested list: `words_of("speed", "slow")`.
     """
     entry: Any = phrases()
     for key in keys:
@@ -122,7 +122,7 @@ def _phrase(text: str, action: str) -> Phrase:
 
 
 def _like(text: str) -> Phrase:
-    """Parses another action and the attributes that it must have, such as "walk speed=slow"."""
+    """Parses another action and its required attributes, such as "walk speed=slow"."""
     parts = text.split()
     name = " ".join(part for part in parts if "=" not in part)
     return Phrase((name,), name, dict(part.split("=") for part in parts if "=" in part))

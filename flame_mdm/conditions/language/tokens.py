@@ -14,8 +14,8 @@ from flame_mdm.conditions.language.vectors import word_table
 
 TOKEN = re.compile(r"(?:anti|counter)[- ]?clockwise|\d+|[^\W\d_]+|[.,;:!?|\n]", re.IGNORECASE)
 HYPHEN = re.compile("[- ]")
-# In a sentence without an action, a real word may be a typo of an action if its rank in frequency
-# is at least this number.
+# In a sentence without an action, a real word may be a typo of an action if its frequency rank is
+# at least this number.
 RARE = 12_000
 
 
@@ -62,11 +62,11 @@ def is_known(word: str) -> bool:
 
 
 def is_foreign(tokens: Sequence[Token]) -> bool:
-    """Returns whether a sentence is in another language than English.
+    """Returns whether a sentence is not in English.
 
     A sentence is foreign if most of its letters are not Latin. It is also foreign if fewer than
-    half of its words are English and, in addition, one of its words has an accent or is typical
-    of another language. `phrases.yaml` lists typical words. Words that are also English do not
+    half of its words are English and, in addition, one of its words has an accent or is typical of
+    another language. `phrases.yaml` lists typical words. Words that also occur in English do not
     count as typical of another language.
     """
     words = [token.word for token in tokens if token.is_word]
@@ -102,9 +102,9 @@ def is_english(word: str) -> bool:
 
 
 def corrected(tokens: Sequence[Token]) -> list[Token]:
-    """Returns the tokens with typos corrected.
+    """Returns the tokens with corrected typos.
 
-    A typo is an unknown word with only a few similar known words.
+    A typo is an unknown word for which there are only a few similar known words.
     """
     return [
         _corrected(token) if token.is_word and not is_known(token.word) else token
@@ -113,9 +113,9 @@ def corrected(tokens: Sequence[Token]) -> list[Token]:
 
 
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
-    """Returns the tokens with one rare word replaced by an action that differs in one letter.
+    """Returns the tokens, with one rare word replaced by an action that differs in one letter.
 
-    This is for sentences in which no action is understood, such as "doge to the left".
+    This function is for sentences in which no action is understood, such as "doge to the left".
 
     Args:
         tokens: tokens of the sentence.

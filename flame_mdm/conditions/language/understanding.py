@@ -1,4 +1,4 @@
-"""What a sentence asks for: actions in order, with their attributes."""
+"""The content of a sentence: actions in order, with their attributes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,7 +12,7 @@ class Mention:
 
     Attributes:
         action: its name in `actions.yaml`.
-        attributes: side, count, direction, speed and amount, as far as the sentence states them.
+        attributes: side, count, direction, speed and amount, if the sentence states them.
         text: the words of the sentence for the action.
         start, end: position of its verb in the sentence.
         typed: the word that was read as this action because of its meaning; "" if the sentence
@@ -45,7 +45,7 @@ class Understanding:
         objects: words for things; they have no effect.
         unknown: words that are not understood, as typed.
         corrected: words that were read as other words: typed word -> corrected word.
-        is_foreign: whether the sentence is in another language than English.
+        is_foreign: whether the sentence is not in English.
         nearest: the three actions with the nearest meanings if no action is understood.
     """
 

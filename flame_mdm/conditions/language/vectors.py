@@ -26,11 +26,11 @@ class WordTable:
         self._rows = {word: row for row, word in enumerate(self.words)}
 
     def has(self, word: str) -> bool:
-        """Returns whether the table has exactly this word."""
+        """Returns whether the table contains exactly this word."""
         return word in self._rows
 
     def rank(self, word: str) -> int | None:
-        """Returns the rank in frequency of a word or its base form; None if both are missing."""
+        """Returns the frequency rank of a word or of its base form; None if both are missing."""
         return next((self._rows[form] for form in base_forms(word) if form in self._rows), None)
 
     def vector(self, word: str) -> np.ndarray | None:
@@ -55,9 +55,9 @@ class WordTable:
 
 @cache
 def word_table() -> WordTable:
-    """Returns the table that is part of the package."""
+    """Returns the table of the package."""
     arrays = read_npz(FILE)
     words = arrays["words"].tobytes().decode().split("\n")
-    # 8 bits per number. The scale of each word is lost, but vectors have length 1 anyway.
+    # 8 bits per number. The scale of each word is lost, but all vectors have length 1.
     vectors = arrays["vectors"].astype(np.float32)
     return WordTable(words, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Words of captions for actions and their attributes, in the form that a model reads."""
+"""Wording of captions for actions and their attributes, in the form that a model reads."""
 
 from collections.abc import Mapping, Sequence
 

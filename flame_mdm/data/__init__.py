@@ -1,4 +1,4 @@
-"""Data sets: reading published releases, packing them into stores, and serving batches."""
+"""Data sets: reading of published releases, packing into stores, and batches."""
 
 import hashlib
 import math
@@ -25,35 +25,35 @@ Value = TypeVar("Value")
 
 @dataclass
 class Clip:
-    """One motion of a data set, to be written into a store."""
+    """One motion of a data set, which is written into a store."""
 
-    # Unique name; a mirrored copy has the name `M` + the name of its original
+    # Unique name. A mirrored copy has the name `M` + the name of its original.
     id: str
     # Input of the representation, at its frame rate. Representations of joints take positions
     # (F, J, 3) in meters, y up, in the joint order of the skeleton.
     motion: np.ndarray
-    # Descriptions of the motion, each complete; empty for data sets with action labels only
+    # Descriptions of the entire motion. Empty for data sets that only have action labels.
     captions: list[str]
-    # Mirrored copies and cuts of a take are in the split of the take
+    # Split. Mirrored copies and cuts of a take are in the split of the take.
     split: Split
-    # The take that the clip comes from; clips of one source are never in two splits
+    # The take that the clip comes from. All clips of one source are in the same split.
     source: str
     # Index into the data set's `actions`, or None
     action: int | None = None
-    # Exact facts about the motion, such as side, count and direction, or tagged words, as JSON
-    # values.
+    # Exact facts about the motion as JSON values, such as side, count and direction, or tagged
+    # words
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    # Name of a representation if the release contains its features: `motion` (F, D) is then
-    # stored unchanged. Empty if `motion` is raw.
+    # Name of a representation, if the release contains its features. `motion` (F, D) is then stored
+    # unchanged. Empty if `motion` is raw.
     encoded: str = ""
-    # (first, length): the clip is this cut of its motion. Consecutive clips with the same array
-    # object share its frames in the store. Only for representations with one row per frame.
+    # (first, length): the part of the motion that is the clip. Consecutive clips with the same
+    # array object share its frames in the store. Only for representations with one row per frame.
     window: tuple[int, int] | None = None
     # Joints (F', J, 3) in meters at the frame rate of the recording, for protocols that compare
     # motions at that rate.
     reference: np.ndarray | None = None
-    # Identifier of the license of this motion, such as "MIT". Empty if the data set has one
-    # license for all motions.
+    # Identifier of the license of this motion, such as "MIT". Empty if one license applies to all
+    # motions of the data set.
     license: str = ""
 
 
@@ -61,13 +61,13 @@ class MotionSource(ABC):
     """A data set in its published form."""
 
     name: str
-    # Whether `data.name` in the recipe names the data set, because the files are the user's.
+    # Whether the recipe names the data set in `data.name`, because the files are the user's own
     named_by_recipe: bool = False
     options: Mapping[str, Any] = {}
     """Arguments of the constructor that define the data, as JSON values.
 
-    Paths and numbers of workers are not among them. The arguments are saved in the store, and
-    commands compare them with the recipe.
+    Paths and numbers of workers are left out. The arguments are saved in the store, and commands
+    compare them with the recipe.
     """
     # Names of the action labels, in the order of their numbers
     actions: tuple[str, ...] = ()
@@ -77,14 +77,14 @@ class MotionSource(ABC):
     license: str = ""
     """License of all motions, a key of `licenses.yaml` such as "MIT".
 
-    The text is empty if the license is unknown, or if clips have their own licenses.
+    It is empty if the license is unknown, or if clips have individual licenses.
     """
-    # Whether the license allows checkpoints to contain captions.
+    # Whether the license allows checkpoints to contain captions
     captions_may_be_shared: bool = False
     published_split: bool = False
-    """Whether the papers' split is used despite its faults.
+    """Whether the papers' split is used despite its flaws.
 
-    Such a split tests on training clips or has no validation clips. The value is saved in the
+    Such a split tests on training clips, or has no validation clips. The value is saved in the
     store and in every result.
     """
     version: int = 1
@@ -93,12 +93,12 @@ class MotionSource(ABC):
     The version is part of the fingerprint. Stores of another version are not used.
     """
     failures: Sequence[str] = ()
-    """One line per motion that could not be read and is left out.
+    """One line per motion that could not be read and was left out.
 
     The list is complete after `clips` has ended. Commands then exit with code 1, because the user
     should correct the files.
     """
-    # Processes that read and encode; 0 = one per core, 1 = only this process
+    # Number of processes that read and encode; 0 = one per core, 1 = only this process
     workers: int = 0
     # Names to leave out
     exclude: Collection[str] = ()
@@ -120,7 +120,7 @@ class MotionSource(ABC):
         """Removes the names in `exclude` from a mapping and counts them.
 
         Raises:
-            UserError: If `exclude` has a name that the mapping lacks.
+            UserError: If `exclude` contains a name that is not in the mapping.
         """
         if unknown := set(self.exclude) - named.keys():
             raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
@@ -128,18 +128,18 @@ class MotionSource(ABC):
         return {name: value for name, value in named.items() if name not in self.exclude}
 
     def counts(self) -> Mapping[str, float]:
-        """Returns figures of the raw data under the names of `published.yaml`.
+        """Returns statistics of the raw data under the names of `published.yaml`.
 
-        The figures are saved after `clips` has ended.
+        They are saved after `clips` has ended.
         """
         return {}
 
     def findings(self) -> list[str]:
-        """Returns lines to print about the motions; complete after `clips` has ended."""
+        """Returns lines to print about the motions. The lines are complete after `clips` has ended."""
         return []
 
     def changed(self, store: Path) -> list[str]:
-        """Returns a line if files were added or changed after the store was prepared from them.
+        """Returns a line if files were added or changed after the store was prepared.
 
         Args:
             store: a file of the store.
@@ -154,7 +154,7 @@ class MotionSource(ABC):
         return self.captions_may_be_shared
 
     def licenses(self) -> set[str]:
-        """Returns the licenses of all motions, without reading motions; "" = unknown license."""
+        """Returns the licenses of all motions without reading the motions; "" = unknown license."""
         return {self.license}
 
     @abstractmethod
@@ -162,8 +162,8 @@ class MotionSource(ABC):
         """Returns the number of clips that `clips` yields, without reading motions.
 
         Raises:
-            FileNotFoundError: If the raw data is missing; the message says how to get it.
-            UserError: If a file is damaged or an option does not fit the data.
+            FileNotFoundError: If the raw data is missing. The message says how to obtain it.
+            UserError: If a file is damaged, or if an option does not fit the data.
         """
 
     def failure_lines(self) -> list[str]:
@@ -171,7 +171,7 @@ class MotionSource(ABC):
         return [f"error: {failure}" for failure in self.failures]
 
     def check(self, fps: float) -> list[str]:
-        """Returns lines to print about present and missing files. Prepares nothing.
+        """Returns lines to print about existing and missing files, without preparing the data.
 
         Args:
             fps: frames per second.
@@ -179,14 +179,14 @@ class MotionSource(ABC):
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def suit(self, representation: "Representation") -> None:  # noqa: B027 (most sources yield one kind of motion)
-        """Makes `clips` yield raw motions of a representation.
+        """Configures the source for a representation, so that `clips` yields its raw motions.
 
         Raises:
             UserError: If the options do not fit the representation.
         """
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns mean and std (D,) that are published with encoded features.
+        """Returns the mean and std (D,) that are published with encoded features.
 
         None = they are computed from the training clips.
         """
@@ -196,7 +196,7 @@ class MotionSource(ABC):
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields all clips at `fps` frames per second, always in the same order.
 
-        The method raises the same errors as `count`.
+        Raises the same errors as `count`.
         """
 
     def check_fps(self, fps: float, published: float) -> None:
@@ -212,18 +212,18 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice for a split without clips, after a space.
+    """Returns advice for a split without clips, with a leading space.
 
-    It is "" for a published data set, whose splits are fixed.
+    The advice is "" for a published data set, because its splits are fixed.
     """
     return " Add a `split` column to captions.csv" if source.named_by_recipe else ""
 
 
 def required(path: Path, get_it: str) -> Path:
-    """Returns `path`.
+    """Returns `path` if it exists.
 
     Raises:
-        FileNotFoundError: If it does not exist; the message ends with the advice `get_it`.
+        FileNotFoundError: If it does not exist. The message ends with the advice `get_it`.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: not found; {get_it}")
@@ -237,12 +237,12 @@ def some(names: Iterable[str]) -> str:
 
 
 def name_hash(name: str) -> int:
-    """Returns 160 bits that depend only on the name, so that draws are equal on every machine."""
+    """Returns 160 bits that depend only on the name, so that random draws are the same on every machine."""
     return int(hashlib.sha1(name.encode()).hexdigest(), 16)
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Returns a split that depends only on the name, so that new names do not move other names.
+    """Returns a split that depends only on the name, so that new names do not change other splits.
 
     Args:
         name: name of a motion or of its source.
@@ -256,8 +256,8 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
     """Returns the split of each block of `size` consecutive clips, drawn by a hash of `name`.
 
-    Neighboring clips may look alike, so a block is never divided between splits. `val` and `test`
-    are fractions of the blocks; each split gets at least one block.
+    Neighboring clips may be similar, so all clips of a block are in the same split. `val` and
+    `test` are fractions of the blocks. Each split gets at least one block.
     """
     count = math.ceil(clips / size)
     blocks = sorted(range(count), key=lambda block: name_hash(f"{name}_{block}"))

@@ -1,6 +1,6 @@
-"""Data for adaptation: one half of each batch are the user's clips.
+"""Data for adaptation: one half of each batch consists of the user's clips.
 
-The other half are clips of motions that the model knows already.
+The other half consists of clips of motions that the model already knows.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ DRIFT = 0.05
 """Maximum rise of the floor, in meters, from the first to the last second of a clip."""
 FLOAT = 0.1
 """Maximum median height of the body above the floor, in meters."""
-# Maximum number of known clips per split. These clips are evenly spaced in the model's data.
+# Maximum number of known clips per split. They are evenly spaced in the model's data.
 PRIOR = {
     "train": 2000,
     "val": 64,
@@ -35,10 +35,10 @@ KEPT = "prior/"  # prefix of the names of the known clips
 
 
 class Lesson(MotionSource):
-    """Clips of the user's folder, with mirrored copies, and clips of what the model knows.
+    """Clips of the user's folder, with mirrored copies, and clips that the model already knows.
 
-    All clips of the folder are for training unless its table says otherwise. Clips are normalized
-    with the statistics of the store. A caption in the folder becomes "CAPTION in NAME style".
+    All clips of the folder are for training, unless its table states otherwise. Clips are
+    normalized
 
     Args:
         path: the user's folder of motions.
@@ -78,9 +78,9 @@ class Lesson(MotionSource):
         return self.folder.count() + len(self.kept())
 
     def suit(self, representation: Representation) -> None:
-        """Fits the user's clips to a representation.
+        """Configures the user's clips for a representation.
 
-        The clips of the store are features already.
+        The clips of the store are already features.
         """
         self.folder.suit(representation)
 
@@ -92,8 +92,8 @@ class Lesson(MotionSource):
         """Yields the user's clips, with their style in the captions, then the clips of the store.
 
         Raises:
-            UserError: If one of the user's motions cannot be read. The folder has only a few
-                motions, so none is left out.
+            UserError: If one of the user's motions cannot be read. The folder contains only a few
+                motions, so none of them is left out.
         """
         for clip in self.folder.clips(fps):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
@@ -105,7 +105,7 @@ class Lesson(MotionSource):
 
 
 def styled(caption: str, name: str) -> str:
-    """Returns the caption of a clip of the style `name` in training."""
+    """Returns the caption that a clip of the style `name` has in training."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 
@@ -138,8 +138,8 @@ def fault_of(joints: np.ndarray, fps: float) -> str:
         joints: (F, J, 3) in meters, y up.
         fps: frames per second.
     """
-    # The floor at a time is the lowest joint within a window of one second. A jump is shorter, so
-    # it does not lift the floor. Height 0 is the lowest joint of the whole clip.
+    # The floor at a given time is the lowest joint within a window of one second. A jump is
+    # shorter, so it does not raise the floor. Height 0 is the lowest joint of the entire clip.
     floor = minimum_filter1d(joints[..., 1].min(1), round(fps), mode="nearest")
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()
     if rise > DRIFT:
@@ -170,10 +170,10 @@ class LessonBatches(Sampler[list[Draw]]):
 
 
 class LessonData(MotionDataModule):
-    """Serves a `Lesson`: half of each batch are the user's clips, and half prior clips."""
+    """Data module of a `Lesson`: half of each batch are the user's clips, and half are prior clips."""
 
     def halves(self) -> list[np.ndarray]:
-        """Returns the indices of the user's training clips, and the indices of the clips of the prior store."""
+        """Returns the indices of the user's training clips, and the indices of the prior store's clips."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
             raise UserError(

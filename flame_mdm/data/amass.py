@@ -80,7 +80,7 @@ class Recording(NamedTuple):
     def parameters(self) -> np.ndarray:
         """Returns the parameters of FLAME, (F, 75) float32.
 
-        A frame has the translation and the axis-angle vectors of 24 joints.
+        A frame contains the translation and the axis-angle vectors of 24 joints.
         """
         return np.concatenate([self.translation, self.poses[:, :72]], 1).astype(np.float32)
 
@@ -88,9 +88,10 @@ class Recording(NamedTuple):
 def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
-    Returns None if the path is in no subset. All names of a subset give the same key, in index
-    files, archives and folders, nested or not. Case is ignored, and spaces become underscores, as
-    in later releases. A file of the SMPL-X release has the key of the SMPL+H file.
+    Returns None if the path belongs to no subset. All names of a subset result in the same key, in
+    index files, archives and folders, nested or not. Case is ignored, and spaces are replaced by
+    underscores, as in later releases. A file of the SMPL-X release has the same key as the SMPL+H
+    file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -108,7 +109,8 @@ def read(file: Path | bytes, name: str) -> Recording:
         name: name of the file in error messages.
 
     Raises:
-        UserError: If the file is not a motion of the SMPL+H G release, or a number is not finite.
+        UserError: If the file is not a motion of the SMPL+H G release, or if a number is not
+            finite.
     """
     names = ("poses", "trans", "betas", "gender", "mocap_framerate")
     with naming(name, ValueError), naming(name, KeyError, prefix=f"{RELEASE}: it lacks "):
@@ -136,7 +138,7 @@ def read(file: Path | bytes, name: str) -> Recording:
 
 @dataclass
 class Amass:
-    """A folder with AMASS: downloaded archives, unpacked subsets, or both."""
+    """A folder with AMASS as downloaded archives, unpacked subsets, or both."""
 
     root: Path
 
@@ -193,7 +195,7 @@ class Amass:
             workers: number of processes; 0 = one per core.
         """
         self.check(arguments)
-        # A task is a single recording. If a subset is not unpacked, a task is its whole archive,
+        # A task is a single recording. If a subset is not unpacked, a task is its entire archive,
         # which can only be read from the beginning.
         tasks: list[tuple[Path, dict[str, Argument]]] = []
         for subset, keys in groupby(sorted(arguments), _subset_of):
@@ -202,8 +204,8 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # An archive takes minutes. Therefore this process does not start on an archive before the
-        # workers do.
+        # An archive takes minutes. Therefore, this process does not work on archives before the
+        # worker processes do.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
         ):

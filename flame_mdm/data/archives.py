@@ -1,6 +1,6 @@
 """Reader of zip and tar archives of motion data.
 
-It reads only regular files, with size limits.
+Only regular files are read, with size limits.
 """
 
 import bz2
@@ -42,7 +42,7 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
     Raises:
         UserError: If the archive is damaged, expands disproportionately or has too many members.
-            Also if such a file is a link, sparse or encrypted.
+            Also if a wanted file is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -62,8 +62,8 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
     """Returns a path that is a folder, or a temporary folder with the `members` of an archive.
 
-    The temporary folder is removed together with `owner`. Of its subfolders, the deepest folder
-    that contains all members is returned.
+    The temporary folder is removed together with `owner`. The returned folder is the deepest
+    subfolder that contains all members.
 
     Raises:
         UserError: For the same reasons as `members`, and if a member would be unpacked outside
@@ -99,7 +99,7 @@ def _zip_members(
             name = info.filename
             if not name:  # `zipfile` cuts names at a null character
                 raise UserError("it contains a file without a name")
-            # macOS adds a folder __MACOSX with attributes of the files
+            # macOS adds a folder __MACOSX with the attributes of the files
             if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):
                 check_member(info)
                 _check_size(name, info.file_size)
@@ -127,9 +127,9 @@ def _tar_members(
                     )
                 _check_size(member.name, member.size)
                 yield member.name, archive.extractfile(member).read()
-            # otherwise, a million empty members would take a gigabyte
+            # Otherwise, a million empty members would take a gigabyte
             archive.members = []
-            # otherwise, each member would copy these shared values
+            # Otherwise, each member would copy these shared values
             archive.pax_headers = {}
 
 
@@ -141,7 +141,7 @@ def _check_size(name: str, size: int) -> None:
 class _Member(tarfile.TarInfo):
     """A tar member.
 
-    This class refuses large headers and sparse files before their content is read.
+    Large headers and sparse files are refused before their content is read.
     """
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
@@ -158,7 +158,7 @@ class _Member(tarfile.TarInfo):
 class _Bounded:
     """Reader of the content of a compressed file of `packed` bytes.
 
-    It refuses implausibly much.
+    It refuses to read implausibly large amounts of data.
     """
 
     def __init__(self, file: IO[bytes], packed: int):
@@ -169,8 +169,7 @@ class _Bounded:
         data = self.file.read(size)
         self.total += len(data)
         self.ended += not data
-        # Otherwise, tarfile would read until the end of a member, and a header may declare any
-        # size.
+        # Otherwise, tarfile would read to the end of a member, and a header may declare any size
         if self.ended > 2:
             raise EOFError("it ends too early")
         check_expansion(self.total, self.packed)

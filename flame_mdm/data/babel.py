@@ -1,4 +1,4 @@
-"""BABEL: action labels with times on AMASS's motions, cut into clips as in FLAME's code.
+"""BABEL: timed action labels for AMASS's motions, cut into clips as in FLAME's code.
 
 Sources: Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim
 et al. (FLAME), AAAI 2023, appendix "BABEL". `docs/babel.md` describes the data set.
@@ -22,7 +22,7 @@ from flame_mdm.safe_io import naming, read_json
 FPS = 20.0
 # Number of frames of a clip, and between windows of the same label
 LENGTH, STRIDE = 128, 10
-# Words, categories, start, end
+# Words, categories, start and end
 Segment = tuple[str, list[str] | None, float | None, float | None]
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
@@ -46,7 +46,7 @@ class Label(NamedTuple):
 class Window(NamedTuple):
     """A clip: consecutive frames of a motion.
 
-    `id` contains the number that FLAME gives the clip within its part.
+    `id` contains the number of the clip within its part, as in FLAME.
     """
 
     id: str
@@ -59,13 +59,13 @@ class Babel(MotionSource):
     """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
 
     Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
-    start) to floor(20 end) - 1. If a label is longer than a clip, it gives one window every
-    `STRIDE` frames. If it is shorter, the clip continues past its end. The label is left out if
-    the motion ends before the clip.
+    start) to floor(20 end) - 1. A label that is longer than a clip gives one window every `STRIDE`
+    frames. If a label is shorter than a clip, the clip continues past the end of the label. The
+    label is left out if the motion ends before the clip.
 
-    Both splits train on BABEL's entire train part and test on 20 % of its val part. Our split
-    draws 20 % of the motions, not of the clips, so no motion is in both val and test. FLAME's
-    split takes every fifth clip, so overlapping windows are in both val and test.
+    Both splits train on BABEL's entire train part, and test on 20 % of its val part. The project's
+    own split draws 20 % of the motions, not of the clips, so that no motion is in both val and
+    test. FLAME's split takes every fifth clip, so overlapping windows are in both val and test.
 
     Args:
         path: folder of BABEL v1.0.
@@ -89,7 +89,7 @@ class Babel(MotionSource):
         return {"labels": sum(1 for file in files for _ in self._annotations(file))}
 
     def count(self) -> int:
-        """Returns the number of clips; reads the labels and measures the motions."""
+        """Returns the number of clips. Reads the labels and measures the motions."""
         return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
@@ -114,7 +114,7 @@ class Babel(MotionSource):
 
     @cached_property
     def windows(self) -> list[Window]:
-        """All clips in FLAME's order. Reads the labels and the lengths of the motions."""
+        """All clips in FLAME's order. Computing them reads the labels and the lengths of the motions."""
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
         measured = self.amass.map(keys, _measure, self.workers)
@@ -141,8 +141,8 @@ class Babel(MotionSource):
     def labels(self, part: str) -> list[Label]:
         """Returns the labels of a part ("train" or "val") in FLAME's order.
 
-        For each file, the annotators' words come first, then the categories. Empty and repeated
-        labels (same text, motion, start and end) are dropped.
+        For each file, the annotators' words come first, followed by the categories. Empty and
+        repeated labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
@@ -192,10 +192,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip of a label, or why the label gives no clip.
-
-    `frames` is the number of frames of the motion.
-    """
+    """Returns the first frame of each clip of a label, or the reason why the label gives no clip."""
     none = range(0)
     if label.text == "transition":
         return none, "transitions"

@@ -38,7 +38,7 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""The joint of the files for each joint of SMPL, in order. spine1 is between Hips and Spine."""
+"""The joint in the files for each SMPL joint, in order. spine1 lies between Hips and Spine."""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
 _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's left foot
@@ -47,7 +47,7 @@ _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's lef
 def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns orthonormal columns.
 
-    The columns are the direction of x, the part of y that is perpendicular to x, and their cross
+    They are the direction of x, the component of y that is perpendicular to x, and their cross
     product.
     """
     first = x / np.linalg.norm(x)
@@ -69,9 +69,9 @@ def _sloping(degrees: float) -> np.ndarray:
 
 
 # Directions of each joint's local axes (columns) when the body is in SMPL's rest pose: standing
-# straight, feet flat, arms out, palms down. In this pose, all rotations of SMPL are the identity.
-# The bones of arms and legs lie on x and have the directions of SMPL's rest pose. Knees and
-# elbows bend about y. `docs/bandai.md` explains how the axes were measured.
+# straight, with flat feet, arms out and palms down. In this pose, all SMPL rotations are the
+# identity. The bones of arms and legs lie on the x axis and have the directions of SMPL's rest
+# pose. Knees and elbows bend about y. `docs/bandai.md` explains how the axes were measured.
 REST = {
     "Hips": _axes(_UP, -_LEFT),
     **dict.fromkeys(("Spine", "Chest", "Neck", "Head"), _axes(_UP, _FORWARD)),
@@ -84,17 +84,17 @@ REST = {
     **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
     **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
 }
-# Converts between y up and AMASS's z up: (-x, z, y). The SMPL representation converts back when
-# it decodes.
+# Converts between y up and AMASS's z up: (-x, z, y). The SMPL representation converts back in
+# decoding.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 WORDS = read_package_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Numbers of published takes of data set 2, by content in the order of `STYLES_2`.
+"""Numbers of the published takes of data set 2, by content in the order of `STYLES_2`.
 
-Splits are drawn from these numbers, so they do not depend on which files are present.
+Splits are drawn from these numbers, so that they do not depend on which files exist.
 """
 
 WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
@@ -104,7 +104,7 @@ HELD_OUT = frozenset(
     for content in group["contents"]
     for style in group["styles"]
 )
-"""Combinations of content and style that training never sees with the compositional split."""
+"""Combinations of content and style that never occur in training with the compositional split."""
 GET_IT = (
     "the data sets are published at https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC "
     "BY-NC 4.0): clone it, then run `make prepare` with SOURCE=/path/to/the/clone"
@@ -115,7 +115,7 @@ FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 class Take(NamedTuple):
     """One BVH file.
 
-    `content` is the action that the actor performs. In the takes in `WRONG_SIDE`, it differs from
+    `content` is the action that the actor performs. For the takes in `WRONG_SIDE`, it differs from
     the file name.
     """
 
@@ -137,9 +137,9 @@ class Bandai(MotionSource):
         mirror: whether a mirrored copy follows each clip of the training split.
         workers: number of processes; 0 = one per core.
         exclude: file names of takes to leave out, without extension.
-        split: "takes" holds out takes of combinations of content and style that training sees.
-            "compositional" holds out the combinations `HELD_OUT`: in training, their contents and
-            styles occur only in other combinations.
+        split: "takes" holds out takes whose combinations of content and style occur in training.
+            "compositional" holds out the combinations `HELD_OUT`. In training, their contents and
+            styles then occur only in other combinations.
     """
 
     name = "bandai"
@@ -175,7 +175,7 @@ class Bandai(MotionSource):
         return {"takes": one + two, "takes of data set 1": one, "takes of data set 2": two}
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields each take. In the training split, its mirrored copy follows.
+        """Yields each take. In the training split, each take is followed by its mirrored copy.
 
         The attributes are content, style, dataset and, if a side moves, side.
         """
@@ -195,7 +195,7 @@ class Bandai(MotionSource):
 
     @cached_property
     def takes(self) -> list[Take]:
-        """The takes that are present and not excluded, sorted by name."""
+        """The takes that exist and are not excluded, sorted by name."""
         files: dict[str, Path] = {}
         folder = archives.as_folder(
             required(self.path, GET_IT), self, lambda name: name.endswith(".bvh")
@@ -224,7 +224,7 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
         kind: "joints", or "smpl" for the motion (F, 75) of `smpl_motion`.
 
     Raises:
-        UserError: If the file has another skeleton, or a joint jumps.
+        UserError: If the file has another skeleton, or if a joint jumps.
     """
     recording = read_recording(file, fps, standard=_standard)
     if recording.doubts.jump:
@@ -250,12 +250,12 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
 
     Args:
         skeleton: skeleton of the file.
-        rotations: (F, J, 3, 3), each in the frame of the parent joint.
-        translations: (F, J, 3) in centimeters, each in the frame of the parent joint.
+        rotations: (F, J, 3, 3), each relative to the parent joint.
+        translations: (F, J, 3) in centimeters, each relative to the parent joint.
     """
-    # A joint of SMPL has the same parent as in the file. The exception is spine1: it is between
-    # two joints of the file and rotates with the pelvis. Therefore a rotation R of the file
-    # becomes a rotation of SMPL with the axes B of the rest pose: B_parent R B_joint^-1.
+    # Each SMPL joint has the same parent as in the file, except spine1, which lies between two
+    # joints of the file and rotates with the pelvis. Therefore, with the axes B of the rest pose, a
+    # rotation R of the file is converted to the SMPL rotation B_parent R B_joint^-1.
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
     hips = skeleton.joints.index("Hips")
@@ -281,16 +281,16 @@ def mirror(motion: np.ndarray) -> np.ndarray:
 
 
 def side_of(content: str) -> str:
-    """Returns the side that moves, or to which the body moves: left, right or both.
+    """Returns the moving side, or the side to which the body moves: left, right or both.
 
-    The result is "" if a content has no side.
+    The result is "" if the content has no side.
     """
     named = re.search("left|right|both", content)
     return named[0] if named else SIDES.get(content, "")
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Returns four captions of a take, phrased like the captions of HumanML3D."""
+    """Returns four captions of a take, worded like the captions of HumanML3D."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     filled = (
@@ -302,12 +302,12 @@ def captions(content: str, style: str, side: str) -> list[str]:
 def split_of(dataset: int, content: str, style: str, number: int, rule: str = "takes") -> Split:
     """Returns the split of a take. The split depends only on the take's name.
 
-    Neighboring takes look alike, so blocks of five stay in one split. Data set 1 has only one
-    take of most combinations, so a whole combination goes to one split. The normal takes of
+    Neighboring takes are similar, so blocks of five takes are in one split. Data set 1 contains
+    only one take of most combinations, so each combination is in one split. The normal takes of
     walk-turn-left and -right overlap in time across names. All these takes are used for training.
 
-    With the rule "compositional", the combinations `HELD_OUT` are the test split. Other takes
-    that the rule "takes" would test on are used for training.
+    With the rule "compositional", the combinations `HELD_OUT` are the test split. All other takes
+    that are test takes with the rule "takes" are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -339,8 +339,8 @@ def _take(file: Path, rule: str) -> Take:
 
 
 def prompts() -> list[str]:
-    """Returns fixed prompts, phrased like the captions.
+    """Returns fixed prompts, worded like the captions.
 
-    The recipes of this data set show samples for these prompts.
+    The recipes of this data set generate samples for these prompts.
     """
     return WORDS["prompts"]

@@ -1,6 +1,6 @@
 """Rest poses of SMPL and SMPL+H.
 
-The poses are read from licensed model files that users download.
+They are read from licensed model files, which users must download.
 """
 
 from pathlib import Path
@@ -99,8 +99,8 @@ class Body(NamedTuple):
 def load_body(folder: Path, gender: str) -> Body:
     """Loads the extended SMPL+H model of a gender.
 
-    For "male", the file is `male/model.npz` or `SMPLH_MALE.npz`. The file is in the folder or in
-    the subfolder `smplh`.
+    For "male", the file is `male/model.npz` or `SMPLH_MALE.npz`, in the folder or in its subfolder
+    `smplh`.
     """
     names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]

@@ -1,4 +1,4 @@
-"""Tables of captions that users write: `captions.csv`, with one line per caption."""
+"""Tables of captions written by users: `captions.csv`, with one line per caption."""
 
 import csv
 import io
@@ -55,10 +55,10 @@ def known_split(split: str) -> Split:
 def drawn_splits(
     sources: Mapping[str, str], stated: Mapping[str, Split | None]
 ) -> dict[str, Split]:
-    """Returns the split of each motion: the split in the table or, without one, a drawn split.
+    """Returns the split of each motion: the split in the table or, if it states none, a drawn split.
 
-    Splits are drawn by a hash of the source, so all motions of a source are in one split. If no
-    motion is drawn for training, the source with the highest hash in the largest split is moved
+    Splits are drawn by a hash of the source, so that all motions of a source are in one split. If
+    no motion is drawn for training, the source with the highest hash in the largest split is moved
     to training. With `SPLITTABLE` or more motions, val and test are filled in the same way.
 
     Args:

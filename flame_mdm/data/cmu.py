@@ -1,8 +1,9 @@
-"""The CMU motion capture database, with captions of HumanML3D and KIT-ML or of the user.
+"""The CMU motion capture database, with captions of HumanML3D, of KIT-ML, or of the user.
 
 The motions are from http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH.
 Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML).
-`docs/cmu.md` says what to download, and how the data differs from these data sets.
+`docs/cmu.md` lists the required downloads, and the differences between this data and these data
+sets.
 """
 
 import re
@@ -45,13 +46,13 @@ SUFFIXES = (
     ".yaml",
     ".zip",
 )
-# Frame rates of the recordings, the usual one first
+# Frame rates of the recordings, the most frequent rate first
 RATES = (120.0, 60.0)
 # Tolerance of durations in seconds: one frame at 20 fps
 SLACK = 0.05
 # Minimum number of feature rows of a clip, as in HumanML3D
 SHORTEST = 40
-# Number of frames after the T-pose of a Daz-friendly file that are blended with it
+# Number of frames after the T-pose of a Daz-friendly file that are blended with the T-pose
 BLENDED = 3
 # Columns of a table of the user's captions
 COLUMNS = (
@@ -63,7 +64,8 @@ COLUMNS = (
     "split",
     "source",
 )
-# Number of frames assumed for a recording of unknown length; any number above `SHORTEST` works
+# Number of frames that is assumed for a recording of unknown length; any number above `SHORTEST`
+# works
 UNKNOWN = 1000
 # The arguments `seconds`, `last` and `is_sixty` of `decide_rate`
 Evidence = tuple[float | None, int | None, bool]
@@ -82,7 +84,7 @@ GET_IT = (
 class Item(NamedTuple):
     """Captions of a recording, or of its part from frame `start` to frame `end` at 20 fps.
 
-    `action` is the label of a part in `captions.csv`. `is_own` is true for such parts, and false
+    `action` is the label of a part in `captions.csv`. `is_own` is True for such parts, and False
     for captions of HumanML3D and KIT-ML.
     """
 
@@ -104,13 +106,14 @@ class Item(NamedTuple):
 
 
 class CMU(MotionSource):
-    """Recordings of the CMU database with captions, on the 22 joints of SMPL.
+    """Recordings of the CMU database with captions, on SMPL's 22 joints.
 
-    These are clips of HumanML3D, recordings with captions of KIT-ML, or motions with the user's
-    captions. HumanML3D's clips keep their names, splits and mirrored copies. Another recording is
+    The clips are clips of HumanML3D, recordings with captions of KIT-ML, or motions with the user's
+    captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
     in the test (val) split if a test (val) clip of HumanML3D is cut from it. If HumanML3D has no
-    clip of it, the subject determines its split. If there is a table `captions.csv`, its rows are
-    the only captions. Each of its parts of a recording becomes a clip.
+    clip of the recording, its split is determined by the subject. If there is a table
+    `captions.csv`, its rows are the only captions, and each of its parts of a recording is one
+    clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -123,7 +126,7 @@ class CMU(MotionSource):
 
     name = "cmu"
     license = "CMU"
-    version = 2  # in version 1, the bone from neck to head changed its length with a nod
+    version = 2  # in version 1, a nod changed the length of the bone from neck to head
 
     def __init__(
         self,
@@ -150,9 +153,9 @@ class CMU(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, list[Path]]:
-        """Files of each recording, the best first.
+        """Files of each recording, best file first.
 
-        Recordings that are known to be bad are absent.
+        Recordings that are known to be bad are left out.
         """
         files: defaultdict[str, list[Path]] = defaultdict(list)
         for path in sorted(self.path.rglob("*")):
@@ -180,9 +183,9 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips of CMU recordings, the captions and the splits by name.
+        """HumanML3D's clips of CMU recordings, and the captions and splits by name.
 
-        All are empty if the user gives captions.
+        All of them are empty if the user provides captions.
         """
         if self.table:
             return [], {}, {}
@@ -239,7 +242,7 @@ class CMU(MotionSource):
 
     @cached_property
     def items(self) -> dict[str, list[Item]]:
-        """Parts to cut from each recording that is present and has captions."""
+        """Parts to cut from each existing recording with captions."""
         files, (rows, texts, splits) = self.files, self.humanml3d
         items: defaultdict[str, list[Item]] = defaultdict(list)
         cut_from: defaultdict[str, set[Split]] = defaultdict(set)
@@ -283,7 +286,7 @@ class CMU(MotionSource):
     def count(self) -> int:
         """Returns the number of clips.
 
-        Recordings are not read: the captions determine the lengths of the clips.
+        Recordings are not read, because the captions determine the lengths of the clips.
         """
         items = [item for items in self.items.values() for item in items]
         ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
@@ -291,7 +294,7 @@ class CMU(MotionSource):
         return sum(len(item.cuts(count)) for item, count in zip(items, frames, strict=True))
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of all recordings that can be read; `findings` lists the others."""
+        """Yields the clips of all readable recordings. `findings` lists the recordings that cannot be read."""
         self.check_fps(fps, FPS)
         labels = {item.action for items in self.items.values() for item in items}
         self.actions = tuple(sorted(label for label in labels if label is not None))
@@ -351,7 +354,7 @@ class _Part:
 def _parts(table: Path) -> dict[str, _Part]:
     """Returns the parts of recordings in a table, by name.
 
-    Rows of the same part are captions of one clip.
+    Rows with the same part are captions of one clip.
     """
     parts: dict[str, _Part] = {}
     for where, cells in table_rows(table, COLUMNS):
@@ -374,7 +377,8 @@ def _parts(table: Path) -> dict[str, _Part]:
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
     """Returns the parts of each recording.
 
-    The table states their splits, or they are drawn by the source or, without one, the subject.
+    Their splits are stated in the table, or drawn by the source or, without a source, by the
+    subject.
     """
     sources = {
         name: part.source or f"CMU subject {part.trial.partition('_')[0]}"
@@ -401,7 +405,7 @@ def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
 
 
 def _part_in_table(cells: Mapping[str, str]) -> _Part:
-    """Returns the part of a recording that the cells of a row name, without captions."""
+    """Returns the part of a recording that the cells of a row name, without its captions."""
     trial, begin, end = cells["id"], cells.get("begin", ""), cells.get("end", "")
     if not re.fullmatch(r"\d{2,3}_\d{2,3}", trial):
         raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
@@ -467,9 +471,9 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording of `frames` frames.
 
-    Durations have priority: KIT-ML's `seconds` come first, then HumanML3D's `last` frame at 20
-    fps. CMU's list comes next. The `header` of the file is last, because conversions state 120
-    for nearly all recordings.
+    Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. The
+    next source is CMU's list. The `header` of the file has the lowest priority, because conversions
+    state 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -486,13 +490,13 @@ def decide_rate(
 def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """Returns a recording with the bones of CMU's own files, and the fields of its `Layout`.
 
-    Both conversions begin with a T-pose, which is removed. Joints `pelvis` and `face` are added
-    at the positions of SMPL's pelvis and head, and `upperneck` is added to the Daz figure. Other
+    Both conversions begin with a T-pose, which is removed. The joints `pelvis` and `face` are added
+    at the positions of SMPL's pelvis and head. In the Daz figure, `upperneck` is also added. Other
     skeletons are returned unchanged, without fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
-    # The MotionBuilder-friendly conversion lacks a bone of the trunk and of each hand. Each of
-    # these bones is restored from a part of the neighboring bone with which it was merged.
+    # The MotionBuilder-friendly conversion lacks one bone of the trunk and one bone of each hand.
+    # Each of these bones is restored from a part of the neighboring bone with which it was merged.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():
@@ -504,7 +508,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
             joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints),
         )
     # The Daz-friendly conversion moves another figure. Its rotations are kept, and its bones are
-    # replaced by bones of a person.
+    # replaced by the bones of a person.
     elif "lButtock" in tree.joints:
         tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
         rows = [
@@ -525,16 +529,16 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
         frames[:blended, 6:] = frames[blended, 6:]
         tree = replace(tree, frames=frames)
 
-    # SMPL's pelvis is above the middle of the hips. The distance is scaled with the legs.
+    # SMPL's pelvis is above the midpoint of the hips. The distance is scaled with the legs.
     bone = dict(zip(tree.joints, tree.offsets, strict=True))
     scale = float(np.linalg.norm(bone["ltibia"]) + np.linalg.norm(bone["lfoot"])) / ADULT_LEG
     pelvis = (bone["lfemur"] + bone["rfemur"]) / 2 - [0, scale * _HIP[1], 0]
-    # As in SMPL, the head joint follows the neck and not the rotations of the head, so its bone
-    # keeps its length.
+    # As in SMPL, the head joint follows the neck but not the rotations of the head, so that its
+    # bone keeps its length.
     above = tree.parents[tree.joints.index("head")]
     face = bone["head"] + [0, 0, scale * _HEAD[2]]
     tree = _added(tree, pelvis=("root", pelvis), face=(tree.joints[above], face))
-    # The Daz figure has one bone from the lower neck to the head. It is divided in the middle.
+    # The Daz figure has a single bone from the lower neck to the head. It is divided in the middle.
     if "upperneck" not in tree.joints:
         tree = _added(tree, upperneck=(tree.joints[above], bone["head"] / 2))
     return tree, {"map": MAP, "unit": unit}
@@ -543,7 +547,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
 def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
     """Returns a tree with additional joints.
 
-    Each keyword is a joint, with its parent and offset (3,).
+    Each keyword argument is a joint, with its parent and offset (3,).
     """
     return replace(
         tree,
@@ -583,10 +587,10 @@ def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh
 
 
 def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:
-    """Returns a part as joints, or as SMPL motion.
+    """Returns a part as joints, or as an SMPL motion.
 
-    An SMPL motion (F, 75) is the translation and SMPL's rotations of the adult body, in AMASS's
-    coordinates.
+    An SMPL motion (F, 75) consists of the translation and the SMPL rotations of the adult body, in
+    AMASS's coordinates.
     """
     part = SMPL22.mirror(torch.from_numpy(joints)) if mirrored else torch.from_numpy(joints)
     if kind == "joints" or len(joints) <= SHORTEST:

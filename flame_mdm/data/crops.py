@@ -20,11 +20,11 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-# Index of a clip, and the number of the batch it is drawn for; -1 in evaluation
+# Index of a clip, and the number of the batch for which it is drawn; -1 in evaluation
 Draw = tuple[int, int]
 # Id, features x (F, D), caption and action of a clip: the input of `collate`
 Sample = tuple[str, Tensor, str | None, int | None]
-# Draws uniform integers, 0 <= integer < argument. The argument is a number or numbers (B,).
+# Draws uniform integers, 0 <= integer < argument. The argument is a number or an array (B,).
 Below = Callable[[Any], Any]
 
 
@@ -44,7 +44,8 @@ class Crop(ABC):
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
         """Draws the frames of samples, or of one sample.
 
-        Without `below`, the result is fixed. Past the end of a clip, its last frame is repeated.
+        Without `below`, the result is deterministic. Past the end of a clip, its last frame is
+        repeated.
 
         Args:
             frames: (B,) number of frames of each clip.
@@ -57,7 +58,7 @@ class Crop(ABC):
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
         """Returns the indices of the frames selected from a clip of `frames` frames.
 
-        Without a generator, the indices are fixed.
+        Without a generator, the indices are deterministic.
         """
         first, length = self.draw(frames, generator.integers if generator else None)
         return np.minimum(np.arange(length) + first, frames - 1)
@@ -67,9 +68,9 @@ class Crop(ABC):
 class Units(Crop):
     """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
 
-    In one of three draws, the sample is one unit shorter. A clip longer than `max_frames` gives a
-    window of that length at a random position. Without a generator, it gives the longest window
-    from the first frame on.
+    In one of three draws, the sample is shorter by one unit. From a clip longer than `max_frames`,
+    a window of that length is taken at a random position. Without a generator, the longest window
+    that starts at the first frame is taken.
     """
 
     min_frames: int = 40
@@ -94,7 +95,7 @@ class Units(Crop):
 
 @dataclass(frozen=True)
 class Whole(Crop):
-    """FLAME: the whole clip, truncated after `max_frames`."""
+    """FLAME: the entire clip, truncated after `max_frames`."""
 
     min_frames: int = 1
     max_frames: int = 471
@@ -109,8 +110,8 @@ class Whole(Crop):
 class Fixed(Crop):
     """ACTOR's action data sets: always `frames` frames.
 
-    Short clips repeat their last frame; long clips give a window. As in ACTOR's code, the window
-    never starts at the last possible frame. Without a generator, the first window is used.
+    Short clips repeat their last frame. From long clips, a window is taken. As in ACTOR's code, the
+    window never starts at the last possible frame. Without a generator, the first window is used.
     """
 
     frames: int = 60
@@ -121,7 +122,7 @@ class Fixed(Crop):
         return self.frames
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns first frames, drawn uniformly, and always the same length."""
+        """Returns first frames, drawn uniformly, and a constant length."""
         spare = np.maximum(0, frames - self.frames - 1)
         first = np.zeros_like(spare) if below is None else below(spare + 1)
         return first, np.full_like(spare, self.frames)
@@ -130,8 +131,8 @@ class Fixed(Crop):
 class Clips(Dataset[Sample]):
     """The clips of a split that are long enough for the crop rule.
 
-    At every draw, a clip is cropped and then normalized. `advice` is part of the error if the
-    split has no clips; see `flame_mdm.data.advice_on_splits`.
+    Each time it is drawn, a clip is cropped and then normalized. `advice` is part of the error
+    message if the split has no clips; see `flame_mdm.data.advice_on_splits`.
     """
 
     def __init__(
@@ -161,7 +162,7 @@ class Clips(Dataset[Sample]):
         return self.__getitems__([draw])[0]
 
     def __getitems__(self, draws: Sequence[Draw]) -> list[Sample]:
-        """Returns the samples of a batch. The data loader calls this."""
+        """Returns the samples of a batch. Called by the data loader."""
         samples: list[Sample] = []
         indices = [index for index, _ in draws]
         for index, first, length, caption in zip(
@@ -179,14 +180,14 @@ class Clips(Dataset[Sample]):
     def draw(
         self, indices: Sequence[int] | np.ndarray, batch: int | Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns first frame, number of frames and caption index (B,) of clips.
+        """Returns the first frame, number of frames and caption index (B,) of clips.
 
-        These numbers are functions of (seed, batch, index). In evaluation (batch -1), they never
-        change.
+        These numbers are functions of (seed, batch, index). In evaluation (batch -1), they are
+        constant.
 
         Args:
             indices: (B,) indices of the clips.
-            batch: number of the batch, or the batch (B,) of each clip.
+            batch: number of the batch, or (B,) the batch number of each clip.
         """
         rows = np.asarray(indices)
         batches = [batch] if isinstance(batch, int) else batch

@@ -1,6 +1,6 @@
 """Training and evaluation batches from a packed store.
 
-Every batch is a function of (seed, step, rank). Therefore no generator state is saved, and a
+Every batch is a function of (seed, step, rank). Therefore, no generator state is saved, and a
 resumed run gets the same batches as an uninterrupted run.
 """
 
@@ -28,8 +28,8 @@ from flame_mdm.representations import Representation
 
 # Maximum number of frames of a sample. One hour at 20 frames per second has 72,000.
 MAX_FRAMES = 100_000
-# Permitted name of a data set. The name of its folder starts with it, and this folder must
-# neither be outside of `root` nor hidden.
+# Permitted names of a data set. The name of the data set's folder starts with this name. The folder
+# must neither be outside `root` nor hidden.
 NAME = r"\w[\w .-]*"
 Loader = DataLoader[Sample] | ResidentLoader
 
@@ -76,7 +76,7 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns batches with every clip exactly once across all ranks, longest first."""
+    """Returns batches that contain every clip exactly once across all ranks, longest first."""
     mine = np.argsort(-lengths, kind="stable")[rank::world]
     return [
         [(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)
@@ -84,18 +84,18 @@ def evaluation_batches(
 
 
 class MotionDataModule(LightningDataModule):
-    """Prepares a data set, unless it is prepared already, and serves its batches.
+    """Prepares a data set, unless it is already prepared, and provides its batches.
 
     Args:
-        representation: encodes the clips; it gets the statistics of the store.
+        representation: representation that encodes the clips. It gets the statistics of the store.
         root: folder of all prepared data sets.
-        name: name of the data set. The name of its folder in `root` starts with it.
+        name: name of the data set. The name of its folder in `root` starts with this name.
         batch_size: clips per rank and step.
-        num_workers: number of loading processes; 0 loads in the training process.
+        num_workers: number of loading processes; 0 = load in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
         resident: whether the data set is kept on the training device. The same batches are then
-            gathered there without workers. "auto": only if it takes at most a quarter of the free
-            memory.
+            gathered on the device, without workers. "auto" = only if the data set takes at most a
+            quarter of the free memory.
         pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
             networks see few shapes. Padding never exceeds the longest sample of the crop rule.
     """
@@ -158,7 +158,7 @@ class MotionDataModule(LightningDataModule):
         self.prepare_data_per_node = False  # all machines share the folder
 
     def prepare_data(self) -> None:
-        """Writes the store if it does not exist. Lightning calls this on one rank only."""
+        """Writes the store if it does not exist. Lightning calls this on only one rank."""
         if (self.folder / "store.json").exists():
             say(*self.source.changed(self.folder / "store.json"))
         else:
@@ -169,7 +169,7 @@ class MotionDataModule(LightningDataModule):
     def actions(self) -> Sequence[str]:
         """Names of the action labels.
 
-        The names come from the store if it exists, so that training does not need the raw data.
+        The names are read from the store if it exists, so that training does not need the raw data.
         """
         prepared = (self.folder / "store.json").exists()
         return self.open().info["actions"] if prepared else self.source.actions
@@ -179,7 +179,7 @@ class MotionDataModule(LightningDataModule):
 
         Raises:
             FileNotFoundError: If the data set is not prepared.
-            UserError: If the store is damaged or was prepared with other options.
+            UserError: If the store is damaged, or was prepared with other options.
         """
         store = Store(self.folder)
         recipe = {
@@ -239,9 +239,9 @@ class MotionDataModule(LightningDataModule):
         self.choose_device()
 
     def choose_device(self, more: int = 0) -> torch.device | None:
-        """Returns the device that keeps the data set; None = no device.
+        """Returns the device on which the data set is kept; None = no device.
 
-        `more` are the bytes of the text encoder's cache.
+        `more` is the size of the text encoder's cache in bytes.
         """
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         free, size = free_memory(device), 4 * self.store.features.size + more
@@ -261,8 +261,8 @@ class MotionDataModule(LightningDataModule):
     def clips(self, split: Split) -> Clips:
         """Returns the clips of a split with their crop rule.
 
-        A data set prepared with a published split that has no test clips (HumanAct12) is tested
-        on its training clips.
+        If a data set was prepared with a published split without test clips (HumanAct12), it is
+        tested on its training clips.
         """
         if (
             split == "test"
@@ -282,7 +282,7 @@ class MotionDataModule(LightningDataModule):
     def train_dataloader(self) -> Loader:
         """Returns an endless loader.
 
-        The loader starts at the trainer's current step, for resumed runs.
+        For resumed runs, the loader starts at the trainer's current step.
         """
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
@@ -301,8 +301,8 @@ class MotionDataModule(LightningDataModule):
     def val_dataloader(self) -> Loader:
         """Returns a loader that yields each validation clip exactly once across all ranks.
 
-        If there are fewer clips than ranks, every rank gets all clips. A rank without a batch
-        would skip the validation, and the others would wait for it.
+        If there are fewer clips than ranks, every rank gets all clips. A rank without a batch would
+        skip the validation, and all other ranks would wait for it.
         """
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size

@@ -33,9 +33,10 @@ from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import naming, read_text
 
-# Minimum number of frames that representations need
+# Minimum number of frames that representations require
 SHORTEST = 3
-# Maximum number of copies of a clip in a balanced set. A model would memorize a clip with more.
+# Maximum number of copies of a clip in a balanced set. With more copies, a model would memorize the
+# clip.
 MOST_COPIES = 16
 
 
@@ -61,7 +62,7 @@ class Folder(MotionSource):
     """Motions and captions in a folder, as joints or as SMPL motions.
 
     Joints are SMPL's 22 joints. SMPL motions are raw motions of the SMPL representation. If the
-    table states no split, 85 % of the sources are used for training, 5 % for validation and 10 %
+    table states no splits, 85 % of the sources are used for training, 5 % for validation and 10 %
     for testing, selected by a hash of their names.
 
     Args:
@@ -71,14 +72,14 @@ class Folder(MotionSource):
             them. For other files, rotations are fitted to the joints.
         mirror: yield a mirrored copy after each clip of the training split; joints only.
         exclude: motions to leave out, by their path in the folder without extension.
-        balance: requested number of training clips per action, mirrored copies included. If an
-            action has fewer clips, its clips are repeated until there are about as many. Each
-            clip occurs at most 16 times. 0 = no repetition.
-        license: license of the motions for which the table states none, a key of `licenses.yaml`.
-            Empty = unknown.
-        prefixes: words that are put in front of captions, each with the actions whose captions get
-            it. A model can then tell these motions from the motions of the same name in another
-            data set.
+        balance: requested number of training clips per action, including mirrored copies. If an
+            action has fewer clips, its clips are repeated until there are about as many. Each clip
+            occurs at most 16 times. 0 = no repetition.
+        license: license of the motions for which the table states no license, a key of
+            `licenses.yaml`. Empty = unknown.
+        prefixes: words that are inserted before captions, each with the actions to whose captions
+            the word applies. A model can then distinguish these motions from the motions with the
+            same name in another data set.
     """
 
     name = "folder"
@@ -123,11 +124,11 @@ class Folder(MotionSource):
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
         # Lines about the motions read so far
         self._notes: Counter[str] = Counter()
-        # The representation of the raw motions to yield; see `suit`
+        # The representation whose raw motions are yielded; see `suit`
         self._representation: Representation | None = None
 
     def suit(self, representation: Representation) -> None:
-        """Makes `clips` yield raw motions of a representation.
+        """Configures the source for a representation, so that `clips` yields its raw motions.
 
         Raises:
             UserError: If `motion` does not fit the representation.
@@ -143,14 +144,14 @@ class Folder(MotionSource):
         self._representation = representation
 
     def count(self) -> int:
-        """Returns the number of clips, with repeated and mirrored copies."""
+        """Returns the number of clips, including repeated and mirrored copies."""
         images = sum(
             self.copies[name] for name in self.files if self.mirror and self.splits[name] == "train"
         )
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
-        """Returns the licenses in the table, and `license` if a row states none."""
+        """Returns the licenses in the table, and `license` if a row states no license."""
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
@@ -170,7 +171,7 @@ class Folder(MotionSource):
         return copies
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of all motions that can be read; `failures` lists the others."""
+        """Yields the clips of all readable motions. `failures` lists the motions that cannot be read."""
         self.actions = tuple(
             sorted({note.action for note in self.notes.values() if note.action is not None})
         )
@@ -199,7 +200,7 @@ class Folder(MotionSource):
         _check_upright(self.path, self._uprights)
 
     def _motions(self, fps: float) -> Iterator[tuple[str, np.ndarray]]:
-        """Yields the name and the motion of each readable file, and records findings."""
+        """Yields the name and the motion of each readable file, and records the findings."""
         self.failures = failures = list[str]()
         self._uprights, self._notes = defaultdict(list), Counter()
         attempts = in_order(
@@ -291,7 +292,7 @@ class Folder(MotionSource):
     def notes(self) -> dict[str, Note]:
         """Captions and labels of each motion, from the table and text files.
 
-        Either all motions have captions, or no motion has one.
+        Either all motions or none of them must have captions.
         """
         notes = {name: Note() for name in self.files}
         if os.path.lexists(self.path / TABLE):
@@ -315,13 +316,13 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Split of each motion, from the table or else drawn as in `drawn_splits`."""
+        """Split of each motion, from the table or, if it states none, drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 
 
 def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: Path) -> None:
-    """Puts a word in front of the captions of some actions.
+    """Inserts a word before the captions of some actions.
 
     Args:
         prefixes: the word, by action.
@@ -357,7 +358,7 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
 
 
 def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
-    """Yields a clip and its repetitions, which share its frames in the store."""
+    """Yields a clip and its repetitions, which share the frames of the clip in the store."""
     yield clip
     for number in range(2, copies + 1):
         yield replace(clip, id=f"{clip.id}~{number}")
@@ -366,7 +367,7 @@ def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
 def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
     """Yields the names of the motions of a file, and the motions.
 
-    If there are several animations, each gets its own name.
+    If there are several animations, each animation gets its own name.
     """
     animations: list[str] = []
     if path.suffix.lower() in SCENES:
@@ -426,8 +427,8 @@ def _read(
     """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations.
 
     The motion has `fps` frames per second. Without a `representation`, the joints are SMPL's 22
-    joints, and rotations are in AMASS's axes. KIT-ML's representations get its 21 joints.
-    Representations in the camera's axes get rotations in these axes.
+    joints, and rotations are in AMASS's axes. For KIT-ML's representations, the joints are KIT-ML's
+    21 joints. For representations in camera axes, the rotations are in these axes.
     """
     path = file.path
     try:

@@ -16,26 +16,26 @@ from flame_mdm.data import Clip, MotionSource, restricted_pickle, split_blocks
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy
 
-# Frames per second at which the authors' code plays the action data sets. Frames are not
+# Frames per second at which the authors' code plays the action data sets. The frames are not
 # resampled.
 FPS = 20.0
-# Errors that NumPy raises for values that are not numbers
+# Errors raised by NumPy for values that are not numbers
 NO_NUMBERS = (
     TypeError,
     ValueError,
     OverflowError,
 )
-# Consecutive clips in the file may be cut from the same recording, so blocks of this size stay in
-# one split.
+# Consecutive clips in the file may be cut from the same recording, so blocks of this size are in
+# one split
 BLOCK = 10
 
 
 class HumanAct12(MotionSource):
     """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
-    The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of
-    each action) keeps neighboring clips together. The published split uses all clips both for
-    training and for testing, as in the papers.
+    The file names neither subjects nor recordings. The project's own split (70 % train, 10 % val,
+    20 % test of each action) keeps neighboring clips together. The published split uses all clips
+    both for training and for testing, as in the papers.
     """
 
     name = "humanact12"
@@ -63,7 +63,7 @@ class HumanAct12(MotionSource):
         return len(self._motions)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips in the order of the file. The clips have actions, but no captions."""
+        """Yields the clips in the order of the file. They have actions, but no captions."""
         self.check_fps(fps, FPS)
         clips, seen = Counter(action for _, action in self._motions), Counter[int]()
         blocks = {
@@ -81,7 +81,7 @@ class HumanAct12(MotionSource):
     def _motions(self) -> list[tuple[np.ndarray, int]]:
         """Motion (F, 75) float32 and action of each clip, in the order of the file.
 
-        A motion is the position of the root joint (meters, camera axes), followed by 24
+        A motion consists of the position of the root joint (meters, camera axes), followed by 24
         axis-angle vectors.
         """
         path, motions = find(self.path, "humanact12poses.pkl"), []
@@ -111,7 +111,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
     Sources: Tevet et al. 2023, section 4.3; Raab et al. 2022. The array in
     `humanact12_unconstrained_modi_struct.npy` is (N, 15 or more, 3, F). The result (N, F, 15, 3)
-    float32 has SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
+    float32 contains SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
     """
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
@@ -136,7 +136,7 @@ def find(path: Path, name: str) -> Path:
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns lists of a pickled dictionary by name. Checks that they have equal length."""
+    """Returns lists of a pickled dictionary by name, after checking that they have equal length."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (

@@ -41,7 +41,7 @@ class IndexedClip(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Whether the clip is a whole file of HumanAct12, named by `key`."""
+        """Whether the clip is an entire file of HumanAct12, named by `key`."""
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
@@ -57,7 +57,7 @@ def read_index(path: Path) -> list[IndexedClip]:
     """Reads `index.csv`.
 
     Raises:
-        UserError: If the file has another layout or names an unknown recording.
+        UserError: If the file has another layout, or names an unknown recording.
     """
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
@@ -88,8 +88,8 @@ class HumanML3D(T2MFolder):
     Args:
         path: the folder, which must contain texts and splits.
         exclude: names of motions to leave out. A mirrored copy has its own name.
-        amass: folder of AMASS's SMPL+H G release, as archives or unpacked, to create missing
-            motions. This also needs `index.csv` and HumanAct12's joints,
+        amass: folder of AMASS's SMPL+H G release, as archives or unpacked, from which missing
+            motions are created. This also requires `index.csv` and HumanAct12's joints,
             `pose_data/humanact12.zip`, in the folder or next to it.
         body_models: folder of the extended SMPL+H model.
         bone_lengths: 22 bone lengths, in meters, of the skeleton to which all motions are
@@ -125,14 +125,14 @@ class HumanML3D(T2MFolder):
     def count(self) -> int:
         """Returns the number of clips.
 
-        If `amass` is set, first creates missing motions from AMASS.
+        If `amass` is set, missing motions are first created from AMASS.
         """
         if self.amass:
             self._make(self.amass)
         return super().count()
 
     def check(self, fps: float) -> list[str]:
-        """Returns a line with the number of created motions, and a line per missing input."""
+        """Returns a line with the number of created motions, and one line per missing input."""
         if not self.amass:
             return super().check(fps)
         todo = self._todo()
@@ -156,7 +156,7 @@ class HumanML3D(T2MFolder):
     def _beside(self, *names: str) -> Path:
         """Returns the first of these names that exists in the folder or next to it.
 
-        If none of them exists, returns the path of the first name in the folder.
+        If none exists, returns the path of the first name in the folder.
         """
         candidates = [folder / name for name in names for folder in (self.path, self.path.parent)]
         return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
@@ -214,7 +214,7 @@ class HumanML3D(T2MFolder):
             remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
-        """Writes the mean and std of all motions of any length and split, with mirrored copies."""
+        """Writes the mean and std of all motions of any length and split, including mirrored copies."""
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
         if wrong := [
@@ -248,7 +248,7 @@ def _from_amass(
 def _write_features(
     folder: Path, representation: HumanML, row: IndexedClip, joints: np.ndarray
 ) -> None:
-    """Writes the features of a clip and its mirror image, first under temporary names."""
+    """Writes the features of a clip and of its mirror image, first under temporary names."""
     motion = torch.from_numpy(joints).double()
     with naming(f"clip {row.name} (data.source.exclude=[{row.name}] leaves it out)", ValueError):
         features = representation.encode_many([motion, representation.skeleton.mirror(motion)])
@@ -276,20 +276,20 @@ def _read_joints(path: Path) -> np.ndarray:
 
 
 class HumanML3DSMPL(MotionSource):
-    """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters of whole clips.
+    """FLAME's version of the data set (Kim et al., AAAI 2023): SMPL parameters of entire clips.
 
     There is one clip per caption, named NAME#0, NAME#1 ... As in FLAME's code, there are no
-    mirrored copies, no length limits and no cuts. A caption of a part is used for the whole
-    motion. In five subsets, the first frames of a recording were dropped. Unlike FLAME's code,
-    this class takes this into account, so that motion and caption match.
+    mirrored copies, length limits or cuts. A caption of a part is used for the entire motion. In
+    five subsets, the first frames of a recording were dropped. Unlike FLAME's code, this class
+    accounts for the dropped frames, so that motion and caption match.
 
     Args:
-        path: folder of HumanML3D with texts, splits and `index.csv`; no motions are needed.
+        path: folder of HumanML3D with texts, splits and `index.csv`. No motions are needed.
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
         humanact12: FLAME's `humanact12_processed.pkl`. Without this file, the clips of HumanAct12
             are left out.
-        published_split: train on the validation clips as well (FLAME's "final"). No clips are
-            then left for validation.
+        published_split: also train on the validation clips (FLAME's "final"). No clips are then
+            left for validation.
     """
 
     name = "humanml3d-smpl"
@@ -317,7 +317,7 @@ class HumanML3DSMPL(MotionSource):
             lacking = f"{len(absent)} clips have no text, such as {absent[0]}"
             raise FileNotFoundError(f"{self.folder.path}: {lacking}; unpack texts.zip again")
         used = [row for row in rows if self.humanact12 or not row.humanact12]
-        # Only originals are counted: mirrored copies are not used.
+        # Only originals are counted, because mirrored copies are not used.
         listed = sum(not name.startswith("M") for name in self.folder.names)
         excluded = sum(not name.startswith("M") for name in self.folder.exclude)
         self.leave_out("motions by data.source.exclude", excluded)
@@ -337,7 +337,7 @@ class HumanML3DSMPL(MotionSource):
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of AMASS, then the clips of HumanAct12."""
+        """Yields the clips of AMASS, followed by the clips of HumanAct12."""
         self.check_fps(fps, FPS)
         from_amass = by_recording(self.rows)
         for key, motions in self.amass.map(from_amass, _parameters, self.workers):

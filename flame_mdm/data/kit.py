@@ -1,7 +1,7 @@
 """KIT Motion-Language: a processed folder with 251 features, and joint positions as in TEMOS.
 
 Source: Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md`
-says what to download.
+lists the required downloads.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,10 +34,10 @@ class KIT(T2MFolder):
 class KITTemos(MotionSource):
     """Joints of the MMM model at 12.5 frames per second, with TEMOS's splits and limits.
 
-    The recordings have 100 frames per second, of which every eighth is used. Source: Petrovich,
-    Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. Training and validation leave out
-    motions of fewer than 10 or more than 500 frames. The test split keeps all motions, but only
-    their first caption. Ghosh et al.'s test clips have the attribute `ghosh_test`.
+    The recordings have 100 frames per second, of which every eighth frame is used. Source:
+    Petrovich, Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. Training and validation
+    leave out motions of fewer than 10 or more than 500 frames. The test split keeps all motions,
+    but only their first captions. Ghosh et al.'s test clips have the attribute `ghosh_test`.
 
     `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
     contains TEMOS's lists of these numbers.
@@ -60,13 +60,13 @@ class KITTemos(MotionSource):
 
     @cached_property
     def ghosh_test(self) -> set[str]:
-        """Names in Ghosh et al.'s test split; empty if there is no list of them."""
+        """Names in Ghosh et al.'s test split; empty if their list is missing."""
         file = self.splits / "ghosh-test"
         return set(read_text(file).split()) if file.is_file() else set()
 
     @cached_property
     def texts(self) -> dict[str, list[str]]:
-        """Captions of each motion in the splits. Motions without captions are absent."""
+        """Captions of each motion in the splits. Motions without captions are left out."""
         names, texts = self.names, {}
         required(self.path, self.get_motions)
         for name in names:
@@ -90,7 +90,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def frames(self) -> dict[str, int]:
-        """Number of frames, at 12.5 per second, of each motion with captions."""
+        """Number of frames, at 12.5 frames per second, of each motion with captions."""
         rows = {
             name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1
             for name in self.texts
@@ -104,7 +104,7 @@ class KITTemos(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields one clip per motion.
 
-        A test clip has all frames of its recording as `reference`.
+        The `reference` of a test clip contains all frames of its recording.
         """
         self.check_fps(fps, 12.5)
         for name, split in self.names.items():

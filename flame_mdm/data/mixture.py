@@ -1,4 +1,4 @@
-"""Several data sets as one. Every clip keeps the license of its data set."""
+"""Several data sets combined into one. Every clip keeps the license of its data set."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -21,18 +21,18 @@ def known_licenses() -> dict[str, dict[str, str]]:
 
 
 class Mixture(MotionSource):
-    """Clips of several data sets, one after the other.
+    """Clips of several data sets, one data set after the other.
 
     Args:
         parts: the data sets, by a name of your choice.
         use: purpose of the trained model. "any" refuses data sets with motions whose license is
-            unknown or allows only research. "research" accepts all data sets.
+            unknown or permits only research. "research" accepts all data sets.
     """
 
     name = "mixture"
     named_by_recipe = True
-    # Increase it with the version of any data set: its motions are then read differently here,
-    # too.
+    # Increase this number with the version of any data set, because its motions are then also read
+    # differently in a mixture
     version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
@@ -61,11 +61,11 @@ class Mixture(MotionSource):
         return {license for part in self.parts.values() for license in part.licenses()}
 
     def may_share_captions(self, license: str) -> bool:
-        """Returns whether the license allows any use of the clip, which includes its captions."""
+        """Returns whether the license permits any use of the clip, including its captions."""
         return known_licenses().get(license, {}).get("use") == "any"
 
     def check_licenses(self) -> None:
-        """Raises `UserError` if a license forbids the use that the recipe states."""
+        """Raises `UserError` if a license forbids the use stated in the recipe."""
         if self.use == "research":
             return
         for name, part in self.parts.items():
@@ -79,7 +79,7 @@ class Mixture(MotionSource):
                 )
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of each part. Actions with equal names get one number in all parts."""
+        """Yields the clips of each part. Actions with the same name have the same number in all parts."""
         self.check_licenses()
         names: dict[str, int] = {}
         for part in self.parts.values():
@@ -102,15 +102,15 @@ class Mixture(MotionSource):
         return [line for part in self.parts.values() for line in part.failure_lines()]
 
     def changed(self, store: Path) -> list[str]:
-        """Returns a line for each part with changed files."""
+        """Returns one line for each part with changed files."""
         return [line for part in self.parts.values() for line in part.changed(store)]
 
     def suit(self, representation: Representation) -> None:
-        """Fits each part to a representation."""
+        """Configures each part for a representation."""
         for part in self.parts.values():
             part.suit(representation)
 
     def check(self, fps: float) -> list[str]:
-        """Checks the licenses and returns the lines of all parts."""
+        """Checks the licenses, and returns the lines of all parts."""
         self.check_licenses()
         return [line for part in self.parts.values() for line in part.check(fps)]

@@ -19,8 +19,8 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# Seconds of work after which processes are started, if their number is not given. Starting them
-# takes about as long.
+# Seconds of work after which processes are started, if their number is not given. Starting the
+# processes takes about as long.
 PATIENCE = 2.0
 
 
@@ -38,9 +38,9 @@ def in_order(
     pool.
 
     Args:
-        function: must be picklable, like tasks and results.
+        function: must be picklable, like its tasks and results.
         tasks: any number of tasks.
-        workers: number of processes. 1 works in this process. 0 starts one process per core once
+        workers: number of processes. 1 = work in this process. 0 = start one process per core once
             the work has taken `PATIENCE` seconds.
 
     Raises:
@@ -82,15 +82,15 @@ _pool: _Pool | None = None  # the pool in use, if any
 @contextmanager
 def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     global _pool
-    # Processes are spawned, not forked: a fork would copy locks of this process's threads, which
-    # may have used torch.
+    # Processes are spawned instead of forked, because a fork would copy the locks of this process's
+    # threads, which may have used torch
     pool = _pool = _pool or _Pool(
         ProcessPoolExecutor(workers, get_context("spawn"), _start_worker), active_children()
     )
     pool.users += 1
     try:
         yield pool.executor
-    # After an error or Ctrl-C, the workers are killed: their tasks may take half an hour.
+    # After an error or Ctrl-C, the workers are killed, because their tasks may take half an hour
     except BaseException as error:
         if isinstance(error, GeneratorExit) and pool.users > 1:  # the others still need the pool
             raise
@@ -115,7 +115,7 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def _first(pending: deque[Future[Result]]) -> Result:
     """Returns the result of the first task, or raises the first error of any task.
 
-    Errors of later tasks are raised at once, because the first task may take long or never end.
+    Errors of later tasks are raised immediately, because the first task may take long or never end.
     """
     while True:
         for future in pending:
@@ -129,11 +129,11 @@ def _first(pending: deque[Future[Result]]) -> Result:
 def _start_worker() -> None:
     """Sets up a worker process.
 
-    The process uses one thread, ignores Ctrl-C, which the parent handles, and exits when the
-    parent dies.
+    The process uses a single thread, ignores Ctrl-C, which the parent process handles, and exits if
+    the parent process dies.
     """
-    # torch reads this variable when a task imports it. Importing torch here would slow down tasks
-    # that do not need it.
+    # torch reads this variable when a task imports torch. Importing torch here would slow down
+    # tasks that do not need it.
     os.environ["OMP_NUM_THREADS"] = "1"
 
     def follow() -> None:

@@ -1,6 +1,6 @@
 """Data sets kept on the training device.
 
-Batches are gathered there, without workers and copies.
+Batches are gathered on the device, without workers and copies.
 """
 
 import os
@@ -22,15 +22,16 @@ from flame_mdm.representations import Representation
 # free memory. The rest is for the model and its activations.
 SHARE = 4
 CHUNK = 1 << 16  # number of frames that are copied at once, so that copying takes little memory
-# Number of batches whose crops are drawn at once, which takes the host less time than one by one
-# and on a GPU needs only one copy for all of them
+# Number of batches whose crops are drawn together. This takes less host time than drawing them one
+# by one, and on a GPU, it needs only one copy for all of them.
 PLANNED = 16
 
 
 def free_memory(device: torch.device) -> int:
     """Returns the free memory of a device in bytes.
 
-    For devices other than GPUs, this is the memory that the system or the container can provide.
+    For devices other than GPUs, this is the memory that is available from the system or the
+    container.
     """
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
@@ -51,10 +52,10 @@ def free_memory(device: torch.device) -> int:
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns the frames of a store on a device, (N + 1, D). The last row is zeros, for padding.
+    """Returns the frames of a store on a device, (N + 1, D). The last row contains zeros, for padding.
 
-    Frames are normalized here. If the representation adapts cuts, frames are normalized later
-    instead.
+    The frames are normalized, unless the representation adapts cuts. In this case, they are
+    normalized later.
     """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
@@ -67,7 +68,7 @@ def resident_features(store: Store, representation: Representation, device: torc
 
 
 def adapts_cuts(representation: Representation) -> bool:
-    """Returns whether a representation changes the features of a cut (see `rebase`)."""
+    """Returns whether a representation changes the features of cuts; see `rebase`."""
     return type(representation).rebase is not Representation.rebase
 
 
@@ -109,7 +110,7 @@ class ResidentLoader:
     def _gathered(self, planned: list[list[Draw]]) -> Iterator[MotionBatch]:
         """Draws the crops of several batches at once, and yields the batches."""
         rows = np.array([index for draws in planned for index, _ in draws])
-        # All clips of a batch are drawn for the number of the first one.
+        # All clips of a batch are drawn with the number of the first clip.
         numbers = [draws[0][1] for draws in planned for _ in draws]
         first, length, caption = self.clips.draw(rows, numbers)
         sizes = [len(draws) for draws in planned]
@@ -123,7 +124,8 @@ class ResidentLoader:
         start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)
         frames = self.frames[: max(padded)]
         mask = frames < lengths[:, None]
-        # Past its last frame, a clip repeats it. Past the end of a sample are zeros.
+        # Past its last frame, a clip repeats this frame. Past the end of a sample, all entries are
+        # 0.
         rows_of_frames = torch.minimum(start[:, None] + frames, last[:, None]).masked_fill(
             ~mask, len(self.features) - 1
         )

@@ -1,14 +1,13 @@
 """Restricted reader of pickles.
 
-This module reads arrays, numbers, text, lists, tuples and dictionaries with text keys.
+This module reads arrays, numbers, text, lists, tuples and dictionaries with text keys. A pickle can
+name any function and have it called. This reader calls no function. It keeps the arguments and the
+state of each object, and creates arrays from the bytes among them. NumPy's own functions are not
+used for this, because a wrong byte in a dtype makes them crash.
 
-A pickle can name any function and have it called. This reader calls no function. It keeps the
-arguments and the state of each object, and creates arrays from the bytes among them. NumPy's own
-functions are not used for this, because a wrong byte in a dtype crashes them.
-
-Python's C unpickler allocates any amount of memory that a file declares, even a file of ten
-bytes. Therefore this reader is based on the unpickler in Python. No read may request more bytes
-than are left in the file. Content that a pickle repeats is counted at each repetition.
+Python's C unpickler allocates any amount of memory that a file declares, even for a file of ten
+bytes. Therefore, this reader is based on the Python version of the unpickler. No read may request
+more bytes than are left in the file. Content that a pickle repeats is counted at each repetition.
 """
 
 import pickle
@@ -25,7 +24,7 @@ from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
 # Each value counts as this number of bytes. Otherwise, a file of a few bytes could repeat a list
-# without end.
+# endlessly.
 VALUE = 512
 
 
@@ -52,13 +51,13 @@ BASES = (
     "__builtin__.object",
     "builtins.object",
 )
-"""Globals with which old protocols create an object of a class."""
+"""Globals with which old protocols create an object of a class"""
 
 
 class _Dictionary(dict[str, Any]):
     """A dictionary with text keys.
 
-    Keys of other types could be chosen so that all of them have the same hash.
+    Keys of other types could be chosen so that they all have the same hash.
     """
 
     def __setitem__(self, key: Any, value: Any) -> None:
@@ -70,7 +69,7 @@ class _Dictionary(dict[str, Any]):
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    `opaque` contains beginnings of names. An object whose global has such a name is read as its
+    `opaque` contains prefixes of names. An object whose global has such a name is read as its
     state.
     """
 
@@ -79,7 +78,7 @@ class _Unpickler(pickle._Unpickler):
     read: Callable[[int], bytes]
 
     def __init__(self, file: IO[bytes], size: int, opaque: tuple[str, ...]):
-        # Python 2 wrote the bytes of arrays in this encoding.
+        # Python 2 wrote the bytes of arrays in this encoding
         super().__init__(file, encoding="latin1")
         self._file_read = self.read_file
         self.file, self.size, self.opaque, self.expanded = file, size, opaque, 0
@@ -88,7 +87,7 @@ class _Unpickler(pickle._Unpickler):
         """Returns `size` bytes.
 
         Raises:
-            EOFError: If the file has fewer bytes; no memory is allocated in this case.
+            EOFError: If the file contains fewer bytes. No memory is allocated in this case.
         """
         if size > self.size - self.file.tell():
             raise EOFError("it ends too early")
@@ -98,7 +97,7 @@ class _Unpickler(pickle._Unpickler):
         """Returns the class of objects of a permitted global.
 
         Raises:
-            UnpicklingError: For other globals.
+            UnpicklingError: For all other globals.
         """
         name = f"{module_name}.{global_name}".replace("numpy._core.", "numpy.core.")
         if name in KINDS:
@@ -111,7 +110,7 @@ class _Unpickler(pickle._Unpickler):
         )
 
     def plain(self, value: Any) -> Any:
-        """Returns a value in which objects of the pickle are arrays, numbers and text."""
+        """Returns a value in which objects of the pickle are converted to arrays, numbers and text."""
         self.expanded += VALUE + (len(value) if isinstance(value, str | bytes | bytearray) else 0)
         check_expansion(self.expanded, self.size)
         match value:
@@ -120,14 +119,14 @@ class _Unpickler(pickle._Unpickler):
             case list() | tuple():
                 return type(value)(self.plain(item) for item in value)
             case _Object():
-                # The object only has the name of its class. Nothing was called to create it.
+                # The object contains only the name of its class. Nothing was called to create it.
                 return self.plain_object(type(value).__name__, value)
         return value
 
     def plain_object(self, name: str, value: _Object) -> Any:
         """Returns the array, number or text that an object describes.
 
-        For opaque objects, it returns their state.
+        For opaque objects, returns their state.
         """
         if name == ARRAY:
             _, shape, dtype, is_fortran, data = value.state
@@ -156,7 +155,7 @@ class _Unpickler(pickle._Unpickler):
         data = data.encode("latin1") if isinstance(data, str) else data
         return np.frombuffer(data, kind).reshape(shape, order=order)
 
-    # BUILD would call `__setstate__` or set attributes. Here, it only stores the state.
+    # BUILD would call `__setstate__` or set attributes. This version only stores the state.
     def _load_build(self) -> None:
         state = self.stack.pop()
         if not isinstance(self.stack[-1], _Object):
@@ -169,7 +168,7 @@ class _Unpickler(pickle._Unpickler):
         for key, value in zip(items[::2], items[1::2], strict=True):
             self.stack[-1][key] = value
 
-    # Python's version allocates the declared size before it reads.
+    # Python's version allocates the declared size before it reads
     def _load_bytearray8(self) -> None:
         self.append(bytearray(self.read(struct.unpack("<Q", self.read(8))[0])))
 
@@ -188,10 +187,11 @@ class _Unpickler(pickle._Unpickler):
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle of protocol 0 to 5.
 
-    Objects whose names begin with one of `opaque` are permitted, too. Their state replaces them.
+    Objects whose names begin with one of `opaque` are also permitted. They are replaced by their
+    state.
 
     Raises:
-        UserError: If the file is damaged or names other globals.
+        UserError: If the file is damaged, or names other globals.
     """
     size = regular_file(path)
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""A motion of a person who stands still, from which streams start by default."""
+"""A motion of a person who stands still, with which streams start by default."""
 
 import numpy as np
 from torch import Tensor
@@ -13,7 +13,7 @@ from flame_mdm.representations.skeleton import SMPL22
 def standing(representation: Representation, frames: int) -> Motion:
     """Returns a motion of a person who stands still, with the features of a representation.
 
-    The person is taken from the synthetic motions, so no data is needed.
+    The motion is taken from the synthetic motions, so no data is needed.
     """
     # Some representations have one row per pair of neighboring frames, so one frame is added.
     body = Body(np.random.default_rng(0), np.zeros(frames + 1))

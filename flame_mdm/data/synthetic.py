@@ -1,8 +1,8 @@
 """The synthetic data set: procedural motions with captions and exact attributes.
 
-It needs no download. `docs/synthetic.md` describes the grammar of the captions and the limits of
-the data set. To add an action, write its motion in `synthetic_motions`, a line in `MORE` of
-`synthetic_actions`, and its captions in `synthetic_more.yaml`.
+It needs no download. `docs/synthetic.md` describes the grammar of the captions and the limitations
+of the data set. To add an action, add its motion to `synthetic_motions`, a line to `MORE` in
+`synthetic_actions`, and its captions to `synthetic_more.yaml`.
 """
 
 import re
@@ -39,12 +39,12 @@ SIMULTANEOUS = 0.08
 CYCLIC = 0.04
 # Seconds of motion before and after such a part, in which the body starts and stops
 MARGIN = 1.0
-# Fraction of the training clips with captions that leave out attributes. Captions of val and test
-# state all of them, so that every attribute can be measured.
+# Fraction of the training clips with captions that omit attributes. Captions of val and test state
+# all attributes, so that every attribute can be measured.
 PARTIAL = 0.25
-# Attributes that each caption states
+# Attributes that every caption states
 ALWAYS = ("action", "while")
-# Values that a caption may leave out
+# Values that a caption may omit
 UNSAID = {"speed": "normal", "amount": "quarter"}
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")
@@ -56,8 +56,8 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")
 def content() -> dict[str, Any]:
     """Returns the grammars of both groups of actions as one grammar.
 
-    Captions have single keys, and the forms of verbs have their infinitives as keys. `core_verbs`
-    are the infinitives of the core actions.
+    Captions have single keys. The keys of verb forms are the infinitives. `core_verbs` contains the
+    infinitives of the core actions.
     """
     grammar = read_package_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_package_yaml(Path(__file__).with_name("synthetic_more.yaml"))
@@ -85,7 +85,7 @@ def draw_captions(
 ) -> tuple[list[str], Attributes]:
     """Draws `count` different captions of a clip. Also returns the attributes that they state.
 
-    If `incomplete` and the grammar has such captions, all of them leave out the same attributes.
+    If `incomplete` and the grammar contains such captions, all of them omit the same attributes.
     """
     everything = {
         name
@@ -94,8 +94,8 @@ def draw_captions(
     }
     captions: list[str] = []
     stated = everything
-    # The first caption that leaves out attributes determines which attributes all captions of the
-    # clip leave out.
+    # The first caption that omits attributes determines which attributes all captions of the clip
+    # omit.
     for _ in range(30 if incomplete else 0):
         caption, said = _sentence(rng, attributes)
         if said != everything:
@@ -143,9 +143,9 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
 
 
 def _template(rng: np.random.Generator, attributes: Attributes) -> str:
-    """Returns a template of the captions.
+    """Returns a template for captions.
 
-    For simultaneous actions, the templates of both are inserted into it.
+    For simultaneous actions, the templates of both actions are inserted into it.
     """
     grammar = content()
     if "while" not in attributes:
@@ -161,7 +161,7 @@ def _template(rng: np.random.Generator, attributes: Attributes) -> str:
 
 
 def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str, int]]) -> str:
-    """Returns the text with its verbs in one of the tenses."""
+    """Returns the text with all verbs in one of the tenses."""
     auxiliary, column = _one(rng, tenses)
 
     def form(verb: re.Match[str]) -> str:
@@ -177,7 +177,7 @@ def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str,
 def entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
     """Returns the entry for the action and one of its attributes, such as "walk left".
 
-    Without such an entry, returns the entry for the action, or None.
+    If there is no such entry, returns the entry for the action, or None.
     """
     action = str(attributes["action"])
     keys = [f"{action} {value}" for value in attributes.values()] + [action]
@@ -189,7 +189,7 @@ def _one(rng: np.random.Generator, choices: Any) -> Any:
 
 
 def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in s."""
+    """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in seconds."""
     margin = round(MARGIN / (t[1] - t[0])) if attributes.get("ends") == "cycle" else 0
     times = np.arange(len(t) + 2 * margin) * (t[1] - t[0]) if margin else t
     body = Body(rng, times, entry(content()["widths"], attributes))
@@ -217,7 +217,7 @@ class Synthetic(MotionSource):
         actions: "core", 22 actions, or "all", which adds 54 actions, clips of two simultaneous
             actions, and parts of cycles.
         core_share: with all actions, the fraction of clips that show one of the 22 actions, drawn
-            as with "core". The other clips are drawn from all actions.
+            as with "core". All other clips are drawn from all actions.
     """
 
     name = "synthetic"
@@ -275,7 +275,7 @@ class Synthetic(MotionSource):
         seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
         name = f"synthetic_{'all_' if self.everything else ''}{self.seed}_{index:06d}"
         motion = _joints(rng, np.arange(round(seconds * fps) + 1) / fps, attributes)
-        # Words have their own generator, so that a change of the grammar changes no motion.
+        # Words have their own generator, so that a change to the grammar changes no motion.
         return self.described(
             name, motion, attributes, np.random.default_rng((self.seed, index, 1))
         )
@@ -323,7 +323,7 @@ class Synthetic(MotionSource):
 def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
     """Returns fixed prompts and their attributes.
 
-    These prompts are for samples on dashboards and for `evaluators.metrics.attributes`.
+    They are used for samples on dashboards and for `evaluators.metrics.attributes`.
 
     Args:
         count: number of prompts, counted from the first. Default: all.
@@ -337,7 +337,7 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
     """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes.
 
-    The attributes can be the attributes of a prompt.
+    For example, they are the attributes of a prompt.
     """
     name = str(attributes["action"])
     drawn = attributes

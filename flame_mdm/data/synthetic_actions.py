@@ -1,8 +1,8 @@
 """The actions of the synthetic data set: motions, frequencies and attributes.
 
 `CORE` contains the actions of the data set `synthetic`. `MORE` contains the actions that
-`Synthetic(actions="all")` adds. `CYCLES` are its clips that begin and end in the middle of an
-action. `BASES` and `GESTURES` are combined in its clips of two simultaneous actions.
+`Synthetic(actions="all")` adds. `CYCLES` contains the actions whose clips may begin and end in the
+middle of the action. `BASES` and `GESTURES` are combined in clips of two simultaneous actions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,18 +22,18 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 
 
 class Action(NamedTuple):
-    """An action, and the attributes of its clips besides its name."""
+    """An action, and the attributes of its clips in addition to its name."""
 
-    # Moves a body at times (F,) in seconds, as the attributes say
+    # Moves a body at times (F,) in seconds, according to the attributes
     motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
     # Frequency of the action, relative to the other actions
     share: float = 1
-    # Values of each attribute: equally frequent, or with their probabilities. Attributes are
-    # drawn in this order; `speed` is drawn only for the direction forward.
+    # Values of each attribute, equally frequent or with their probabilities. Attributes are drawn
+    # in this order. `speed` is drawn only for the direction forward.
     values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
     # Minimum duration
     seconds: float = 0.0
-    # Whether the motion is played backward
+    # Whether the motion is played backwards
     reverse: bool = False
 
     def draw(self, rng: np.random.Generator, name: str) -> Attributes:

@@ -20,8 +20,8 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy, read_text
 
-# Frames per second with which the tags `from` and `to` are converted to frames. The published
-# code uses 20 for KIT-ML, too, although its motions have 12.5.
+# Frames per second with which the tags `from` and `to` are converted to frames. The published code
+# also uses 20 for KIT-ML, although its motions have 12.5 frames per second.
 TAG_FPS = 20
 MAX_LENGTH = 200  # motions and cuts with this number of frames or more are left out
 MAX_TOKENS = 20
@@ -30,7 +30,7 @@ MAX_TOKENS = 20
 class Description(NamedTuple):
     """One line of a text file.
 
-    The line describes the motion from `begin` to `end`, in seconds; both are 0 for the entire
+    The line describes the motion from `begin` to `end`, in seconds. Both are 0 for the entire
     motion.
     """
 
@@ -43,7 +43,7 @@ class Description(NamedTuple):
 class Cut(NamedTuple):
     """One item of the data set: a part of a motion with its descriptions.
 
-    The part is frames `start` to `start + length`.
+    The part consists of the frames `start` to `start + length`.
     """
 
     id: str
@@ -56,7 +56,7 @@ class Cut(NamedTuple):
     ) -> Clip:
         """Returns the clip of a motion.
 
-        `facts` are attributes besides the tokens. Empty facts are left out.
+        `facts` are attributes in addition to the tokens. Empty facts are left out.
         """
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
         attributes = facts | ({"tokens": tokens} if all(tokens) else {})
@@ -65,7 +65,7 @@ class Cut(NamedTuple):
 
 
 def parse(text: str, where: str) -> list[Description]:
-    """Parses the descriptions in a text file. As published, a NaN tag means 0.
+    """Parses the descriptions in a text file. As in the published code, a NaN tag means 0.
 
     `where` names the file in error messages.
     """
@@ -86,9 +86,9 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion of `frames` frames, in the published order.
 
-    The description of a part gives a separate item, NAME@from-to. A second description of the
-    same part gives NAME@from-to#2. As published, a motion that is too short or too long gives no
-    items, even if parts of it would fit.
+    The description of a part gives a separate item, NAME@from-to. A second description of the same
+    part gives NAME@from-to#2. As in the published code, a motion that is too short or too long
+    gives no items, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
@@ -110,7 +110,7 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
 
 
 def words_of(caption: str) -> list[str]:
-    """Returns the words of a caption, without capitals and punctuation."""
+    """Returns the words of a caption in lower case, without punctuation."""
     return re.findall(r"[^\W_]+", caption.lower())
 
 
@@ -139,7 +139,7 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 
 
 class T2MFolder(MotionSource):
-    """A processed folder. Cuts and mirrored copies have the split of their motion, their source.
+    """A processed folder. Cuts and mirrored copies are in the split of their motion, their source.
 
     The attribute `tokens` contains the words with their parts of speech, one list per caption. A
     mirrored copy has its own name, by which it can be excluded.
@@ -218,7 +218,7 @@ class T2MFolder(MotionSource):
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the figures of `published.yaml`. The figures do not count mirrored copies."""
+        """Returns the statistics of `published.yaml`, which do not count mirrored copies."""
         texts = [
             text for name, texts in self.texts.items() if not name.startswith("M") for text in texts
         ]
@@ -240,7 +240,7 @@ class T2MFolder(MotionSource):
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")
-        # A file whose name begins with a dot was left unfinished by a killed process.
+        # A file whose name begins with a dot was left unfinished by a killed process
         return {path.stem for path in files if not path.name.startswith(".")}
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:
@@ -256,7 +256,7 @@ class T2MFolder(MotionSource):
         return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        """Counts why a motion gives no item, or how many of its captions are left out."""
+        """Counts why a motion gives no items, or how many of its captions are left out."""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:

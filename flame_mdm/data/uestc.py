@@ -27,13 +27,13 @@ TRAIN_SUBJECTS = (
 )
 # fmt: on
 """Training subjects of the cross-subject protocol: 51 of 118. The other 67 are for testing."""
-# Number of training subjects that our split uses for validation
+# Number of training subjects that the project's own split uses for validation
 VAL_SUBJECTS = 5
 # Minimum length of a training clip: three quarters of 60
 MIN_FRAMES = 45
 # Index of the middle of the hips in VIBE's 49 joints; ACTOR uses it as the root
 ROOT = 8
-# Focal length and image size in pixels that ACTOR assumes, because VIBE estimates only a scale.
+# Focal length and image size in pixels that ACTOR assumes, because VIBE estimates only a scale
 FOCAL_LENGTH = 500.0
 IMAGE_SIZE = 540.0
 NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
@@ -53,9 +53,9 @@ class Video(NamedTuple):
 class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl` in front view, as raw SMPL motions.
 
-    As published, training clips of fewer than 45 frames are left out, and all test clips are
-    kept. The published split trains on all 51 training subjects. Our split uses 5 of these
-    subjects for validation.
+    As in the published data set, training clips of fewer than 45 frames are left out, and all test
+    clips are kept. The published split trains on all 51 training subjects. The project's own split
+    uses 5 of these subjects for validation.
     """
 
     name = "uestc"
@@ -68,14 +68,14 @@ class UESTC(MotionSource):
     def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Names of the actions.
 
-        The names are read from the data, because models need their number early.
+        They are read from the data, because models need the number of actions early.
         """
         return tuple(self._lines("action_classes.txt"))
 
     def count(self) -> int:
         """Returns the number of videos.
 
-        The number includes the few videos that turn out to be too short when they are read.
+        This includes the few videos that turn out to be too short when they are read.
         """
         return len(self.used)  # including the few that are left out when their poses are read
 
@@ -164,19 +164,19 @@ class UESTC(MotionSource):
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:
     """Converts VIBE's estimates to a raw motion (F, 75) float32.
 
-    VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y
-    = the shift. The depth z follows from the scale: at z = f / (s w / 2), a camera of focal
-    length f shows the body in that size, in an image w pixels wide. Videos of side 2 are rotated
+    VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y =
+    the shift. The depth z follows from the scale: at z = f / (s w / 2), a camera with focal length
+    f shows the body at that size, in an image that is w pixels wide. Videos of side 2 are rotated
     about the vertical axis by their view.
 
     Args:
         pose: (F, 72), axis-angle vectors.
         root: (F, 3), root position relative to the body.
-        camera: (F, 4), scales sx (used) and sy, then the shift.
+        camera: (F, 4), scales sx (used) and sy, followed by the shift.
         video: the video.
 
     Returns:
-        Translation relative to the first frame, and pose, in camera axes.
+        The translation relative to the first frame, and the pose, in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)

@@ -20,7 +20,8 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_package_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
-# Distance in meters. A clip counts as still if no joint moves farther from its first position.
+# Distance in meters. A clip counts as still if no joint moves farther than this from its first
+# position.
 STILL_DISTANCE = 0.01
 
 
@@ -30,9 +31,9 @@ def report(data: MotionDataModule) -> dict[str, Any]:
     The report is written into the folder of the store.
 
     Returns:
-        The report: data set, hashes of the `files`, `figures` next to published ones, numbers of
-            captions and actions, lengths, `still` clips, `duplicates`, differences of the
-            statistics, and `excluded` clips.
+        The report: data set, hashes of the `files`, `figures` with the published figures, numbers
+        of captions and actions, lengths, `still` clips, `duplicates`, differences between
+        statistics, and `excluded` clips.
 
     Raises:
         FileNotFoundError: If the data set is not prepared.
@@ -83,7 +84,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "duplicates_across_splits": sum(
             len({clip.split for clip in group}) > 1 for group in duplicates
         ),
-        # Mean and std of the store may be published values. Therefore, they are compared with
+        # Mean and std in the store may be published values. Therefore, they are compared with
         # values computed from the training clips.
         "statistics": {
             "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
@@ -110,7 +111,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns the figures of a report that differ from published ones, with differences."""
+    """Returns the figures of a report that differ from the published figures, with the differences."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()
@@ -125,7 +126,7 @@ def deviations(content: dict[str, Any]) -> list[str]:
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
     """Returns figures of the store and of its raw data.
 
-    If both have a figure, the figure of the raw data is returned.
+    If a figure exists for both, the figure of the raw data is returned.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}
@@ -159,7 +160,8 @@ def _anomalies(
 ) -> tuple[list[Entry], list[list[Entry]]]:
     """Returns the clips without movement, and groups of clips with bit-identical motions.
 
-    Clips that share all their frames are one motion: they differ only in their captions.
+    Clips that share all their frames count as one motion, because they differ only in their
+    captions.
 
     Raises:
         UserError: If a frame is not finite.

@@ -1,1 +1,1 @@
-"""Procedural motions of the synthetic data set. One function per action moves the body."""
+"""Procedural motions of the synthetic data set. Each action is a function that moves the body."""

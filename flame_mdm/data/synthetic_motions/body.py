@@ -1,17 +1,17 @@
 """The body of the synthetic motions: curves that an action sets, and its kinematics.
 
 Joint angles move the upper body by forward kinematics. The legs follow planned footprints by
-two-bone inverse kinematics, so a foot on the ground does not move at all. Hands that reach for
-something use inverse kinematics, too. Bone lengths are close to HumanML3D's reference skeleton
-(Guo et al. 2022).
+two-bone inverse kinematics, so that a foot on the ground does not move at all. Hands that reach for
+something also use inverse kinematics. Bone lengths are close to HumanML3D's reference skeleton (Guo
+et al. 2022).
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-# Offsets from the parent in meters, standing with hanging arms, facing +z. x is for the left
-# side; the right side is mirrored.
+# Offsets from the parent in meters, for a standing body with hanging arms that faces +z. x is for
+# the left side; the right side is mirrored.
 HIP = (0.075, -0.075, 0.0)
 SPINE1 = (0.0, 0.131, -0.015)
 SPINE2 = (0.0, 0.142, 0.0)
@@ -62,7 +62,7 @@ def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 class Body:
-    """Curves over the frames that actions change. Initially, the person stands and breathes.
+    """Curves over time that actions change. Initially, the person stands and breathes.
 
     Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
     """
@@ -70,7 +70,7 @@ class Body:
     def __init__(
         self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
     ):
-        """`width` is half the distance between the feet in meters, or its range.
+        """`width` is half the distance between the feet in meters, or a range of it.
 
         None = the width of a relaxed stance.
         """
@@ -90,7 +90,8 @@ class Body:
         )[:, None]
         # Rise of the shoulders in addition to the rise with the arms
         self.shoulders = np.zeros((2, len(t)))
-        # Whether a foot that is too far away is pulled toward its hip, instead of a longer shin
+        # Whether a foot that is too far away is pulled toward its hip, instead of lengthening the
+        # shin
         self.keeps_legs = False
         self.reaches: list[tuple[int, np.ndarray, np.ndarray, str]] = []
 
@@ -114,7 +115,7 @@ class Body:
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
         """Blends an arm by `weight` (F,) into a pose.
 
-        The pose is four angles: forward, sideways, turned outward, elbow.
+        The pose consists of four angles: forward, sideways, turned outward, elbow.
         """
         for angle, target in enumerate(pose):
             self.arms[side, angle] += weight * (target - self.arms[side, angle])
@@ -128,31 +129,31 @@ class Body:
     ) -> None:
         """Moves a wrist by `weight` (F,) from its position to a point (3,) or (F, 3) in meters.
 
-        Without weight, the angles of the arm determine the position of the wrist. `frame` is
-        world, chest or head. For chest and head, the point is relative to this joint, with x to
-        the left and z ahead.
+        If the weight is 0, the angles of the arm determine the position of the wrist. `frame` is
+        world, chest or head. For chest and head, the point is relative to this joint, with x to the
+        left and z ahead.
         """
         self.reaches.append((side, weight[:, None], np.asarray(target, float), frame))
 
     def joints(self) -> np.ndarray:
         """Returns joint positions (F, 22, 3) in meters, y up."""
-        # Footprints are fixed first, so that feet never slide. The pelvis is placed above them.
-        # Inverse kinematics connects the hips to the feet. Spine, head and arms follow from
-        # angles.
+        # Footprints are determined first, so that feet never slide. The pelvis is placed above
+        # them. Inverse kinematics connects the hips to the feet. Spine, head and arms are computed
+        # from angles.
         out = np.empty((len(self.t), 22, 3))
         yaw, (pitch, twist, roll) = self.heading, self.pelvis
         pelvis = rotation(1, yaw) @ rotation(1, twist) @ rotation(0, pitch) @ rotation(2, -roll)
         hips = np.stack([pelvis @ np.array([SIGN[side] * HIP[0], *HIP[1:]]) for side in (0, 1)])
 
-        # A raised heel rotates about the toes, and raised toes rotate about the ankle, so the
-        # part on the floor does not move.
+        # A raised heel rotates about the toes, and raised toes rotate about the ankle, so that the
+        # part of the foot on the floor does not move.
         foot = rotation(1, self.foot_yaw) @ rotation(0, self.foot_pitch)
         toe_offset = foot @ np.array(FOOT)
         heel_up = (self.foot_pitch > 0)[..., None]
         ankles = self.ankles + heel_up * (rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
 
-        # The pelvis sinks if a leg would not reach its footprint. This makes the pelvis of a walk
-        # bob.
+        # The pelvis is lowered if a leg could not reach its footprint. In a walk, this makes the
+        # pelvis bob.
         reach = 0.998 * (THIGH + SHIN)
         out[:, 0] = self.position
         apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
@@ -204,7 +205,7 @@ class Body:
             shoulder, elbow, wrist = (out[:, joint + side] for joint in (16, 18, 20))
             origin, axes = frames[frame]
             goal = wrist + weight * (origin + (axes @ target[..., None])[..., 0] - wrist)
-            # Elbows point outward. The elbows of an upright body point backward, not forward.
+            # Elbows point outward. In an upright body, they point backward, not forward.
             toward = (
                 elbow
                 - shoulder
@@ -220,10 +221,10 @@ def bent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the middle and the end (F, 3) of a limb of two bones that reaches for `end`.
 
-    The limb bends toward the direction `toward` (F, 3).
+    The limb bends in the direction `toward` (F, 3).
     """
-    # The bones and the line from start to end form a triangle. A limb is never completely
-    # straight or folded, so the direction in which it bends is always defined.
+    # The bones and the line from start to end form a triangle. A limb is never completely straight
+    # or folded, so that the direction in which it bends is always defined.
     line = end - start
     length = np.linalg.norm(line, axis=-1, keepdims=True)
     line /= length
@@ -250,7 +251,7 @@ def step(
 ) -> None:
     """Moves a foot by (x, y, z) in meters between two times.
 
-    The heel leaves the floor first, at the angle `heel`. A foot that lands higher than it stood
+    The heel leaves the floor first, at the angle `heel`. If a foot lands higher than it stood, it
     rises before it moves ahead.
     """
     s = np.clip((body.t - start) / (end - start), 0, 1)
@@ -265,7 +266,7 @@ def step(
 
 
 def follow_feet(body: Body) -> None:
-    """Carries the pelvis along with the point between the feet, on the ground."""
+    """Moves the pelvis along with the midpoint between the feet, on the ground."""
     middle = body.ankles.mean(0)[:, [0, 2]]
     body.position[:, [0, 2]] += middle - middle[0]
 
@@ -282,7 +283,7 @@ def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
 def events(
     rng: np.random.Generator, t: np.ndarray, count: int, slowest: float
 ) -> list[tuple[float, float]]:
-    """Returns (start, seconds) of `count` equally long repetitions, at a random time."""
+    """Returns (start, seconds) of `count` equally long repetitions, at random times."""
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]

@@ -136,7 +136,7 @@ def slash(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 def fall(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
     """Loses balance, drops backward to the floor, and stays on the back.
 
-    Faster than lying down.
+    This motion is faster than lying down.
     """
     start, end = rng.uniform(0.15, 0.3), rng.uniform(1.35, 1.5)
     lie(

@@ -50,7 +50,7 @@ def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
     aside = rng.uniform(-0.1, 0.35)
-    # The lean of the trunk is subtracted from the arm, so that it points ahead and not down.
+    # The lean of the trunk is subtracted from the arm, so that the arm points ahead and not down.
     bent = body.pelvis[0] + body.spine[0]
     body.move_arm(side, out, (rng.uniform(1.4, 1.6) + bent, aside, -0.4, 0.06))
     body.spine[1] -= 0.2 * SIGN[side] * out
@@ -58,7 +58,7 @@ def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def beckon(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Holds a forearm out and bends it toward the body again and again."""
+    """Holds out a forearm and bends it toward the body repeatedly."""
     (side,) = SIDES[str(requested["side"])]
     out = hold(rng, t)
     pull = beat(t, rng.uniform(1.1, 1.4), rng.random())
@@ -153,7 +153,7 @@ def phone(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def type_keys(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Sits at a desk; both hands go up and down in turn over a keyboard."""
+    """Sits at a desk and moves both hands up and down in turn over a keyboard."""
     still = np.ones_like(t)
     seat(body, still, 0 * still)
     body.reaches.clear()
@@ -198,7 +198,7 @@ def knock(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def guitar(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Strums with the right hand; the left hand moves along the neck."""
+    """Strums with the right hand while the left hand moves along the neck."""
     on = ease(t, 0.0, 0.6)
     rhythm = rng.uniform(1.6, 2.1)
     strum, slide = beat(t, rhythm), beat(t, rng.uniform(0.4, 0.6), rng.random())
@@ -290,7 +290,7 @@ def lift_box(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
 
 
 def applaud(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Claps quickly, again and again."""
+    """Claps quickly and repeatedly."""
     on, open_ = hold(rng, t), 0.5 + 0.5 * beat(t, rng.uniform(2.2, 2.8), rng.random())
     height = rng.uniform(-0.08, 0.02)
     for side, sign in enumerate(SIGN):

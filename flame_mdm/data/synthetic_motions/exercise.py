@@ -85,7 +85,7 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
         pulse(t, s, s + 0.42 * d, s + 0.5 * d, s + d)
         for s, d in events(rng, t, int(requested["count"]), 1.2)
     )
-    # slope of the line from the feet to the shoulders
+    # Slope of the line from the feet to the shoulders
     slope = 0.27 - rng.uniform(0.17, 0.2) * down
     body.foot_pitch += LYING_HEEL
     body.foot_yaw *= 0.2
@@ -111,7 +111,7 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
 def _toes(heel: float) -> tuple[float, float]:
     """Returns the position of the toes of a foot with a raised heel, in meters.
 
-    The two numbers are the distances ahead of and below the ankle.
+    The two numbers are the distances in front of and below the ankle.
     """
     _, low, ahead = FOOT
     return ahead * np.cos(heel) + low * np.sin(heel), ahead * np.sin(heel) - low * np.cos(heel)

@@ -1,4 +1,4 @@
-"""Motions on the spot: gestures of arms and head, jumps, kicks, bends, sitting and lying."""
+"""Motions in place: gestures of arms and head, jumps, kicks, bends, sitting and lying."""
 
 import numpy as np
 
@@ -276,7 +276,7 @@ def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
 
 
 def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Sits down on a seat that is not shown."""
+    """Sits down on an invisible seat."""
     start, seconds = rng.uniform(0.1, 0.25), rng.uniform(1.25, 1.5)
     end = start + seconds
     seat(
@@ -287,7 +287,7 @@ def sit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
 
 
 def rise(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Stands up from a seat that is not shown."""
+    """Stands up from an invisible seat."""
     start, seconds = rng.uniform(0.35, 0.5), rng.uniform(1.25, 1.45)
     end = start + seconds
     seat(

@@ -9,9 +9,10 @@ import numpy as np
 
 from flame_mdm.data.synthetic_motions.body import Body, ease, rotation
 
-# Curves of a body that change to the values of the second motion, and the axis of their frames
+# Curves of a body that are blended into the values of the second motion, and the axis of their
+# frames
 ANGLES = {"pelvis": -1, "spine": -1, "head": -1, "arms": -1, "shoulders": -1, "foot_pitch": -1}
-# Curves of the second motion that are moved to where the first motion ends in the world
+# Curves of the second motion that are moved to the place in the world where the first motion ends
 PLACES = {"position": 0, "heading": -1, "ankles": 1, "foot_yaw": -1}
 FRAMES = ANGLES | PLACES
 PLANTED = 0.05  # distance in meters; a foot that has to move farther takes a step
@@ -22,15 +23,16 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
     """Returns a body that moves like `first` and then, from the end of `first`, like `second`.
 
     The changes during the second motion are added to the end of the first motion. The difference
-    between the end of the first and the beginning of the second motion fades, except for the
-    place in the world. A foot that is elsewhere at the beginning of the second motion takes a
-    step to this place.
+    between the end of the first and the beginning of the second motion is faded out, except for the
+    position in the world. A foot that has another position at the beginning of the second motion
+    takes a step to this position.
 
     Args:
         first: a body at evenly spaced times.
         second: a body at times with the same spacing.
-        overlap: how many seconds before the end of the first motion the second one begins.
-        blend: seconds after the end of the first motion until the difference has faded.
+        overlap: number of seconds by which the second motion begins before the end of the first
+            motion.
+        blend: seconds after the end of the first motion in which the difference is faded out.
     """
     spacing = second.t[1] - second.t[0]
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1
@@ -105,7 +107,8 @@ def frames_of(body: Body, frames: np.ndarray) -> Body:
 def _padded(values: np.ndarray, axis: int, start: int, frames: int) -> np.ndarray:
     """Returns values with `frames` frames along `axis`; the given values begin at frame `start`.
 
-    The first given value is repeated before `start`, and the last one after its frame.
+    The first given value is repeated before `start`, and the last given value is repeated at the
+    end.
     """
     length = values.shape[axis]
     return np.take(values, np.clip(np.arange(frames) - start, 0, length - 1), axis)

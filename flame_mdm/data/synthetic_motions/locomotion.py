@@ -17,7 +17,7 @@ from flame_mdm.data.synthetic_motions.body import (
 )
 
 Path = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Fraction (N,) of a path, and its length in meters -> x (N,), z (N,) and heading (N,) there."""
+"""Signature of a path: fraction (N,) of the path, length in meters -> x (N,), z (N,) and heading (N,)."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Gait:
     lift: float
     # Angle of the heel when the foot leaves the floor
     heel_off: float
-    # Angle of the toes when the foot lands; negative: the toes land first
+    # Angle of the toes when the foot lands. If it is negative, the toes land first.
     toe_up: float
     # Half the distance between the tracks of the feet
     width: float
-    # How much the pelvis is lowered while moving
+    # How far the pelvis is lowered while the body moves
     sink: float = 0.03
-    # Amplitude of the pelvis; it is highest when both feet are in the air
+    # Amplitude of the vertical motion of the pelvis, which is highest when both feet are in the air
     bounce: float = 0.0
     # Distance by which footprints are shifted backward, relative to the pelvis
     behind: float = 0.0
@@ -53,13 +53,13 @@ def walk_along(
     The foot `first` takes the first step. Returns how far the right foot is in front of the left
     foot (F,), in meters, relative to the heading of the pelvis.
     """
-    # The pelvis accelerates, keeps its speed and stops. A footprint is where the pelvis will be
-    # in the middle of the foot's next stance, shifted sideways by the width of the gait. The feet
-    # are therefore under the body on average.
+    # The pelvis accelerates, keeps its speed and stops. Each footprint is where the pelvis will be
+    # in the middle of the foot's next stance, shifted sideways by the width of the gait. On
+    # average, the feet are therefore below the body.
     t, start = body.t, rng.uniform(0.08, 0.18)
     # Time until the last foot is down
     seconds = t[-1] - rng.uniform(0.06, 0.16) - start
-    # A run ends with steps of a walk, in which the feet never leave the ground together.
+    # A run ends with walking steps, in which the feet never leave the ground at the same time.
     landing = min(gait.swing, 0.82)
     count = max(1, round(seconds / gait.step - landing))
     gait = replace(gait, step=seconds / (count + landing))
@@ -96,8 +96,8 @@ def walk_along(
         goal = np.array(
             [px + across * cos + along * sin, pz - across * sin + along * cos, yaw + yaw0[side]]
         )
-        # In the air, the foot eases from footprint to footprint. Its highest point is early in
-        # the swing, because it has just been lifted. Smaller steps are lower.
+        # In the air, the foot moves smoothly from footprint to footprint. Its highest point is
+        # early in the swing, because it has just been lifted. Smaller steps are lower.
         s = np.clip((t - lift_off) / swing, 0, 1)
         share = ease(s, 0.08, 0.96)
         distance = np.hypot(*(goal - prints[side])[:2])
@@ -122,7 +122,7 @@ def walk_along(
 
 
 def straight(x: float, z: float) -> Path:
-    """Returns a path in the direction (x, z). Its length is the length of (x, z)."""
+    """Returns a straight path along the vector (x, z), whose length is the length of the path."""
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 
@@ -181,7 +181,7 @@ def run(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
     )
     apart = walk_along(body, rng, gait, rng.uniform(2.4, 3.0), straight(0, 1), RIGHT)
     speed = np.gradient(body.position[:, 2], t)
-    # The body leans forward to speed up, and back to stop.
+    # The body leans forward to accelerate, and backward to stop.
     body.pelvis[0] += 0.025 * speed + 0.015 * np.gradient(speed, t)
     body.spine[0] += 0.05 * speed
     for side in (0, 1):
@@ -213,7 +213,7 @@ def turn(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def dance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Steps from side to side on the beat, with hips and arms that swing along."""
+    """Steps from side to side on the beat, with swinging hips and arms."""
     beat, start, first = rng.uniform(0.44, 0.54), rng.uniform(0.1, 0.2), rng.choice(SIGN)
     going = pulse(t, start - 0.1, start + 0.4, t[-1] - 0.45, t[-1])
     phase = np.pi * (t - start) / beat

@@ -1,4 +1,4 @@
-"""Other ways to move, such as sneaking, limping, marching, climbing or carrying."""
+"""Further ways to move, such as sneaking, limping, marching, climbing or carrying."""
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def limp(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
     sign = SIGN[side]
     gait = Gait(rng.uniform(0.52, 0.6), 0.82, 0.12, 0.35, 0.1, 0.09)
     apart = walk_along(body, rng, gait, rng.uniform(0.5, 0.7), straight(0, 1), 1 - side)
-    # The weight is on the sore leg while the other foot is in the air.
+    # The weight is on the sore leg while the other foot is in the air
     loaded = np.clip((body.ankles[1 - side, :, 1] - ANKLE_HEIGHT) / 0.12, 0, 1)
     sore = body.ankles[side, :, 1]
     sore += 0.6 * (ANKLE_HEIGHT - sore)
@@ -133,11 +133,11 @@ def run_in_place(
 def _tread(
     body: Body, frequency: float, lift: float, ahead: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lifts the feet in turn on the spot, the left foot first.
+    """Lifts the feet in turn in place, the left foot first.
 
-    A foot is lifted by `lift` meters and moves `ahead` meters in the air. Returns two curves
-    (F,): a wave that is 1 when the left foot is up and -1 when the right foot is up, and whether
-    the body is moving.
+    A foot is lifted by `lift` meters and moves `ahead` meters in the air. Returns two curves (F,).
+    The first is a wave that is 1 when the left foot is up and -1 when the right foot is up. The
+    second is whether the body is moving.
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))
@@ -239,7 +239,7 @@ def climb_ladder(
 def climb_stairs(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
-    """Climbs stairs with one foot on each stair. The last step brings the feet side by side."""
+    """Climbs stairs, placing one foot on each stair. The last step brings the feet side by side."""
     start, seconds = rng.uniform(0.05, 0.15), rng.uniform(0.5, 0.6)
     steps = int((t[-1] - 0.1 - start) / seconds)
     seconds = (t[-1] - 0.1 - start) / steps

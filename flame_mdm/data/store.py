@@ -5,10 +5,13 @@ changed:
 
     features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
     clips.jsonl      one clip per line: id, start, length, split, source, captions, action,
-    attributes statistics.npz   mean and std (D,) of the training frames, used by the
-    representation for normalization references.npz   joints (F', J, 3) float32 by clip id, at the
-    frame rate of the recording, if the data set has them store.json       representation, frame
-    rate, options of the source, counts, hashes of the other files, fingerprint
+    attributes
+    statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
+    references.npz   joints (F', J, 3) float32 by clip id, at the frame rate of the recording, if the data
+                     set contains them
+    store.json       representation, frame rate, options of the source, counts, hashes of the other
+    files,
+                     fingerprint
 
 Verification adds a report to the folder, `verify.json`.
 """
@@ -62,7 +65,7 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 class Entry:
     """One clip of a store: frames `start` to `start + length` of the packed array.
 
-    `Clip` describes the other fields.
+    `Clip` describes all other fields.
     """
 
     id: Annotated[str, Field(min_length=1)]
@@ -111,8 +114,8 @@ class Store:
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
-        # The fingerprint is part of results. Equal clips and options have the same fingerprint on
-        # every machine.
+        # The fingerprint is part of results. The same clips and options have the same fingerprint
+        # on every machine.
         self.fingerprint: str = self.info["fingerprint"]
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
@@ -148,7 +151,7 @@ class Store:
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
         """Returns the joints of clips at the frame rate of their recordings.
 
-        Returns None if a clip has none.
+        Returns None if a clip has no such joints.
         """
         if "references.npz" not in self.info["sha256"]:
             return None
@@ -157,9 +160,9 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns license, clips, minutes and actions of the motions under each license.
+        """Returns the license, clips, minutes and actions of the motions under each license.
 
-        The list is empty if the data set states no licenses. Copies of a clip count once.
+        The list is empty if the data set states no licenses. Copies of a clip are counted once.
         """
         frames: dict[str, dict[int, int]] = {}
         actions: dict[str, set[str]] = {}
@@ -182,7 +185,7 @@ class Store:
     def verify(self) -> None:
         """Checks the hashes of features and references.
 
-        Opening the store checks the other files.
+        The other files were checked when the store was opened.
         """
         self._check("features.npy", *{"references.npz"} & self.info["sha256"].keys())
 
@@ -199,7 +202,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
     The store has a temporary name until it is complete. If another process is writing it, this
     function waits and opens the result. If data cannot be read, no files are left behind. An
-    intact store that existed before the call is replaced.
+    existing intact store is replaced.
 
     Raises:
         UserError: If `folder` contains anything but an intact store.
@@ -209,8 +212,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        # This process holds the lock, so files of another process that is just ending are
-        # removed, too.
+        # This process holds the lock, so files of another process that is about to end are also
+        # removed.
         remove_abandoned(folder.parent, folder, is_locked=True)
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
@@ -225,7 +228,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 def _replaceable(folder: Path) -> list[Path]:
     """Returns the files of the store in a folder, `store.json` first.
 
-    The list is empty if the folder does not exist or is empty.
+    The list is empty if the folder does not exist, or is empty.
 
     Raises:
         UserError: If the folder is a link, contains other files but no store, or contains a
@@ -295,14 +298,14 @@ def _line(entry: Entry) -> str:
 def _pack(
     folder: Path, name: str, encoded: Iterable[tuple[Clip, np.ndarray]], features: int
 ) -> tuple[list[Entry], int]:
-    """Writes the features and references of the data set `name` clip by clip.
+    """Writes the features and references of the data set `name`, clip by clip.
 
-    Returns its clips and number of frames. Consecutive clips with the same motion share its
-    frames.
+    Returns its clips and number of frames. Consecutive clips with the same motion share the frames
+    of the motion.
 
     Raises:
-        UserError: If a clip exceeds its motion, has the id of another clip, or is in another
-            split than a clip of the same source.
+        UserError: If a clip exceeds its motion, if two clips have the same id, or if clips of the
+            same source are in different splits.
     """
     entries: dict[str, Entry] = {}
     split_of: dict[str, Split] = {}  # split of each source
@@ -314,8 +317,8 @@ def _pack(
             if clip.motion is not motion:
                 motion, begin = clip.motion, frames
                 frames += len(values)
-                # Written with file operations: with a memory map, a full disk would kill the
-                # process (SIGBUS).
+                # Written with file operations, because with a memory map, a full disk would kill
+                # the process (SIGBUS).
                 packed.write(values.tobytes())
             first, length = clip.window or (0, len(values))
             if first < 0 or length < 1 or first + length > len(values):
@@ -363,7 +366,7 @@ def training_statistics(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the mean and std (D,) of the training frames of a store.
 
-    The frames are read from its file in blocks.
+    The frames are read from the file in blocks.
     """
     training = np.zeros(frames, bool)  # cuts may overlap, but each frame counts only once
     for clip in clips:
@@ -385,7 +388,7 @@ def _encoded(
 ) -> Generator[tuple[Clip, np.ndarray]]:
     """Yields each clip with the features of its entire motion, encoded in worker processes.
 
-    A motion of several clips is encoded only once.
+    A motion with several clips is encoded only once.
     """
     groups: deque[list[Clip]] = deque()
 
@@ -402,7 +405,7 @@ def _encoded(
 def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.ndarray:
     """Returns the features of a motion. `named` is its name, its published representation and the motion.
 
-    The representation is "" if the motion is not published as features.
+    The representation is "" if the motion was not published as features.
     """
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
@@ -433,18 +436,20 @@ def _fingerprint(
     folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray, version: int
 ) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
-    # Features differ in their last bits between processors and thread counts. Therefore the
-    # fingerprint contains only their statistics, rounded to a fixed number of decimals. Adding
-    # 0.0 makes -0.0 and 0.0 equal.
+    # The last bits of features differ between processors and thread counts. Therefore, the
+    # fingerprint contains only their statistics, rounded to a fixed number of decimals. Adding 0.0
+    # makes -0.0 and 0.0 equal.
     rounded = [round(float(value), 4) + 0.0 for value in np.concatenate([mean, std])]
-    versions = [version] if version > 1 else []  # fingerprints of version 1 lack the version
+    versions = (
+        [version] if version > 1 else []
+    )  # fingerprints of version 1 do not contain the version
     digest.update(json.dumps([representation, fps, rounded, *versions]).encode())
     return digest.hexdigest()[:16]
 
 
 @contextmanager
 def _intact(path: Path) -> Iterator[Path]:
-    """Yields a path of a store. Errors caused by its content become one `UserError`."""
+    """Yields a path of a store. Errors caused by its content are converted to one `UserError`."""
     try:
         yield path
     except (OSError, ValueError, KeyError) as error:
@@ -456,8 +461,7 @@ def _intact(path: Path) -> Iterator[Path]:
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
-    # Lines are read from the file, because `splitlines` would also split at separators in
-    # captions.
+    # Lines are read from the file, because `splitlines` would also split at separators in captions.
     with (
         _intact(path),
         path.open(encoding="utf-8") as lines,

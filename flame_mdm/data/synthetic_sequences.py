@@ -1,4 +1,4 @@
-"""Synthetic clips for models that continue frames: one motion after the end of another."""
+"""Synthetic clips for models that continue frames: a motion that follows the end of another motion."""
 
 import numpy as np
 
@@ -10,18 +10,18 @@ from flame_mdm.data.synthetic_motions.joining import frames_of, join
 
 # Duration of the motion that the captions describe
 SECONDS = 2.0, 3.0
-# Duration of the visible end of the earlier motion
+# Duration of the visible end of the previous motion
 EARLIER_SECONDS = 1.4, 2.0
-# Fraction of clips in which the earlier motion shows the same action
+# Fraction of clips in which the previous motion shows the same action
 AGAIN = 0.25
 # Fraction of clips in which the person stands before the motion
 RESTING = 0.25
-# Fraction of clips that stand up before a motion that begins standing
+# Fraction of clips in which the person stands up before a motion that begins in a standing posture
 FROM_THE_FLOOR = 0.15
 # Maximum duration, in seconds, of the overlap of both motions
 OVERLAP = 0.45
-# Motions that have no natural end. Clips show up to 6 seconds of such a motion and leave out its
-# end, so that a stream keeps moving until its text changes.
+# Motions that have no natural end. Clips show up to 6 seconds of such a motion without its end, so
+# that a stream keeps moving until its text changes.
 ENDLESS = (
     *("walk", "run", "sneak", "crouch walk", "limp", "march", "march in place", "run in place"),
     *("carry", "push", "pull", "strafe", "skip", "dance", "waltz", "crawl", "idle", "stand"),
@@ -30,10 +30,10 @@ ENDLESS = (
 )
 # Maximum duration of an endless motion, in seconds
 LONGEST = 6.0
-# Duration in seconds of the end of an endless motion, which is left out
+# Duration in seconds of the end of an endless motion, which is cut off
 STOPPING = 0.9
-# Posture at the beginning of actions that do not begin standing, and at the end of actions that
-# do not end standing
+# Posture at the beginning of actions that do not begin in a standing posture, and at the end of
+# actions that do not end in a standing posture
 STARTS = {
     **dict.fromkeys(("rise", "seated", "type"), "seated"),
     **{"get up": "lying", "crawl": "on all fours", "push-ups": "a plank"},
@@ -43,17 +43,18 @@ ENDS = {
     **dict.fromkeys(("lie", "fall"), "lying"),
     **{"kneel": "kneeling", "crawl": "on all fours", "push-ups": "a plank"},
 }
-# Action with which a standing person takes each posture; played backward, the person stands up
+# Action with which a standing person gets into each posture. Played backwards, the person stands
+# up.
 WAYS_DOWN = {"seated": "sit", "lying": "lie", "kneeling": "kneel"}
-HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so no motion follows
+HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothing follows them
 
 
 class SyntheticSequences(Synthetic):
-    """Clips that begin with the end of an earlier motion, followed by the motion of the captions.
+    """Clips that begin with the end of a previous motion, followed by the motion of the captions.
 
-    The earlier motion is any other action, the same action once more, or standing. The motion of
-    the captions begins before the body is back at rest. Sitting, lying and kneeling people stand
-    up first. Motions such as walking continue until the end of the clip.
+    The previous motion is any other action, the same action again, or standing. The motion of the
+    captions begins before the body is back at rest. Sitting, lying and kneeling people stand up
+    first. Motions such as walking continue until the end of the clip.
 
     Args:
         clips: number of clips.
@@ -82,7 +83,7 @@ class SyntheticSequences(Synthetic):
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
     """Returns the body of a clip.
 
-    The body shows the end of an earlier motion, a transition to the required posture, and the
+    The body shows the end of a previous motion, a transition to the required posture, and the
     motion itself.
     """
     action = str(attributes["action"])
@@ -95,7 +96,7 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
     tail = frames[-round(rng.uniform(*EARLIER_SECONDS) * fps) :]
 
     if posture != start and posture == ENDS.get(action):
-        # A person who sits already stays seated.
+        # A person who is already sitting stays seated.
         hold = round(rng.uniform(*SECONDS) * fps)
         return frames_of(before, np.concatenate([tail, np.repeat(tail[-1], hold)]))
     before = frames_of(before, tail)
@@ -111,7 +112,7 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
 
 
 def _earlier(rng: np.random.Generator, start: str) -> Attributes:
-    """Draws the attributes of the motion before a motion that begins in the posture `start`."""
+    """Draws the attributes of a motion that precedes a motion with the initial posture `start`."""
     if start == "standing":
         if rng.random() < RESTING:
             return {"action": "stand"}
@@ -129,7 +130,7 @@ def _earlier(rng: np.random.Generator, start: str) -> Attributes:
 
 
 def _way(rng: np.random.Generator, posture: str, fps: float, up: bool = False) -> Body:
-    """Returns a body that changes from standing into a posture, or `up` again."""
+    """Returns a body that moves from standing into a posture or, with `up`, back to standing."""
     name = WAYS_DOWN[posture]
     body = _moved(rng, ACTIONS[name].draw(rng, name), fps)
     frames = np.arange(len(body.t))
@@ -141,7 +142,7 @@ def _moved(
 ) -> Body:
     """Returns a body that has moved through the action.
 
-    If the action is endless and not `whole`, its end is left out.
+    If the action is endless and not `whole`, its end is cut off.
     """
     action = ACTIONS[str(attributes["action"])]
     shortest = max(SECONDS[0], 0.35 + 0.8 * int(attributes.get("count", 0)), action.seconds)

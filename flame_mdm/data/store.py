@@ -5,13 +5,12 @@ changed:
 
     features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
     clips.jsonl      one clip per line: id, start, length, split, source, captions, action,
-    attributes
+                     attributes
     statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
     references.npz   joints (F', J, 3) float32 by clip id, at the frame rate of the recording, if the data
                      set contains them
     store.json       representation, frame rate, options of the source, counts, hashes of the other
-    files,
-                     fingerprint
+                     files, fingerprint
 
 Verification adds a report to the folder, `verify.json`.
 """

@@ -1,7 +1,7 @@
 """Configuration: command lines, recipes composed by Hydra, checks against signatures, instantiation.
 
 These modules do not import torch or Lightning, so that `--help` and errors about misspelled keys
-are immediate.
+appear immediately.
 """
 
 from flame_mdm.config.building import (

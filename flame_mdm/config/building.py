@@ -21,7 +21,7 @@ EXPERIMENTS = (
     if (_PACKAGE / "experiments").is_dir()
     else _PACKAGE.parent / "experiments"
 )
-"""Folder of the recipes: inside the installed package, or next to it in a clone."""
+"""Folder of the recipes, inside the installed package or next to it in a clone."""
 
 MODULES = {
     "task": ("flame_mdm.task", "flame_mdm.training.adaptation", "flame_mdm.training.distillation"),
@@ -31,29 +31,29 @@ MODULES = {
     "representation": ("flame_mdm.representations",),
     "data": ("flame_mdm.data",),
 }
-"""Modules whose classes a checkpoint's configuration may name, by part of the configuration."""
+"""Modules whose classes may be named in a checkpoint's configuration, by part of the configuration."""
 RENAMED = {
     "flame_mdm.task.MotionGeneration": "flame_mdm.task.GeneratorTask",
     "flame_mdm.training.distillation.ConsistencyDistillation": "flame_mdm.training.distillation.DistillationTask",
 }
 """Names of classes in configurations of version 0.2, and their current names."""
 ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
-"""Tasks of adaptations, whose configurations have a key `base`: in version 0.2, and currently."""
+"""Tasks of adaptations, whose configurations have a key `base`, in version 0.2 and currently."""
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
 """Limits of a configuration file: number of values, and depth of nested mappings and lists."""
 RUN_DIR = "${run.dir}"
 """Placeholder for the run directory in a saved `config.yaml`.
 
-With it, `run.dir=...` changes all paths in the run directory.
+With the placeholder, `run.dir=...` changes all paths in the run directory.
 """
 
 
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
-    """Checks that the content of the untrusted file `where` only has plain values and no interpolations.
+    """Checks that the content of the untrusted file `where` has only plain values and no interpolations.
 
     Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any
     environment variable. The interpolation `but` is allowed at the beginning of a text. Raises
-    `UserError`, also if the content is nested too deeply, or contains itself.
+    `UserError` if the check fails, or if the content is nested too deeply or contains itself.
     """
     count = 0
 
@@ -83,7 +83,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Returns a configuration, perhaps of an earlier version, with the current names of its classes."""
+    """Returns a configuration with the current names of its classes. It may be of an earlier version."""
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config
@@ -95,7 +95,7 @@ def renamed(config: Config) -> Config:
 
 
 def read_saved(path: Path) -> Config:
-    """Returns the saved configuration of a run, with `RUN_DIR` for its directory."""
+    """Returns the saved configuration of a run, in which `RUN_DIR` stands for its directory."""
     config = read_yaml(path)
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
         raise UserError(f"{path}: not the configuration of a run: it has no key `run`")
@@ -104,7 +104,7 @@ def read_saved(path: Path) -> Config:
 
 
 def movable(config: Config) -> Config:
-    """Returns a configuration with `RUN_DIR` for the run directory.
+    """Returns a configuration in which `RUN_DIR` stands for the run directory.
 
     `run.dir` then changes all paths in the run directory.
     """
@@ -126,16 +126,15 @@ def moved(node: Any, folders: Mapping[str, str]) -> Any:
 
 
 def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **derived: Any) -> Any:
-    """Instantiates the object described by a mapping with a `_target_`, including nested ones.
+    """Instantiates the object described by a mapping with a `_target_`, including nested objects.
 
     The function supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as
     plain text. Mappings and lists are passed as plain copies, as with Hydra's `_convert_: all`.
 
     Args:
         node: the mapping.
-        offered: further arguments. The object gets the arguments that its class or function
-            takes.
-        derived: further arguments, all of which the object gets.
+        offered: additional arguments. Those that the class or function accepts are passed.
+        derived: additional arguments, all of which are passed.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(name, str):
@@ -166,7 +165,7 @@ def _instances(node: Any) -> Any:
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Flattens nested mappings to dotted keys; lists are leaves."""
+    """Flattens nested mappings to dotted keys. Lists are leaves."""
     if not isinstance(config, Mapping) or not config:
         return {prefix: config}
     flat: dict[str, Any] = {}
@@ -182,9 +181,9 @@ def save(config: Config, path: Path, head: str = "") -> None:
 
 
 def trust(config: Config) -> None:
-    """Checks that the parts of a checkpoint's configuration only name legal classes and arguments.
+    """Checks that the parts of a checkpoint's configuration name only permitted classes and arguments.
 
-    A class is legal for a part if `MODULES` lists its module for this part, or if a file in the
+    A class is permitted for a part if `MODULES` lists its module for this part, or if a file in the
     part's folder of `experiments/` names it. The environment variable FLAME_MDM_TRUST adds
     packages, separated by commas. This check does not import the classes.
     """

@@ -1,4 +1,4 @@
-"""Command lines, with one dataclass per command that declares its keys; signals, errors, exit codes."""
+"""Command lines, with one dataclass per command that declares its keys, and signals, errors and exit codes."""
 
 import os
 import re
@@ -23,10 +23,10 @@ Settings = TypeVar("Settings")
 """Dataclass of a command.
 
 The docstring of the class is the usage, and its fields made by `option` are the keys. `OBJECTS`
-names the keys that leading words without a key belong to. If the last of these keys is a list, it
-takes all remaining words. `SWEEPS` is True if the command takes --multirun and launch=, as in
-`flame_mdm.config.jobs`. A field `composed` receives the arguments for Hydra: keys with a dot,
-such as `data.source.path`, and the keys and options in `COMPOSED`.
+lists the keys to which leading words without a key belong. If the last of these keys is a list, it
+takes all remaining words. `SWEEPS` is True if the command accepts --multirun and launch=, as in
+`flame_mdm.config.jobs`. A field `composed` receives the arguments for Hydra: keys with a dot, such
+as `data.source.path`, and the keys and options in `COMPOSED`.
 """
 
 STOP = (signal.SIGINT, signal.SIGTERM)  # signals after which a command cleans up and ends
@@ -38,7 +38,7 @@ BUG = 70  # exit code for a bug, as in sysexits.h
 NO_MEMORY = re.compile(
     "allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map"
 )
-"""Messages of errors that a lack of memory causes in torch, in threads, and in loading libraries."""
+"""Error messages that a lack of memory causes in torch, in threads, and when libraries are loaded."""
 
 
 def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
@@ -52,7 +52,7 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns settings like `read_settings`, after the checks that their fields declare."""
+    """Returns settings as `read_settings` does, after the checks that their fields declare."""
     settings = read_settings(kind, words)
     for entry in fields(kind):  # type: ignore[arg-type]
         value, check = getattr(settings, entry.name), entry.metadata.get("check")
@@ -64,7 +64,7 @@ def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     """Reads the settings of a command from its words.
 
-    Text is taken literally, lists of texts are split as in a shell, and other values have Hydra's
+    Text is taken literally, lists of texts are split as in a shell, and other values follow Hydra's
     grammar.
     """
     annotations = _annotations(kind)
@@ -159,7 +159,7 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
             raise UserError(
                 f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
             )
-    # Surplus words remain unchanged, and are refused later because they have no value.
+    # Surplus words remain unchanged, and are refused later because they have no key
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
     return keyed + leading[len(objects) :] + rest
 
@@ -203,7 +203,7 @@ def _help(kind: type[Any]) -> list[str]:
 def make_variables() -> list[str]:
     """Returns the variables of make as command-line arguments.
 
-    `EXP` names the recipe; other upper-case names are keys. Make passes the variables in
+    `EXP` names the recipe, and other upper-case names are keys. Make passes the variables in
     MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
@@ -220,9 +220,10 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code.
 
-    A signal of `signums` ends the action after it has cleaned up. Prints an error that the user
-    can fix as one line and returns 1; FLAME_MDM_TRACEBACK=1 prints the traceback first. Any other
-    exception is a bug: prints the traceback with a request to report it, and returns `BUG`.
+    A signal of `signums` ends the action after it has cleaned up. An error that the user can fix is
+    printed as one line, and 1 is returned. FLAME_MDM_TRACEBACK=1 prints the traceback first. Any
+    other exception is a bug: the traceback is printed with a request to report it, and `BUG` is
+    returned.
     """
     try:
         with stoppable(signums):
@@ -235,7 +236,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except Exception as error:
         verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
         if isinstance(error, MemoryError) and not verbose:
-            # frees the variables of the frames, since printing a line takes memory, too
+            # frees the variables of the frames, because printing a line also takes memory
             error.__traceback__ = None
         line = explanation(error)
         if line is None or verbose:
@@ -254,7 +255,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 def explanation(error: Exception) -> str | None:
     """Returns the line for an error that the user can fix; None for a bug.
 
-    Such errors are a `UserError`, errors of files, and a lack of memory.
+    Such errors are a `UserError`, an error of a file, and a lack of memory.
     """
     if isinstance(error, UserError):
         return first_line(error)

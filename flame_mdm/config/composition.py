@@ -33,7 +33,7 @@ LAUNCH = "launch"  # folder of `experiments/` with launchers, which start jobs o
 def groups() -> list[str]:
     """Returns the replaceable parts of a recipe.
 
-    The parts are folders of `experiments/` whose files are options, not recipes.
+    They are the folders of `experiments/` whose files are options instead of recipes.
     """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
@@ -64,7 +64,7 @@ def compose_data(
 ) -> Config:
     """Composes a file in experiments/data with its representation.
 
-    Returns the keys `data` and `representation`; raises the errors of `compose`.
+    Returns the keys `data` and `representation`. Raises the same errors as `compose`.
     """
     source = ConfigSource(EXPERIMENTS, None)
     first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
@@ -78,7 +78,7 @@ class ConfigSource(NamedTuple):
     folder: Path
     # Name of the file in `folder` without its suffix; None = an empty configuration
     stem: str | None
-    # whether the configuration is resolved, so that its parts cannot be replaced
+    # Whether the configuration is resolved, so that its parts cannot be replaced
     saved: bool = False
 
 
@@ -87,8 +87,8 @@ def prepare_overrides(
 ) -> tuple[list[str], Config]:
     """Checks the overrides (not those in `first`) and prepares them for Hydra.
 
-    Keys that the recipe lacks but a `_target_` accepts get a `++`. Also returns the recipe with
-    its groups chosen, before single keys are overridden; {} without overrides.
+    Keys that the recipe lacks but a `_target_` accepts get the prefix `++`. Also returns the recipe
+    with its groups chosen, before single keys are overridden; {} without overrides.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -111,7 +111,7 @@ def prepare_overrides(
 
 
 def first_choice(override: Override) -> str:
-    """Returns the override. The override of a sweep is returned with its first value only."""
+    """Returns the override. The override of a sweep is reduced to its first value."""
     if override.is_sweep_override():
         return f"{override.get_key_element()}={choices(override)[0]}"
     return str(override.input_line)
@@ -169,7 +169,7 @@ def quoted(word: str) -> str:
 def parse(overrides: Sequence[str]) -> list[Override]:
     """Parses overrides in Hydra's grammar.
 
-    If an override cannot be parsed, raises a `UserError` with advice.
+    Raises a `UserError` with advice if an override cannot be parsed.
     """
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
@@ -232,7 +232,7 @@ def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
 def _legal(config: Config, override: Override) -> str:
     """Returns an override as text for Hydra.
 
-    Raises `UserError` if neither the recipe nor a `_target_` has its key.
+    Raises `UserError` if its key exists neither in the recipe nor in the signature of a `_target_`.
     """
     line = str(override.input_line)
     if (

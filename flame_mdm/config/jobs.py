@@ -25,7 +25,7 @@ Settings = TypeVar("Settings")
 FOLDER = Path("runs") / "sweeps"
 """Folder for the logs of jobs that a launcher starts.
 
-Each job writes its results to the same place as without a launcher.
+The results of each job are written to the same place as without a launcher.
 """
 
 
@@ -33,8 +33,8 @@ def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Se
     """Runs a command line `[OBJECT [OUT]] key=value ... [--multirun]` and returns the exit code.
 
     With `--multirun`, values separated by commas are a sweep: one job per combination, one after
-    the other. `launch=...` passes the jobs of a sweep, or the only job, to a launcher, and waits
-    for them. Values of keys that take any text, such as paths, are never split.
+    the other. `launch=...` passes the jobs of a sweep, or a single job, to a launcher, and waits
+    for them. Values of keys that accept any text, such as paths, are never split.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     asks_for_help = any(word in ("-h", "--help") for word in words)
@@ -75,7 +75,7 @@ def _is_of_launcher(word: str) -> bool:
 
 
 def _alternatives(kind: type[Any], word: str) -> list[str]:
-    """Returns one word `key=value` for each value that a word lists."""
+    """Returns one word `key=value` for each value listed in a word."""
     key, separator, _ = word.partition("=")
     if not separator or is_text(kind, key):
         return [word]
@@ -83,7 +83,7 @@ def _alternatives(kind: type[Any], word: str) -> list[str]:
 
 
 def _launch(jobs: Sequence[Callable[[], int]], words: Sequence[str]) -> None:
-    """Passes jobs to the launcher of Hydra that `launch=NAME` and its keys select, and waits for the jobs."""
+    """Passes jobs to the Hydra launcher that is selected by `launch=NAME` and its keys, and waits for the jobs."""
     compose("quickstart", words)  # checks the words
     launchers = [word.partition("=")[2] for word in words if word.startswith(f"{LAUNCH}=")]
     check_launcher(launchers)

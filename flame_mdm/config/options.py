@@ -5,7 +5,7 @@ from dataclasses import MISSING, field, fields
 from typing import Any
 
 Check = Callable[[str, Any], None]
-"""Checks a value; arguments are the key and the value.
+"""Checks a value. The arguments are the key and the value.
 
 Raises `UserError` or `FileNotFoundError`.
 """
@@ -21,7 +21,7 @@ def option(default: Any, help: str, check: Check | None = None) -> Any:
 
 
 def required(help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field like `option`, but without a default."""
+    """Returns a dataclass field as `option` does, but without a default."""
     return option(MISSING, help, check)
 
 

@@ -1,6 +1,6 @@
 """Checks of recipes against the signatures of the classes and functions that they name.
 
-Signatures are read from source files. Misspelled keys are therefore reported immediately, and a
+Signatures are read from source files. Therefore, misspelled keys are reported immediately, and a
 class in a recipe is checked without running its code.
 """
 
@@ -21,9 +21,9 @@ Config = dict[str, Any]
 
 
 def check(config: Config) -> None:
-    """Raises `UserError` if a `_target_` does not exist, or does not take an argument.
+    """Raises `UserError` if a `_target_` does not exist, or does not accept an argument.
 
-    The message has the nearest legal keys.
+    The message contains the most similar permitted keys.
     """
     for path, node in walk(config):
         if "_target_" not in node:
@@ -71,13 +71,13 @@ ARGUMENTS = {
     "losses": "flame_mdm.losses.MotionLosses",
     "ema": "flame_mdm.training.averaging.MovingAverage",
 }
-"""Keys of a recipe whose mapping has the arguments of a class, with this class."""
+"""Keys of a recipe whose mapping contains the arguments of a class -> this class."""
 
-DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes must not have
+DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes must not set
 
 
 def check_top_level(config: Config) -> None:
-    """Raises `UserError` for unknown keys and wrong values outside of mappings with a `_target_`."""
+    """Raises `UserError` for unknown keys and invalid values outside mappings with a `_target_`."""
     for key, annotation in TOP_LEVEL.items():
         group, _, name = key.rpartition(".")
         node = config.get(group) if group else config
@@ -99,13 +99,13 @@ def check_top_level(config: Config) -> None:
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Raises `UserError` if the annotation of a parameter rules out a value.
+    """Raises `UserError` if the annotation of a parameter excludes a value.
 
-    Unknown annotations allow any value.
+    Unknown annotations permit any value.
     """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
-    # A configuration cannot contain a tensor: in a union, only the other types are checked.
+    # A configuration cannot contain a tensor, so in a union, only the other types are checked.
     for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:
         description = _mismatch(value, kind)
         if not description:
@@ -225,7 +225,7 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
 def walk(
     node: Any, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
-    """Yields the path and the content of each mapping in a configuration, beginning with the whole configuration."""
+    """Yields the path and the content of each mapping in a configuration, beginning with the entire configuration."""
     if isinstance(node, Mapping):
         yield path, node
         for name, child in node.items():
@@ -317,8 +317,8 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_file(module: str) -> Path | None:
-    """Returns the source file of a module; None without a file, or if the name is not a module's name."""
-    # a name with a slash could name any file
+    """Returns the source file of a module; None if there is no file, or if the name is not a module's name."""
+    # A name with a slash could refer to any file
     if not all(part.isidentifier() for part in module.split(".")):
         return None
     relative = Path(*module.split("."))

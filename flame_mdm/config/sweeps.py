@@ -22,7 +22,7 @@ from flame_mdm.safe_io.paths import check_tree
 SWEEP = ("-m", "--multirun")  # with these options, values separated by commas are a sweep
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
-# Signals that end training before the first step. From the first step, training handles signals
+# Signals that end training before the first step. From the first step on, training handles signals
 # itself.
 INTERRUPT = STOP[:1]
 
@@ -30,7 +30,7 @@ INTERRUPT = STOP[:1]
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
     """Runs a command line `RECIPE key=value ... [--multirun]` and returns the exit code.
 
-    `launch=...` passes each job of a sweep, or the only job, to a launcher, and waits for them.
+    `launch=...` passes each job of a sweep, or a single job, to a launcher, and waits for them.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):
@@ -89,7 +89,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
 
     def job(_: object) -> None:
         hydra = HydraConfig.get()
-        # otherwise, Lightning would add words for Hydra's command line
+        # Otherwise, Lightning would add words for Hydra's command line
         HydraConfig.instance().cfg = None
         task = [
             str(word)
@@ -99,7 +99,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         code = start(
             composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task
         )
-        # A signal ends the whole sweep. A failed job ends the sweep only if a launcher ran the
+        # A signal ends the entire sweep. A failed job ends the sweep only if a launcher ran the
         # job.
         if code > 128 or (launcher and code):
             raise SystemExit(code)
@@ -143,11 +143,11 @@ def hydra_sweep(
 
 
 LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
-"""Keys of the trainer that Lightning checks only after data and model are loaded."""
+"""Keys of the trainer that Lightning checks only after the data and the model are loaded."""
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe lacks a part, or has a value that training would only refuse later."""
+    """Raises `UserError` if a recipe lacks a part, or has a value that training would refuse only later."""
     plain(config, name)  # otherwise, the checkpoints of the run would be refused
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]

@@ -4,8 +4,8 @@ All clips are in one memory-mapped array. A store is a folder that is written on
 changed:
 
     features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
-    clips.jsonl      one clip per line: id, start, length, split, source, captions, action,
-                     attributes
+    clips.jsonl      one clip per line: id, start, length, split, source, captions,
+                     action, attributes
     statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
     references.npz   joints (F', J, 3) float32 by clip id, at the frame rate of the recording, if the data
                      set contains them

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Adaptation of a trained model to a few clips of the user; `docs/own-motion.md` is the guide."""
+"""Adaptation of a trained model to a few clips of the user. `docs/own-motion.md` is the guide."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -38,11 +38,11 @@ from flame_mdm.task import GeneratorTask
 from flame_mdm.training.start import train
 from flame_mdm.visualize import player_page
 
-# Number of motions that are sampled from a model if its training data is missing
+# Number of motions that are sampled from the base model if its training data is missing
 SAMPLED = 300
 # Number of clips with which the page compares models
 COMPARED = 32
-# Parts that the recipe takes from the base.
+# Parts of the recipe that are taken from the base
 OF_BASE = (
     "task",
     "losses",
@@ -57,7 +57,7 @@ class AdaptationTask(GeneratorTask):
     """Trains a model further on the user's few clips, and on clips of its own data."""
 
     def pretrain(self) -> None:
-        """Does nothing, since the text encoder is trained already."""
+        """Does nothing, because the text encoder is already trained."""
 
     def dropped(self, batch: MotionBatch) -> Tensor:
         """Draws the dropped captions, but never drops captions of the user's clips.
@@ -84,7 +84,7 @@ def adapt(
     data_root: str | Path = "data",
     overrides: Sequence[str] = (),
 ) -> Path:
-    """Teaches a text-conditioned model the motions in a folder; resumes an interrupted run.
+    """Teaches a text-conditioned model the motions in a folder. Resumes an interrupted run.
 
     The model is trained on the user's clips and on clips of its original training data, so that
     it does not forget what it has learned. Prompts request the new motions with "in NAME style".
@@ -99,8 +99,8 @@ def adapt(
         action: whether the clips show an action that the model does not know, instead of a style.
         full: whether to train all weights. The result is then a model file instead of an adapter.
         force: whether to accept clips that drift upward or float.
-        rank: rank of the changes of the weights, 1 or more. Increase it for motions that differ
-            much from the model's training data.
+        rank: rank of the changes to the weights, 1 or more. Increase it for motions that are very
+            different from the model's training data.
         data_root: folder of the prepared data sets. If it lacks the data set of the base, 300 motions are sampled from
             the base instead.
         overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
@@ -198,7 +198,7 @@ def _recipe(
 ) -> Config:
     """Returns the recipe of an adaptation.
 
-    Raises `UserError` for overrides of parts that the base determines.
+    Raises `UserError` for overrides of parts that are determined by the base.
     """
     if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
@@ -213,8 +213,8 @@ def _recipe(
     config["experiment"] = f"adapt/{name}"
     config["run"]["name"] = config["data"]["name"] = name
 
-    # Crop, kind of motion and learning rate come from the base. A released model has no data, so
-    # its crops are as long as its longest motion, in units of 4 frames.
+    # Crop, kind of motion and learning rate are taken from the base. A released model has no data,
+    # so its crops are as long as its longest motion, in units of 4 frames.
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
@@ -233,8 +233,8 @@ def _recipe(
 def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
     """Returns the folder of the store with data of the base.
 
-    It is the store of the base's training data if `root` has this store, otherwise a store of
-    samples in `out`.
+    If `root` contains the store of the base's training data, this store is returned; otherwise, a
+    store of samples in `out`.
     """
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
@@ -283,7 +283,7 @@ class _Samples(MotionSource):
 
 
 def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
-    """Returns the page that compares the base with the adapted model, by motions and by losses."""
+    """Returns the page that compares the base with the adapted model, by their motions and losses."""
     data.setup("fit")
     before, after = (task.generator for task in tasks)
     clips = data.train.clips

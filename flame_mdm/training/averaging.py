@@ -1,4 +1,4 @@
-"""Moving average of the weights."""
+"""Moving average of weights."""
 
 from typing import Any
 
@@ -14,17 +14,17 @@ from flame_mdm.errors import UserError
 class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, for validation and for the saved model.
 
-    By default, it computes the same average as Lightning's `EMAWeightAveraging`, but with one
-    call for all parameters. Lightning's class walks through all modules in every step, and on
-    CUDA waits for the device. Buffers are not averaged.
+    By default, it computes the same average as Lightning's `EMAWeightAveraging`, but with a single
+    call for all parameters. Lightning's class iterates over all modules in every step, and waits
+    for the device on CUDA. Buffers are not averaged.
 
     Args:
         decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
         update_every_n_steps: the average is updated at multiples of this number of steps.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
             them. The first update always copies them.
-        from_initial_weights: whether the average starts from the weights before the first step,
-            as in MDM's code. Then the first update is an average, too.
+        from_initial_weights: whether the average starts from the weights before the first step, as
+            in MDM's code. The first update is then also an average.
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class MovingAverage(WeightAveraging):
         self.begun = False
 
     def averaged(self) -> Any:
-        """Returns the copy of the task with the averages.
+        """Returns the copy of the task that contains the averages.
 
-        During validation, this copy has the trained weights instead.
+        During validation, this copy contains the trained weights instead.
         """
         assert self._average_model is not None
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of model and average once, since looking them up takes time."""
+        """Collects the parameters of the model and of the average once, because this takes time."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):

@@ -42,11 +42,12 @@ from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
 
-# Number of training clips with which the metrics of samples are compared
+# Number of training clips whose metrics are compared with the metrics of samples
 REAL = 64
 # Number of motions without a prompt
 UNCONDITIONED = 4
-# In meters. Even if a model has learned little, its samples for different prompts differ by more.
+# In meters. Even if a model has learned little, its samples for different prompts differ by more
+# than this.
 SAME = 0.01
 Values = Mapping[str, float]  # values by metric, or by metric/part
 
@@ -62,10 +63,10 @@ class Interrupted(Exception):
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step and when interrupted.
 
-    `keep_every_n_steps` is the number of steps between checkpoints that are kept. Signals stop
-    training at the end of the current step (`StopRequest`); with several ranks, at the end of the
-    next step. Validation is never interrupted, since averaged weights replace the trained weights
-    during validation.
+    `keep_every_n_steps` is the number of steps between the checkpoints that are kept. Signals stop
+    training at the end of the current step (`StopRequest`) or, with several ranks, at the end of
+    the next step. Validation is never interrupted, because averaged weights replace the trained
+    weights during validation.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -81,7 +82,7 @@ class Checkpoints(Checkpoint):
         self.step = -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Starts to record signals instead of ending the process."""
+        """Starts to record signals, so that they do not end the process."""
         self.step = trainer.global_step
         self.stop.install()
 
@@ -96,7 +97,7 @@ class Checkpoints(Checkpoint):
         signum = self.stop.signum
         if trainer.world_size > 1:
             # All processes act on the signal that was exchanged in the previous step. Reading the
-            # signal of this step would wait until the device has finished the step.
+            # signal of the current step would wait until the device has finished the step.
             signum, received = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
             torch.distributed.all_reduce(received, torch.distributed.ReduceOp.MAX)
             self.exchanged = received
@@ -109,23 +110,24 @@ class Checkpoints(Checkpoint):
             raise Interrupted(signum, self.step)
 
     def on_train_end(self, *_: Any) -> None:
-        """Restores the handlers of signals."""
+        """Restores the signal handlers."""
         self.stop.restore()
 
     def on_exception(self, *_: Any) -> None:
-        """Restores the handlers of signals."""
+        """Restores the signal handlers."""
         self.on_train_end()
 
 
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`.
 
-    The values that the task reports are logged with them. Other steps are not slowed. The norm of
-    all gradients is measured before clipping. Seconds per step do not include validation. Adds
-    `facts.training` to checkpoints: `hours` of training so far, including validation;
+    The values that the task reports are logged with them. Other steps are not slowed down. The norm
+    of all gradients is measured before clipping. Seconds per step do not include validation.
+
+    Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
     `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
-    peak memory. On CUDA, this is the memory of tensors; on other devices, the memory of the first
-    process.
+    peak memory. On CUDA, this is the memory of tensors. On other devices, it is the memory of the
+    first process.
     """
 
     def __init__(self) -> None:
@@ -136,7 +138,7 @@ class Measurements(Callback):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Restores the sums of the run from before its interruption."""
+        """Restores the sums of the run before its interruption."""
         self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -145,7 +147,7 @@ class Measurements(Callback):
         self.first = trainer.global_step
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restarts the clock of the speed, which does not include validation."""
+        """Restarts the clock that measures the speed, which does not include validation."""
         self.since, self.first = time.perf_counter(), trainer.global_step
 
     def on_save_checkpoint(
@@ -203,9 +205,9 @@ class Measurements(Callback):
 
 
 def log_values(trainer: Trainer, values: Mapping[str, Tensor | float]) -> None:
-    """Writes values of a training step to all loggers, and shows them to all callbacks.
+    """Writes values of a training step to all loggers, and passes them to all callbacks.
 
-    Tensors are copied from the device together, so that it is waited for only once.
+    Tensors are copied from the device together, so that the host waits for the device only once.
     """
     tensors = {name: x for name, x in values.items() if isinstance(x, Tensor)}
     copied = torch.stack([x.detach().float() for x in tensors.values()]).tolist() if tensors else []
@@ -220,13 +222,13 @@ def log_values(trainer: Trainer, values: Mapping[str, Tensor | float]) -> None:
 
 
 class Report(Callback):
-    """Prints the last losses at the end of training, writes `report.html`, and prints the next commands."""
+    """Prints the last losses at the end of training, writes `report.html`, and suggests the next commands."""
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Prints the last losses, writes the report, and prints the commands to run next."""
+        """Prints the last losses, writes the report, and prints the next commands to run."""
         if not trainer.is_global_zero:
             return
         texts = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
@@ -263,7 +265,7 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics with their docstrings, and values of generated and real motions."""
+    """Returns lines that explain metrics by their docstrings, with values of generated and real motions."""
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -284,7 +286,7 @@ class Progress(Callback):
     bar: ProgressBar | None = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Shows the bar; in a resumed run, at its current step."""
+        """Shows the bar. In a resumed run, it starts at the current step."""
         self.bar = ProgressBar(
             desc="training",
             initial=trainer.global_step,
@@ -320,10 +322,10 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Whether motions differ by less than `SAME`, which shows that the network ignores its input.
+    """Whether motions differ by less than `SAME`, which means that the network ignores its input.
 
-    A learning rate that is too high can produce a network that returns one pose for every prompt
-    and noise. Its loss is finite and even falls a little, so curves do not show the failure.
+    If the learning rate is too high, the network may learn to return the same pose for every prompt
+    and noise. Its loss is finite and even decreases slightly, so curves do not show the failure.
     """
     if len(motions) < 2:
         return False
@@ -336,10 +338,10 @@ class SampleMotions(Callback):
     """Samples fixed prompts with fixed noise, writes files to the run directory, and logs a video.
 
     Args:
-        folder: folder of the samples. Samples of a step are in a subfolder such as
+        folder: folder of the samples. The samples of each step are in a subfolder such as
             `step_0001000`.
-        every_n_steps: minimum number of steps between samples, which are drawn at validation and
-            after training.
+        every_n_steps: minimum number of steps between samples, which are generated at validation
+            and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None =
             `UNCONDITIONED` motions. If a model is conditioned on actions and no prompt is an
             action, its first actions are used instead.
@@ -379,8 +381,7 @@ class SampleMotions(Callback):
         if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(
             actions
         ):
-            # a text-to-motion recipe was overridden with condition=action, so its prompts are
-            # texts
+            # A text-to-motion recipe was overridden with condition=action, so its prompts are texts
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -399,7 +400,7 @@ class SampleMotions(Callback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the samples of the final model and prints their metrics next to real motions."""
-        # The last validation may have written the samples of this step already.
+        # The last validation may already have written the samples of this step
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)
         _, folder, values = self.written
@@ -483,11 +484,11 @@ class SampleMotions(Callback):
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
-        """Computes all metrics of motions (F, J, 3) in meters; metrics without a value are left out."""
+        """Computes all metrics of motions (F, J, 3) in meters. Metrics without a value are left out."""
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()
-            # returns False: metrics are not synchronized, since this process has all motions
+            # Returns False: metrics are not synchronized, because this process has all motions
             metric.distributed_available_fn = bool
             for key, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)

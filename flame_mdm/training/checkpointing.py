@@ -1,8 +1,8 @@
 """Atomic checkpoints, and resuming from them.
 
-A run directory may come from somebody else. Reading a checkpoint does not run code, and does not
-take more memory than the file. Only files in the folder of the checkpoints are removed, even if
-the state of a callback names other files.
+A run directory may come from somebody else. Reading a checkpoint neither runs code nor takes more
+memory than the file. Only files in the folder of the checkpoints are removed, even if the state of
+a callback names other files.
 """
 
 import math
@@ -22,11 +22,11 @@ from flame_mdm.safe_io import write_failure
 from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
-# Checkpoints of older versions of Lightning are refused: Lightning migrates them with code that
-# trusts their content.
+# Checkpoints of older versions of Lightning are refused, because Lightning migrates them with code
+# that trusts their content
 OLDEST_LIGHTNING = Version("2.6")
 
-# Numbers in the state of a learning rate's schedule
+# Numbers in the state of a learning rate schedule
 SCHEDULE = {
     "base_lrs",
     "_last_lr",
@@ -46,7 +46,7 @@ class Resumed(NamedTuple):
 class AtomicCheckpoints(TorchCheckpointIO):
     """Writes checkpoints to a temporary file, which is synced and renamed.
 
-    The former last checkpoint is kept as `previous.ckpt`.
+    The previous last checkpoint is kept as `previous.ckpt`.
     """
 
     def __init__(self, folder: Path, resumed: Resumed | None = None):
@@ -54,10 +54,10 @@ class AtomicCheckpoints(TorchCheckpointIO):
         self.folder, self.resumed = folder, resumed
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
-        """Returns the content of the checkpoint from which the run resumes; `newest` has checked it."""
+        """Returns the content of the checkpoint from which the run resumes, already checked by `newest`."""
         assert self.resumed is not None
         content = self.resumed.content
-        # The checkpoint is released, since it takes as much memory as the model and its
+        # The checkpoint is released, because it takes as much memory as the model and its
         # optimizer.
         self.resumed = None
         return content
@@ -125,9 +125,9 @@ def newest(folder: Path) -> Resumed | None:
 
 
 def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
-    """Raises `UserError` if the saved state of the optimizer and its schedule does not fit the recipe.
+    """Raises `UserError` if the saved state of the optimizer and its schedule does not match the recipe.
 
-    PyTorch accepts any values, and would fail in the first step of the training.
+    PyTorch accepts any values, and would fail only in the first training step.
     """
     try:
         misfits = list(_misfits(resumed.content, optimizer))
@@ -139,7 +139,7 @@ def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None
 
 
 def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Iterator[str]:
-    """Yields a message for each fault in the saved state of the optimizer and its schedule."""
+    """Yields a message for each error in the saved state of the optimizer and its schedule."""
     usual = optimizer.param_groups[0]
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     for state in content.get("optimizer_states") or []:
@@ -172,7 +172,7 @@ def _is_alike(value: Any, usual: Any) -> bool:
 
 
 def _is_state(value: Any, weight: Tensor) -> bool:
-    """Whether a saved value can be the state of a weight: a number, or a tensor up to the weight's size."""
+    """Whether a saved value can be the state of a weight: a number, or a tensor of at most the weight's size."""
     if isinstance(value, Tensor):
         return value.numel() <= max(1, weight.numel()) and not value.dtype.is_complex
     return isinstance(value, int | float)

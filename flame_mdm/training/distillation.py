@@ -26,7 +26,7 @@ class DistillationTask(GeneratorTask):
     """Trains a student to sample in one to four steps, with built-in guidance.
 
     The student starts with its teacher's weights, and has the same parts, data and captions. The
-    teacher is only needed in training. The text encoder is not trained, and there is no dropout.
+    teacher is needed only in training. The text encoder is not trained, and there is no dropout.
     `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
@@ -49,16 +49,16 @@ class DistillationTask(GeneratorTask):
         return task.eval()
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode, since dropout would add noise to the targets."""
+        """Stays in evaluation mode, because dropout would add noise to the targets."""
         return super().train(False)
 
     def setup(self, stage: str) -> None:
-        """Loads the teacher; training starts from its weights."""
+        """Loads the teacher, from whose weights training starts."""
         super().setup(stage)
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Reads the teacher and copies its weights. Raises `UserError` if it is missing or does not fit."""
+        """Reads the teacher and copies its weights. Raises `UserError` if it is missing or does not match."""
         options = self.config["distillation"]
         name = options["teacher"]
         try:
@@ -87,7 +87,7 @@ class DistillationTask(GeneratorTask):
         self.facts["teacher"] = weights_sha256(path)
         scale = options["guidance_scale"]
         self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
-        # The networks are kept in lists, so that they are not registered as submodules of the
+        # The networks are stored in lists, so that they are not registered as submodules of the
         # student.
         denoiser = self.generator.denoiser
         self.teacher, self.target = [copy.deepcopy(denoiser).requires_grad_(False)], [denoiser]
@@ -117,7 +117,7 @@ class DistillationTask(GeneratorTask):
                 self.target = [average.generator.denoiser]
 
     def pretrain(self) -> None:
-        """Does nothing, since the text encoder comes from the teacher."""
+        """Does nothing, because the text encoder is taken from the teacher."""
 
     def loss_terms(
         self,
@@ -128,7 +128,7 @@ class DistillationTask(GeneratorTask):
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`.
 
-        Validation, which passes `u`, uses the grid of times with which training ends.
+        Validation, which passes `u`, uses the grid of times that training uses at its end.
         """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None
@@ -170,7 +170,7 @@ class DistillationTask(GeneratorTask):
 
 
 def read_teacher(path: Path) -> MotionGenerator:
-    """Loads a teacher. Raises `UserError` if it predicts noise, or is a student itself."""
+    """Loads a teacher. Raises `UserError` if it predicts noise, or if it is itself a student."""
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(

@@ -31,13 +31,13 @@ from flame_mdm.training.provenance import WriteProvenance
 from flame_mdm.training.speed import accelerate
 
 SHARDING = ("fsdp", "deepspeed", "modelparallel")
-"""Parts of the names of strategies that divide a model among processes."""
+"""Parts of the names of strategies that shard a model."""
 
 
 def fit(folder: Path, config: Config) -> None:
     """Trains a recipe in its run directory.
 
-    Training resumes from the newest checkpoint, if any.
+    Resumes from the newest checkpoint, if there is one.
     """
     _quiet()
     check_devices(config["trainer"])
@@ -72,7 +72,7 @@ def fit(folder: Path, config: Config) -> None:
     measurements, checkpoints = Measurements(), AtomicCheckpoints(folder / "checkpoints", resumed)
     callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
-        # Added before the callbacks that use the averaged weights in validation.
+        # Added before the callbacks that use the averaged weights in validation
         callbacks.append(MovingAverage(**config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     # The progress bar shows values that `measurements` has logged.
@@ -81,7 +81,7 @@ def fit(folder: Path, config: Config) -> None:
     loggers = [instantiate(config["logger"])] if config["logger"] else []
     plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
-        # Lightning would save during a step, to a file that it would then prefer to `last.ckpt`.
+        # Lightning would save during a step, to a file that it would then prefer to `last.ckpt`
         plugins.append(SLURMEnvironment(auto_requeue=False))
     unless_chosen = {} if config["trainer"].get("profiler") else {"profiler": NoProfiler()}
     trainer: Trainer = instantiate(
@@ -111,7 +111,7 @@ def fit(folder: Path, config: Config) -> None:
             _requeue(job)
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
-        # Without this, the other processes wait for this one for half an hour.
+        # Otherwise, the other processes would wait for this one for half an hour.
         if trainer.strategy.launcher is not None:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
@@ -204,6 +204,6 @@ def _quiet() -> None:
         # Lightning warns if the run directory was moved. The next validation determines the best
         # checkpoint again.
         "The dirpath has changed.*",
-        ".*sync_dist=True.*",  # the metrics already are means over all processes
+        ".*sync_dist=True.*",  # the metrics are already means over all processes
     ):
         warnings.filterwarnings("ignore", message)

@@ -21,8 +21,8 @@ from flame_mdm.safe_io.paths import check_tree, remove_abandoned
 def only_run(folder: Path) -> Iterator[None]:
     """Holds the lock `run.lock` in the run directory.
 
-    The directory may come from somebody else. Raises `UserError` if a process on any host holds
-    the lock, or if links in the directory lead out of it.
+    The directory may come from somebody else. Raises `UserError` if a process on any host holds the
+    lock, or if links in the directory lead out of it.
     """
 
     def refuse(owner: str) -> None:
@@ -40,8 +40,8 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            # Without a configuration, training never started, and the folder only holds files of
-            # loggers.
+            # Without a configuration, training has never started, and the folder only contains
+            # files of loggers.
             if new and not (folder / "config.yaml").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 
@@ -50,7 +50,7 @@ class BadLoss(Callback):
     """Stops training when a loss is not finite or explodes, before a checkpoint is written.
 
     A loss explodes if it exceeds `factor` times the median of the previous interval.
-    `bad_batch.json` in the run directory describes the first bad batch: it contains the step and,
+    `bad_batch.json` in the run directory describes the first bad batch. It contains the step and,
     for each rank, the number of the batch, the ids of the clips and the loss.
 
     Args:
@@ -59,8 +59,8 @@ class BadLoss(Callback):
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
-        # Copying a loss from the GPU waits for the step. Losses stay on the device and are copied
-        # together, at the log interval and before a checkpoint.
+        # Copying a loss from the GPU waits for the step. Therefore, losses stay on the device and
+        # are copied together, at the log interval and before a checkpoint.
         self.path, self.factor = Path(folder) / "bad_batch.json", factor
         self.usual = float("inf")
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
@@ -82,7 +82,7 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Checks the losses before a checkpoint is written, so that it cannot hold weights after a bad loss."""
+        """Checks the losses before a checkpoint is written, so that it never contains weights after a bad loss."""
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
@@ -123,7 +123,7 @@ class BadLoss(Callback):
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns an explanation for errors that mean that a data loading process died, otherwise None."""
+    """Returns an explanation if an error means that a data loading process died; otherwise None."""
     # If a worker dies while a checkpoint is written, its error is the cause of another error.
     message = f"{error} {error.__cause__ or ''}"
     lost = re.search(
@@ -140,7 +140,7 @@ def lost_worker(error: BaseException) -> UserError | None:
 
 
 def out_of_memory(error: BaseException, step: int) -> UserError | None:
-    """Returns an explanation for errors that mean that memory is exhausted, otherwise None."""
+    """Returns an explanation if an error means that memory is exhausted; otherwise None."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
     return UserError(

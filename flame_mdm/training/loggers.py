@@ -1,4 +1,4 @@
-"""Loggers: a metrics file in the run directory, TensorBoard, Weights & Biases."""
+"""Loggers: a metrics file in the run directory, TensorBoard, and Weights & Biases."""
 
 import io
 import json
@@ -37,12 +37,12 @@ class History(Logger):
 
     @property
     def version(self) -> str:
-        """Empty, since all parts of a run share one file."""
+        """Empty, because all parts of a run share one file."""
         return ""
 
     @rank_zero_only
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
-        """Does nothing, since the hyperparameters are in `config.yaml`."""
+        """Does nothing, because the hyperparameters are in `config.yaml`."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
@@ -61,7 +61,7 @@ class History(Logger):
 class TensorBoardRun(TensorBoardLogger):
     """TensorBoard logger without Lightning's `epoch`.
 
-    The epoch is always 0, since training is one pass over drawn batches.
+    The epoch is always 0, because training is a single pass over drawn batches.
     """
 
     @rank_zero_only
@@ -102,10 +102,10 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Logs metrics, except for steps that an earlier part of a resumed run has logged."""
+        """Logs metrics, except for steps that were logged before the run was resumed."""
         if step is not None and step < self.logged_step:
             return
-        # Weights & Biases numbers the rows of an offline part from 0 again.
+        # Weights & Biases numbers the rows of an offline part from 0 again
         if self.experiment.step < self.rows:
             self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)
@@ -117,7 +117,7 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """Ends the wandb run, since the next run of a sweep is in the same process."""
+        """Ends the wandb run, because the next run of a sweep is in the same process."""
         super().finalize(status)
         if self._experiment is not None:
             self._experiment.finish(exit_code=int(status != "success"))

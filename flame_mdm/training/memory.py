@@ -1,4 +1,4 @@
-"""Memory that a training needs, computed from its recipe without building the network."""
+"""Memory that training needs, computed from a recipe without building the network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,16 +28,16 @@ FLOAT = 4
 class TrainingMemory:
     """Memory of a training in float32, in bytes per process.
 
-    The text encoder and the data are not included: frozen encoders run before the training, and
-    data that are too large stay on disk.
+    The text encoder and the data are not included. Frozen encoders run before training, and data
+    sets that are too large stay on disk.
 
     Attributes:
         parameters: number of weights of the denoiser.
         state: weights, gradients, both states of Adam and, if the recipe averages weights, the
-            average. It does not depend on the batch size.
-        activations: tensors that the backward pass needs, for the longest batch. In bfloat16,
-            about half of it.
-        recomputed: the same with `task.checkpoint_activations=true`.
+            average. Independent of the batch size.
+        activations: tensors that the backward pass needs, for the longest batch. In bfloat16, they
+            take about half of this memory.
+        recomputed: `activations` with `task.checkpoint_activations=true`.
     """
 
     parameters: int
@@ -47,7 +47,7 @@ class TrainingMemory:
 
 
 def training_memory(config: Config) -> TrainingMemory:
-    """Returns the memory that the training of a recipe needs.
+    """Returns the memory that the training of a recipe requires.
 
     The network is built and run on torch's device "meta", whose tensors have no values.
     """
@@ -85,8 +85,8 @@ def training_memory(config: Config) -> TrainingMemory:
 def _saved(denoiser: nn.Module, forward: Callable[[], object]) -> tuple[int, list[tuple[int, int]]]:
     """Returns the bytes that a forward pass saves for the backward pass.
 
-    For each layer of `stacked_layers`, it also returns the saved bytes inside of the layer,
-    and the size of its input.
+    For each layer of `stacked_layers`, it also returns the bytes saved inside the layer, and the
+    size of its input.
     """
     weights = {p.untyped_storage()._cdata for p in denoiser.parameters()}
     kept: dict[int, Tensor] = {}  # by storage; kept alive, so that no address is used twice

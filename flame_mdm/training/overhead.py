@@ -1,7 +1,7 @@
-"""Leaves out work that Lightning does in every step, although no part of this training needs it.
+"""Skips work that Lightning does in every step, although this framework's training does not need it.
 
-A step of a small network takes about 2 ms, of which Lightning's bookkeeping takes a third. On a
-GPU, the device waits for the host during this time.
+A step of a small network takes about 2 ms, and a third of this time is Lightning's bookkeeping. On
+a GPU, the device waits for the host during this time.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -36,10 +36,10 @@ class NoProfiler(PassThroughProfiler):
 
 
 def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
-    """Replaces the hooks of each step that do nothing with None, which Lightning does not call.
+    """Replaces the hooks of each step that do nothing with None, so that Lightning does not call them.
 
-    There are six hooks per step, which most callbacks do not override. Calling one takes longer
-    than many operations of torch.
+    There are six hooks per step, most of which are not overridden by callbacks. Calling a hook
+    takes longer than many operations of torch.
     """
     owners: list[tuple[object, type]] = [(task, LightningModule)]
     owners += [(callback, Callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
@@ -50,9 +50,9 @@ def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
 
 
 def skip_exchange_of_signals(trainer: Trainer) -> None:
-    """Stops Lightning from asking all processes in every step whether one received SIGTERM.
+    """Prevents Lightning from asking all processes in every step whether one of them received SIGTERM.
 
-    Each question waits until the device has finished the step before. `Checkpoints` replaces
+    Each request waits until the device has finished the previous step. `Checkpoints` replaces
     Lightning's handler of SIGTERM, and exchanges signals without waiting.
     """
     trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]

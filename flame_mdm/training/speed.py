@@ -12,25 +12,25 @@ from flame_mdm.task import GeneratorTask, Task
 COMPILED_FROM = 5000
 """Minimum number of training steps for which the network is compiled.
 
-Shorter runs would not make up for the time of the compilation.
+In shorter runs, compilation would take more time than it saves.
 """
 PAD_MULTIPLE = 32
 """Batches of a compiled network are padded to multiples of this number of frames.
 
 The network is compiled once per length.
 """
-# Maximum number of lengths and modes for which the network is compiled; torch's default is 8
+# Maximum number of lengths and modes for which the network is compiled. The default of torch is 8.
 MOST_SHAPES = 64
 
 
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
-    """Prepares task and data for `speed=fast`, before training; returns the precision of the trainer.
+    """Prepares the task and the data for `speed=fast` before training. Returns the trainer's precision.
 
-    On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of
-    `COMPILED_FROM` steps or more.
+    On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM`
+    steps or more.
 
-    On a CPU: bfloat16 if the CPU has instructions for its products; `CheapDropout`; and
-    `attention`, without dropout of the attention weights. Compilation made no difference there.
+    On a CPU: bfloat16 if the CPU has instructions for its products, `CheapDropout`, and
+    `attention`, without dropout of the attention weights. Compilation made no difference on CPUs.
 
     A precision of the recipe other than 32-true is kept.
     """
@@ -52,7 +52,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
                 "takes less time"
             )
             denoiser = task.generator.denoiser
-            # networks without this attribute would learn from the padding
+            # Networks without this attribute would learn from the padding
             if denoiser.mask_padding:
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES
@@ -87,7 +87,7 @@ class CheapDropout(nn.Module):
         self.threshold = round(p * 2**16) - 2**15
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns `x` with some elements dropped and the others scaled; in evaluation mode, returns `x`."""
+        """Returns `x` with some elements dropped and the others scaled. In evaluation mode, returns `x`."""
         if not self.training or self.p == 0:
             return x
         words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64).random_(-(2**63), None)
@@ -102,7 +102,7 @@ def attention(
     attn_mask: Tensor | None = None,
     dropout_p: float = 0.0,
 ) -> Tensor:
-    """Computes `scaled_dot_product_attention` with two matrix products; ignores `dropout_p`.
+    """Computes `scaled_dot_product_attention` with two matrix products. Ignores `dropout_p`.
 
     On a CPU, torch's fused attention takes up to twice as long in float32, and 3 to 5 times as
     long in bfloat16.

@@ -27,7 +27,7 @@ FREE = (
     "trainer.limit_val_batches",
     "trainer.enable_progress_bar",
 )
-"""Keys that may differ when a run is resumed, since they change neither the model nor its training."""
+"""Keys that may differ when a run is resumed, because they change neither the model nor its training."""
 
 
 def train(config: Config) -> None:
@@ -51,10 +51,10 @@ def train(config: Config) -> None:
 def recipe_changes(config: Config) -> list[str]:
     """Returns "key=value" for each key in which a configuration differs from the recipe that it names.
 
-    Some keys are not compared: keys that may differ when a run is resumed, the seed, and keys
-    that the configuration lacks, because another version wrote it. If the class of a part
-    differs, the other keys of this part are left out. A recipe that is not in `experiments/` has
-    no changes.
+    Some keys are not compared: keys that may differ when a run is resumed, the seed, and keys that
+    the configuration lacks because it was written by another version. If the class of a part
+    differs, all other keys of this part are left out. A recipe that is not in `experiments/` has no
+    changes.
     """
     name = config.get("experiment")
     if name not in recipes():

@@ -282,7 +282,7 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
         checkpoint=sampled,
     )
     text = rendered(made(folder), "md")
-    assert "Differs from the protocol: samples = 4, seed = 2." in text
+    assert "Options that differ from the protocol: samples = 4, seed = 2." in text
     assert "sampler = ddim, eta 0.5; steps = 0, 5, 9" in text
     words = "Excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given."
     assert [words in note for _, note in made(folder).parts[0].notes].count(True) == 1
@@ -473,7 +473,7 @@ def test_rows_are_measured_from_their_checkpoint(trained, data_root, tmp_path, m
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
     assert b"ddim, eta 0.5" in first["mine.html"]
-    assert b"Differs from the protocol: replications = 1, samples = 4." in first["mine.md"]
+    assert b"Options that differ from the protocol: replications = 1, samples = 4." in first["mine.md"]
     assert main(["tables", *words]) == 0
     assert "evaluating" not in capsys.readouterr().out
     assert files(Path("runs/tables")) == first
@@ -629,9 +629,9 @@ def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
     ), "as the spec says"
 
     change(folder, "MFM", changed={"multimodality": False})
-    assert "Differs from the protocol" not in rendered(made(folder), "md"), "no column shows it"
+    assert "Options that differ from the protocol" not in rendered(made(folder), "md"), "no column shows it"
     change(folder, "MFM", changed={"samples": 5})
-    assert "Differs from the protocol: samples = 5." in rendered(made(folder), "md")
+    assert "Options that differ from the protocol: samples = 5." in rendered(made(folder), "md")
 
 
 def test_ranks(subtests):
@@ -757,7 +757,7 @@ def test_multimodality_is_computed_if_a_column_shows_it(folder, monkeypatch, sub
             assert main(words) == 0
             assert requests == expected
     page = (folder / "out" / "several.md").read_text()
-    assert "Differs from the protocol" not in page
+    assert "Options that differ from the protocol" not in page
 
 
 def test_a_footnote_states_the_numbers_of_generated_and_of_real_motions(folder):

@@ -246,7 +246,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
         "audit": f"Audit: {card}." if card else "Not audited.",
         "exclusions": _left_out(data.excluded),
         "skeleton": skeleton,
-        "changes": f"Differs from the protocol: {changed}." if changed else "",
+        "changes": f"Options that differ from the protocol: {changed}." if changed else "",
         "changes of the recipe": recipe,
         "published split": PUBLISHED_SPLIT if result.published_split else "",
         "force": FORCED if result.forced else "",

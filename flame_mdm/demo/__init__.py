@@ -1,4 +1,4 @@
-"""The demo: a page on which users request motions in the browser.
+"""The demo: a web page on which users request motions.
 
 `flame-mdm demo` serves the page.
 """

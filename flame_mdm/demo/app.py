@@ -1,4 +1,4 @@
-"""Server of the demo: the page, motion files, and their limits.
+"""Server of the demo: the page, motion files, and limits.
 
 It requires the extra `demo` (gradio).
 """
@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-# gradio reads these variables when it is imported.
+# gradio reads these variables when it is imported
 os.environ |= {
     "GRADIO_ANALYTICS_ENABLED": "False",
     "HF_HUB_DISABLE_TELEMETRY": "1",
@@ -37,8 +37,8 @@ from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 from flame_mdm.visualize import player_page
 
-# Number of open pages that gradio remembers. For each page, gradio stores half a megabyte, which
-# the demo does not need.
+# Number of open pages that gradio remembers. For each page, gradio stores half a megabyte of data,
+# which the demo does not need.
 SESSIONS = 64
 # Maximum number of motion files written at the same time, and maximum number of requests that wait for a file
 WRITERS = 2
@@ -84,7 +84,7 @@ def serve(
 def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
     """Returns the limits of connections.
 
-    With `hosts`, the demo is behind a web server with these names, so that all visitors have one
+    With `hosts`, the demo is behind a web server with these names, so all visitors have the same
     address.
     """
     limits = ConnectionLimits()
@@ -92,7 +92,7 @@ def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
 
 
 class Server(uvicorn.Server):
-    """A server that ends the streams to open pages when it stops, before it waits for requests."""
+    """A server that ends the streams of open pages when it stops, before it waits for requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]
@@ -194,7 +194,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         finally:
             writers.waiting -= 1
         words = "-".join(re.findall(r"[a-z0-9]+", request.text.lower()))[:60]
-        # The rig is part of the name of the file.
+        # The rig is part of the file name
         rig = f"-{options['rig']}" if options.get("rig") else ""
         name = f"{words or 'motion'}-{int(number) + 1}{rig}{extension}"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -204,7 +204,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
         add_live(app, studio.live, writers)
     blocks = build_page(studio)
     blocks.state_session_capacity = SESSIONS
-    # without this setting, gradio does not check which files it may read
+    # Without this setting, gradio does not check which files it may read
     blocks.has_launched = True
     gr.mount_gradio_app(
         app,

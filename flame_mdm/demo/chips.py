@@ -1,6 +1,6 @@
-"""The meaning that the demo understood from a text, as HTML.
+"""The meaning that the demo reads from a text, as HTML.
 
-There is a chip for each action and attribute, which one click changes.
+Each action and attribute is shown as a chip, and can be changed with one click.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,11 +21,11 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
     """Returns the chips of a text: its actions in order, their attributes, and ignored words.
 
-    The options of a chip are texts with another word for its action or attribute. A chosen text
+    The options of a chip are texts with another word for its action or attribute. The chosen text
     replaces the text in the form.
 
     Args:
-        abilities: the actions and attributes that the model knows. These are the options of the
+        abilities: the actions and attributes that the model knows. They are the options of the
             chips.
         parts: words and seconds of the parts of the text.
         readings: the meaning of each part.

@@ -1,4 +1,4 @@
-"""Connections of the demo's server, with deadlines, and limits on the number in total and per address."""
+"""Connections of the demo's server, with deadlines and limits on their number in total and per address."""
 
 import asyncio
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class ConnectionLimits:
     """Limits of the connections of a server.
 
     A connection is *waiting* until the headers of a request are complete, and again after the
-    answer. When the maximum number of connections is reached, a new connection replaces the
+    response. When the maximum number of connections is reached, a new connection replaces the
     connection that has waited longest. If no connection is waiting, the request of the new
     connection gets status 503.
 
@@ -24,10 +24,10 @@ class ConnectionLimits:
         total: maximum number of open connections.
         per_address: maximum number of open connections per address, or per IPv6 network of 64
             bits.
-        header_seconds: maximum waiting time of a connection, however many bytes of the headers
-            arrive.
-        idle_seconds: maximum waiting time after an answer, if nothing arrives.
-        stall_seconds: maximum number of seconds during which a client does not read an answer.
+        header_seconds: maximum waiting time of a connection, regardless of how many bytes of the
+            headers arrive.
+        idle_seconds: maximum waiting time after a response, if nothing arrives.
+        stall_seconds: maximum number of seconds during which a client does not read a response.
     """
 
     total: int = 256
@@ -50,7 +50,7 @@ def server_settings(app: ASGIApp, limits: ConnectionLimits) -> uvicorn.Config:
 
 
 class Connection(H11Protocol):
-    """A connection that observes `ConnectionLimits`."""
+    """A connection that enforces `ConnectionLimits`."""
 
     def __init__(self, *arguments: Any, limits: ConnectionLimits, **keywords: Any):
         super().__init__(*arguments, **keywords)
@@ -91,19 +91,19 @@ class Connection(H11Protocol):
     def pause_writing(self) -> None:
         """Starts the timer that closes the connection if the client does not read."""
         super().pause_writing()
-        # The timer aborts the connection, because closing it would wait for the client, which
-        # does not read.
+        # The timer aborts the connection instead of closing it, because closing would wait for the
+        # client, which does not read.
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stops this timer, since the client reads again."""
+        """Stops this timer, because the client reads again."""
         super().resume_writing()
         if self.stall is not None:
             self.stall.cancel()
             self.stall = None
 
     def close(self) -> None:
-        """Closes the connection, which no longer counts."""
+        """Closes the connection and stops counting it."""
         self._stop_timers()
         self.connections.discard(self)
         self.transport.close()
@@ -145,7 +145,7 @@ class Connection(H11Protocol):
 
 
 def _network(address: str) -> IPv4Address | IPv6Network:
-    """Returns an address, or the 64-bit network of an IPv6 address, since a subscriber has a whole network."""
+    """Returns an address, or the 64-bit network of an IPv6 address, because a subscriber has an entire network."""
     parsed = ip_address(address.partition("%")[0])
     if isinstance(parsed, IPv6Address):
         return parsed.ipv4_mapped or IPv6Network((parsed, 64), strict=False)

@@ -1,4 +1,4 @@
-"""Guard of the demo's server: it passes on requests of the page itself, and refuses all others."""
+"""Guard of the demo's server, which passes on requests of the page itself and refuses all others."""
 
 import asyncio
 import ipaddress
@@ -21,7 +21,7 @@ from flame_mdm.demo.request import MAX_TEXT, MAX_WAYPOINTS, PLAIN
 MAX_BODY = 64 * 1024
 # Maximum number of seconds until the body has arrived
 BODY_TIME = 10.0
-# maximum number of characters in the path of an address; names of files have at most 255
+# Maximum number of characters in the path of an address. File names have at most 255 characters.
 MAX_PATH = 200
 READ = re.compile(
     r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"
@@ -54,7 +54,7 @@ class Post(BaseModel):
 class Call(Post):
     """A call of a function of the page.
 
-    Its arguments are texts, never objects that could name a file.
+    Its arguments are texts, and never objects that could name a file.
     """
 
     data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
@@ -100,12 +100,12 @@ POSTS: dict[str, type[Post]] = {
 
 
 class Guard:
-    """ASGI middleware that checks a request before the application gets it.
+    """ASGI middleware that checks a request before the application receives it.
 
     It checks host, origin, path, size and content. `hosts` are the names of this server, in
     addition to localhost and numeric addresses. A request with another host name may come from a
     page whose name somebody pointed at this computer (DNS rebinding). `calls` maps the numbers of
-    the page's callable functions to their path, and to a check of the arguments. `is_open` tells
+    the page's callable functions to their path, and to a check of the arguments. `is_open` returns
     whether a session has called a function, so that its results can be read.
     """
 
@@ -163,7 +163,7 @@ class Guard:
     async def _until_closing(self, receive: Receive) -> Message:
         """Returns the next message.
 
-        Once the server stops, this is a message of disconnection, so that open streams end.
+        When the server stops, this is a message of disconnection, so that open streams end.
         """
         tasks = [asyncio.ensure_future(receive()), asyncio.ensure_future(self.closing.wait())]
         try:
@@ -180,7 +180,7 @@ class Guard:
             line = "this demo is not served under that name. Start it with hosts=NAME"
             raise HTTPException(HTTPStatus.MISDIRECTED_REQUEST, line)
         origin = headers.get("origin", f"http://{host}")
-        # a proxy may replace the host, but does not replace the origin
+        # A proxy may replace the host, but does not replace the origin
         same = _network_location(origin) == host.lower() or _host_name(origin) in self.hosts
         if not same or (
             path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
@@ -239,7 +239,7 @@ async def _body(request: Request) -> bytes:
 
 
 def _network_location(address: str) -> str:
-    """Returns host and port of an address in lower case; "" for an invalid address, such as http://[."""
+    """Returns the host and port of an address in lower case; "" for an invalid address, such as http://[."""
     try:
         return urlsplit(address).netloc.lower()
     except ValueError:

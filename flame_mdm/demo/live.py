@@ -1,4 +1,4 @@
-"""Streams of motion for visitors. Their number is limited; blocks are computed one at a time."""
+"""Streams of motion for visitors. Their number is limited, and blocks are computed one at a time."""
 
 import secrets
 import tempfile
@@ -27,7 +27,7 @@ LONGEST = 3600.0
 BURST, RATE = 8.0, 2.0
 # Duration in seconds of the part of a stream that can be downloaded
 KEPT = 60.0
-# The rotations of the first frames of a block depend on this number of frames before it
+# The rotations of the first frames of a block depend on this number of preceding frames
 BEFORE = 10
 ENDINGS = (".bvh", ".glb")
 STAND, WALK = "a person stands", "a person walks forward"
@@ -36,7 +36,7 @@ STAND, WALK = "a person stands", "a person walks forward"
 
 @dataclass
 class LiveStream:
-    """A visitor's stream and the data that is kept for it.
+    """A visitor's stream, and the data that is stored for it.
 
     Attributes:
         stream: the stream.
@@ -68,7 +68,7 @@ class LiveStreams:
 
     @property
     def can_lead(self) -> bool:
-        """Whether the model walks, so that visitors may lead the person along waypoints."""
+        """Whether the model can walk, so that visitors can lead the person along waypoints."""
         if not isinstance(self.model.representation, HumanML):
             return False
         try:
@@ -83,14 +83,15 @@ class LiveStreams:
         """Returns the frames of a stream, starting at frame `begin`, in the format of the player.
 
         Args:
-            name: name of the stream; "" = begin a new stream, whose name is in the result.
+            name: name of the stream. "" = begin a new stream, whose name is in the result.
             text: description of the motion.
-            begin: number of the first frame. Frames of the stream after this frame are dropped.
+            begin: number of the first frame. Later frames of the stream are dropped.
             path: waypoints that are ahead in frame `begin`, x and z in meters. `reached` in the
                 result lists the numbers of the frames in which the first waypoints are reached.
 
         Raises:
-            UserError: If the text is not understood, the stream has ended, or a limit is reached.
+            UserError: If the text is not understood, if the stream has ended, or if a limit is
+                reached.
         """
         with self._working:
             read_text(self.model, text)
@@ -122,7 +123,7 @@ class LiveStreams:
         """Returns a motion file of the last minute of a stream.
 
         Raises:
-            UserError: If the stream has ended, or files do not have this ending.
+            UserError: If the stream has ended, or if no file format has this ending.
         """
         if ending not in ENDINGS:
             raise UserError(
@@ -139,7 +140,7 @@ class LiveStreams:
             return path.read_bytes()
 
     def _opened(self, name: str, text: str) -> tuple[str, LiveStream]:
-        """Returns a stream and its name, after ending streams that nobody reads."""
+        """Returns a stream and its name, after ending streams that are no longer read."""
         now = self.clock()
         self._streams = {
             other: live for other, live in self._streams.items() if now - live.used <= IDLE

@@ -18,7 +18,7 @@ from pydantic import (
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
 
-# Limits of one request, so that a visitor cannot occupy the machine for minutes.
+# Limits of a request, so that a visitor cannot occupy the machine for minutes
 MAX_TEXT = 300
 MAX_SECONDS = 30
 MAX_SAMPLES = 4
@@ -32,7 +32,7 @@ MAX_WAYPOINTS, FAR = 16, 20.0
 # Separator between the names of a model and its adapter
 PLUS = " + "
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
-"""Text without control characters and without characters that change the direction of writing."""
+"""Text without control characters, and without characters that change the writing direction."""
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=PLAIN)]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
@@ -57,7 +57,7 @@ class DemoEdit(BaseModel):
     """An edit of a previous motion; `motion` is its number.
 
     See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part; "" =
-    unconditioned. A variation of the entire motion keeps text, parts and path of the request.
+    unconditioned. A variation of the entire motion keeps the text, parts and path of the request.
     """
 
     model_config = RULES
@@ -101,9 +101,9 @@ class DemoRequest(BaseModel):
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps: for each, the number of the motion to edit, and keywords of `generate` or `edit`.
+        """Returns the steps: for each step, the number of the motion to edit, and keywords of `generate` or `edit`.
 
-        In the first step, which generates, the number is None.
+        The number is None in the first step, which generates.
         """
         shared = self.model_dump(
             include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True
@@ -126,14 +126,14 @@ class DemoRequest(BaseModel):
                 )
             else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-        # With a path, there is no cleanup: it moves the root away from the waypoints, by 0.3 m in
-        # one example.
+        # With a path, there is no cleanup, because it moves the root away from the waypoints, by
+        # 0.3 m in one example.
         if self.cleanup and not self.path:
             steps[-1][1]["cleanup"] = True
         return steps
 
     def python(self, kind: str, device: str) -> str:
-        """Returns Python code that makes the same motions; `kind` is the model's kind of condition."""
+        """Returns Python code that generates the same motions; `kind` is the model's kind of condition."""
         model, _, adapter = self.model.partition(PLUS)
         options = ("" if device == "cpu" else f", {device!r}") + (
             f", adapter={adapter!r}" if adapter else ""
@@ -179,7 +179,7 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
 
 
 def checked(values: dict[str, Any]) -> DemoRequest:
-    """Returns a request; empty values become the defaults.
+    """Returns a request. Empty values are replaced by the defaults.
 
     The `UserError` quotes an invalid value.
     """

@@ -1,4 +1,4 @@
-"""Motions for the page: the model handles one request at a time; the latest results stay in memory."""
+"""Motions for the page. The model handles one request at a time, and the latest results stay in memory."""
 
 import tempfile
 import time
@@ -38,7 +38,7 @@ FORMATS = {
 
 
 class Studio:
-    """Makes the motions of requests, only with the models in `sources`.
+    """Generates the motions of requests, only with the models in `sources`.
 
     A source is an argument of `load`, or "MODEL + ADAPTER".
     """
@@ -57,7 +57,7 @@ class Studio:
     def model(self, name: str) -> MotionGenerator:
         """Returns a model by its name on the page. Raises `UserError` for other names.
 
-        A model with an adapter is loaded at its first use.
+        A model with an adapter is loaded when it is first used.
         """
         if name not in self.files:
             near = did_you_mean(name, self.files)
@@ -69,15 +69,15 @@ class Studio:
             model = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
             if model.conditioned_on == "text" and Reader.fits(model.facts):
                 reader = self._readers[name] = Reader(model.facts)
-                # The tables of the language are read in advance, so that the first answer does
-                # not wait for them.
+                # The language tables are read in advance, so that the first response does not wait
+                # for them.
                 for action in reader.abilities.actions:
                     reader.abilities.choices(action)
             self._models[name] = model
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns the reader of texts for a model whose captions have single actions; None for other models."""
+        """Returns the reader of texts for a model whose captions describe single actions; None for other models."""
         self.model(name)
         return self._readers.get(name)
 
@@ -98,7 +98,7 @@ class Studio:
 
             def before(*_: object) -> None:
                 nonlocal calls
-                # A stream of another visitor may use the model at the same time.
+                # A stream of another visitor may use the model at the same time
                 if get_ident() != thread:
                     return
                 if stop is not None and stop.is_set():
@@ -131,9 +131,9 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request; a sentence with several actions becomes a sequence.
+        """Returns the request, in which a sentence with several actions becomes a sequence.
 
-        Raises the errors of `generate`.
+        Raises the same errors as `generate`.
         """
         if not request.text or (model := self.model(request.model)).conditioned_on != "text":
             return request
@@ -143,7 +143,7 @@ class Studio:
         return checked(request.model_dump() | {"text": text})
 
     def readings(self, request: DemoRequest) -> list[Reading]:
-        """Returns the meaning of each part of a request's text; [] for models that read any words."""
+        """Returns the meaning of each part of a request's text; [] for models that read arbitrary words."""
         reader = self.reader(request.model)
         if reader is None or not request.text or not request.split:
             return []

@@ -1,6 +1,6 @@
 """The page of the demo: form, player, edits, downloads and links.
 
-`page.js` writes the links; the server reads and answers them.
+`page.js` writes the links, and the server reads and answers them.
 """
 
 import re
@@ -54,7 +54,7 @@ PROGRAMS = {
     "Mixamo FBX": ("fbx", "&amp;rig=mixamo"),
     "Mixamo GLB": ("glb", "&amp;rig=mixamo"),
 }
-"""Buttons for programs: the ending of the file, and the skeleton in its address.
+"""Buttons for programs: the file ending, and the skeleton in the address of the file.
 
 Other formats are under "More".
 """
@@ -323,9 +323,9 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 
 def _refusal(error: NotUnderstood) -> str:
-    """Returns the message for a text that contains no action that the model knows.
+    """Returns the message for a text without an action that the model knows.
 
-    The nearest actions are buttons with pictures.
+    The nearest actions are shown as buttons with pictures.
     """
     message = (
         f'<p class="error" role="alert">{escape(one_line(error.message))}. Nearest in meaning:</p>'
@@ -345,7 +345,7 @@ def _still(text: str) -> str:
 def _note(kind: str, line: str) -> str:
     """Returns a message.
 
-    A suggested text in it is a button that replaces the text of the form.
+    If the message suggests a text, this text is a button that replaces the text in the form.
     """
     shown = re.sub(
         r"Did you mean &#x27;(.+?)&#x27;\?$",

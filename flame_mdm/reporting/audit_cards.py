@@ -19,7 +19,7 @@ from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
 SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
-"""Perturbations of the set that show the bias of a metric, and the measured motions at their strongest grade."""
+"""Perturbations of sets that show the bias of a metric, and the motions that are measured at their strongest grade."""
 ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
@@ -34,13 +34,13 @@ LEGEND = (
 class Seen:
     """Response of a metric to a perturbation; None = at no grade."""
 
-    # the paired difference from real motions is not 0 at this and all stronger grades
+    # The paired difference from real motions is not 0 at this and all stronger grades
     grade: float | None
-    # values are outside the 95 % interval of real motions at this and all stronger grades
+    # Values are outside the 95 % interval of real motions at this and all stronger grades
     outside: float | None
     # Whether the strongest grade is rated better than real motions
     rewarded: bool
-    # Whether every stronger grade differs at least as much, within its interval
+    # Whether every stronger grade differs by at least as much, within its interval
     monotone: bool
 
 
@@ -75,8 +75,8 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 def card_name(card: AuditCard) -> str:
     """Returns the name of a card's files: data set, extractor, number of motions, and a hash.
 
-    An audit of other motions, or of another crop, has another hash, so that it does not overwrite
-    a stronger card.
+    The hash depends on the motions and the crop, so that an audit of other motions or with another
+    crop does not overwrite a stronger card.
     """
     extractor = card.extractor.sha256[:12] if card.extractor else "none"
     facts = card.model_dump(include={"protocol", "data", "split", "seed", "motions", "resamples"})
@@ -108,10 +108,10 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns a tuple by which cards are compared: the larger, the better the card fits the evaluated data.
+        """Returns a tuple by which cards are compared. Larger tuples mean cards that better fit the evaluated data.
 
-        Cards with the same length limits are best, then cards of the test split, cards of the
-        same data, and cards of more motions.
+        Cards with the same length limits are best, followed by cards of the test split, cards of
+        the same data, and cards of more motions.
         """
         same_frames = self.data.frames == data.frames
         return (
@@ -126,10 +126,10 @@ class CitedCard:
 
 
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
-    """Returns the strongest card of an extractor that fits the evaluated data; None without such a card.
+    """Returns the strongest card of an extractor that fits the evaluated data; None if there is no such card.
 
-    Without an extractor, the card is about the metrics of joints. Cards are in the folder of
-    FLAME_MDM_AUDITS (default: runs/audit) and in the repository, whose cards are listed in
+    Without an extractor, the card is about the metrics of joints. Cards are in the folder
+    FLAME_MDM_AUDITS (default: runs/audit), and in the repository, whose cards are listed in
     audited.json.
     """
     extractor = sha256[:12] if sha256 else None
@@ -152,9 +152,9 @@ def read_card(path: Path) -> AuditCard:
 
 
 def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Path]:
-    """Writes one card, or two side by side, as a web page and as Markdown; returns the paths.
+    """Writes one card, or two cards side by side, as a web page and as Markdown. Returns the paths.
 
-    `name` is the name of the files; the default consists of the names of the cards.
+    `name` is the name of the files. The default consists of the names of the cards.
     """
     metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
     metrics.sort(key=lambda metric: any(_facts_of(card, metric).exact for card in cards))
@@ -249,7 +249,7 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def findings(card: AuditCard) -> list[str]:
-    """Returns sentences on perturbations that metrics do not notice, or rate better than real motions."""
+    """Returns sentences about perturbations that metrics do not notice, or rate better than real motions."""
     table = {
         (perturbation.name, metric): seen(card, perturbation, metric)
         for perturbation in card.perturbations
@@ -282,7 +282,9 @@ def findings(card: AuditCard) -> list[str]:
     for metric in card.metrics:
         liked = [name for name in wrong if (response := table[name, metric]) and response.rewarded]
         if liked:
-            lines.append(f"{metric} rates these perturbations better than real motions: {', '.join(liked)}.")
+            lines.append(
+                f"{metric} rates these perturbations better than real motions: {', '.join(liked)}."
+            )
     biased = [metric for metric in card.metrics if _facts_of(card, metric).depends_on_count]
     for perturbation in card.perturbations:
         of_motions = SETS.get(perturbation.name)
@@ -361,5 +363,5 @@ def _curve(
 
 
 def _metric_text(name: str) -> str:
-    """Returns the name of a metric as Markdown; names of this project's metrics need no escapes."""
+    """Returns the name of a metric as Markdown. Names of this project's metrics need no escapes."""
     return name if re.fullmatch(r"[\w/.-]+", name) else markdown_text(name)

@@ -24,8 +24,8 @@ SECONDS = 15  # only the first seconds of a longer clip are shown, to keep the p
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
     """Returns the clips of a split (None = all) whose id and captions contain all words of `search`.
 
-    Upper and lower case do not matter. Each clip is grouped with its mirrored copy, original
-    first. A group matches if one of its clips matches.
+    Upper and lower case are not distinguished. Each clip is grouped with its mirrored copy,
+    original first. A group matches if one of its clips matches.
     """
     ids = {clip.id for clip in clips}
     families: dict[str, list[Entry]] = {}
@@ -58,8 +58,8 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
-    # The action data sets use camera coordinates, which have no floor. The lowest joint is
-    # therefore placed at height 0.
+    # The action data sets use camera coordinates, which have no floor, so the lowest joint is
+    # placed at height 0.
     if below < -0.3:
         joints[..., 1] -= below
     actions = store.info["actions"]
@@ -105,7 +105,7 @@ def write_clips(
         longest: number of frames to which longer clips are cut, as in evaluations.
 
     Raises:
-        UserError: If the folder holds other motions, which would be mistaken for these clips.
+        UserError: If the folder contains other motions, which would be mistaken for these clips.
     """
     ids = [re.sub(r"[^\w.-]+", "_", clip.id)[:100] for clip in clips]
     paths = [folder / f"motion_{number:03d}_{name}.npz" for number, name in enumerate(ids)]

@@ -56,8 +56,8 @@ class ComparedRun:
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
     """Returns two or more runs and folders of motion files.
 
-    The label of a run consists of recipe and run name; the label of a folder is its name. Labels
-    that are the same are replaced with paths.
+    The label of a run consists of the recipe and the run name. The label of a folder is its name.
+    Identical labels are replaced by paths.
     """
     if len(set(folders)) < 2:
         raise UserError(
@@ -115,12 +115,12 @@ def comparison(
     mesh: Mesh | None = None,
     evidence: Callable[[Motion], Sequence[Mark]] = lambda motion: (),
 ) -> str:
-    """Returns a page that compares runs side by side. The same runs give the same bytes.
+    """Returns a page that compares runs side by side. The same runs result in the same bytes.
 
     Args:
         compared: runs and folders of motions.
         shown: the motions of each run and folder, by prompt. The page plays the motions for the
-            prompts that all have.
+            prompts that all of them have.
         mesh: the body to draw.
         evidence: function that returns the marks for the time line of a motion.
     """
@@ -212,9 +212,9 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD`: the differences of all metrics of two results, or a reason for no comparison.
+    """Returns rows for `HEAD`: the differences of all metrics of two results, or the reason why there is no comparison.
 
-    Both results are of the same evaluation.
+    Both results must be of the same evaluation.
     """
     if invalid := [*first.invalid_because, *second.invalid_because]:
         return f"not compared: not valid: {invalid[0]}"

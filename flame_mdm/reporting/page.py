@@ -1,4 +1,4 @@
-"""Self-contained web pages from templates. The same input gives the same bytes."""
+"""Self-contained web pages from templates. The same input results in the same bytes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
     "base-uri 'none'; form-action 'none'"
 )
-"""Content security policy of pages: blocks all network access."""
+"""Content security policy of pages, which blocks all network access."""
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -55,7 +55,7 @@ def _environment() -> Environment:
 
 
 def number(value: float | None) -> str:
-    """Formats a number for a table with four digits; a missing value is a dash."""
+    """Formats a number with four digits for a table. A missing value is a dash."""
     if value is None:
         return "–"
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
@@ -64,7 +64,7 @@ def number(value: float | None) -> str:
 
 
 def filled(head: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Returns a table without empty columns and rows; the first column has the names of the rows."""
+    """Returns a table without empty columns and rows. The first column contains the names of the rows."""
     rows = [row for row in rows if {*row[1:]} - {"–", ""}]
     kept = [k for k in range(len(head)) if not k or {row[k] for row in rows} - {"–", ""}]
     return [head[k] for k in kept], [[row[k] for k in kept] for row in rows]

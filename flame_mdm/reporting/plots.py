@@ -1,4 +1,4 @@
-"""Curves, scatter plots and histograms as SVG. The same values give the same bytes."""
+"""Curves, scatter plots and histograms as SVG. The same values result in the same bytes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 # Height of a line of text
 ROW = 16
-# Maximum number of segments per curve. The lowest and the highest point of each segment are
-# drawn.
+# Maximum number of segments per curve. The lowest and the highest point of each segment are drawn.
 MOST = 300
 LOG_RANGE = 15  # positive values get a logarithmic axis if they span more than this factor
 COLORS = 8
-# Numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow
+# Numbers closer to 0 than this are treated as 0 on axes, because steps between ticks would
+# underflow
 SMALLEST = 1e-300
 
 Curve = Mapping[int, float]  # values by step
@@ -53,7 +53,7 @@ class Histogram:
 class Panel:
     """A pair of axes with labels.
 
-    The x-axis may be logarithmic, or begin at 0; `levels` are horizontal lines.
+    The x-axis may be logarithmic, or begin at 0. `levels` are horizontal lines.
     """
 
     content: Sequence[Series] | Histogram
@@ -66,7 +66,7 @@ class Panel:
 
 
 def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
-    """Draws panels side by side, with the styles of the page; returns None without points."""
+    """Draws panels side by side, with the styles of the page. Returns None if there are no points."""
     drawn = [_drawn(panel) for panel in panels]
     if not any(drawn):
         return None
@@ -183,7 +183,7 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    """Returns the points of a curve by step, without NaN and values that would overflow."""
+    """Returns the points of a curve by step, without NaN and without values that would overflow."""
     return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]
 
 
@@ -212,7 +212,8 @@ def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
         begin, end = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
         low, high = begin * step, end * step
     else:
-        # A tick may lie slightly past the end: an axis that ends at step 2999 has a tick at 3k.
+        # A tick may lie slightly beyond the end of an axis: an axis that ends at step 2999 has a
+        # tick at 3k.
         begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)
     return _Axis(low, high, [k * step for k in range(begin, end + 1)])
 

@@ -25,7 +25,7 @@ COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
     """Writes `report.html` into a run directory and returns its path.
 
-    The same run gives the same bytes.
+    The same run results in the same bytes.
     """
     from omegaconf import OmegaConf
 
@@ -83,8 +83,8 @@ def _player(run: Run, body: Mesh | None) -> str:
     from flame_mdm.formats.readers import read
     from flame_mdm.visualize import player_page
 
-    # The player is written again from the motions: an existing `player.html` may be untrusted,
-    # and its scripts would run in the report.
+    # The player is generated again from the motions, because an existing `player.html` may be
+    # untrusted, and its scripts would run in the report.
     return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))], body=body)
 
 
@@ -101,8 +101,8 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     """Groups the curves of each heading into charts.
 
-    Below a heading, curves whose names differ only in their family (`train/loss`, `val/loss`)
-    share a chart.
+    Below a heading, curves whose names differ only in their family (`train/loss`, `val/loss`) share
+    a chart.
     """
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {
@@ -162,7 +162,7 @@ def labeled(name: str, value: Value | None) -> str:
 
 
 def sampling(result: Result) -> str:
-    """Returns the origin of a result's motions: checkpoint or baseline, and options of the sampler."""
+    """Returns the origin of a result's motions: the checkpoint or baseline, and the sampler options."""
     checkpoint = result.checkpoint
     words = [f"baseline {result.baseline}" if result.baseline else "motions from other systems"]
     if checkpoint is not None:
@@ -192,7 +192,7 @@ def marks(result: Result) -> list[str]:
 
 
 def printed(value: Value | None) -> str:
-    """Returns a value with its interval as text; – without a value."""
+    """Returns a value with its interval as text, or – if there is no value."""
     return interval(value.mean, value.half) if value else "–"
 
 

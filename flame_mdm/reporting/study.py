@@ -1,4 +1,4 @@
-"""User study: a page on which people rate motions, and counts of their answers."""
+"""User study: a page on which people rate motions, and the counts of their answers."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Answers(Schema):
 
 
 class Pair(Schema):
-    """Counts of people's preferences between two runs."""
+    """Counts of the raters' preferences between two runs."""
 
     a: str
     b: str
@@ -82,17 +82,17 @@ def rating_page(
 ) -> str:
     """Returns a page that asks which of two motions fits a text better.
 
-    One motion is from the first run, the other one from another run. The page hides the names of
-    the runs, and saves the answers to a file for `tally`.
+    One motion is from the first run, and the other one from another run. The page hides the names
+    of the runs, and saves the answers to a file for `tally`.
 
     Args:
         compared: two or more runs or folders of motions.
         shown: the motions of each run, by prompt.
-        seed: seed of the order of the pairs, and of the sides on which the motions are shown.
+        seed: seed of the order of the pairs, and of the side on which each motion is shown.
         body: the body to draw.
 
     Raises:
-        UserError: If two runs have no prompt in common, apart from the empty prompt.
+        UserError: If two runs have no prompt in common, except the empty prompt.
     """
     draw = random.Random(seed)
     items: list[dict[str, Any]] = []
@@ -150,8 +150,8 @@ def tally(files: Sequence[Path]) -> list[Pair]:
     """Counts the answers of several raters, per pair of runs.
 
     Raises:
-        UserError: If a file is malformed, if a rater's answers to one page are given twice, or if
-            a rating compares a run with itself.
+        UserError: If a file is malformed, if a rater's answers to one page are given twice, or if a
+            rating compares a run with itself.
     """
     answered: dict[tuple[str, str], Path] = {}
     pairs: dict[tuple[str, str], Pair] = {}
@@ -186,7 +186,7 @@ def tally(files: Sequence[Path]) -> list[Pair]:
 
 
 def wilson(wins: int, votes: int) -> tuple[float, float, float]:
-    """Returns the share of wins and the limits of its 95 % interval (Wilson 1927).
+    """Returns the fraction of wins and the limits of its 95 % interval (Wilson 1927).
 
     Votes are assumed to be independent.
     """

@@ -1,9 +1,9 @@
 """Atomic writes, hashes, locks, and safe reading of files from other people.
 
-A file that may come from other people is read or checked with this module first. The file must be
-a regular file of limited size, and the sizes that it declares must match its bytes. Functions
-that read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a
-regular file or its content is refused.
+A file that may come from other people is first read or checked with this module. The file must be a
+regular file of limited size, and the sizes that it declares must match its bytes. Functions that
+read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular
+file, or if its content is refused.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ MEBIBYTE = 2**20
 TEXT_LIMIT = 512 * MEBIBYTE
 """Maximum size of a text or JSON file.
 
-The largest known file, BABEL's annotations, has 175 MiB.
+The largest known file, which contains BABEL's annotations, has 175 MiB.
 """
 YAML_LIMIT = MEBIBYTE // 4
-"""Maximum size of a YAML file, since parsing is slow.
+"""Maximum size of a YAML file, because parsing is slow.
 
 Recipes, skeletons, protocols and table specs are far smaller.
 """
@@ -46,10 +46,10 @@ Recipes, skeletons, protocols and table specs are far smaller.
 YAML_NODES = 100_000
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
-"""The arrays of a compressed file may always have this total size.
+"""Total size that the arrays of a compressed file may always have.
 
-Above it, they may have at most `INFLATION` times the size of the file. Motion data is compressed
-by a factor of less than 10.
+Larger arrays may have at most `INFLATION` times the size of the file. Motion data is compressed by
+a factor of less than 10.
 """
 INFLATION = 20
 # Beginning of a pointer file, which replaces a file in Git LFS
@@ -57,11 +57,11 @@ GIT_LFS = b"version https://git-lfs.github.com/spec/"
 POINTER_LIMIT = 1024  # pointer files are smaller than this number of bytes
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-"""Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
+"""Errors raised by `zipfile` for damaged, encrypted and unusually compressed archives."""
 DIRECTORY_LIMIT = 16 * MEBIBYTE
 """Maximum size of the directory of a zip archive in bytes. Each entry becomes a Python object."""
-# Maximum number of members of an archive. HumanML3D, the largest data set in archives, has
-# 90,000.
+# Maximum number of members of an archive. HumanML3D, the largest data set in archives, has 90,000
+# members.
 MAX_MEMBERS = 200_000
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # error numbers of a full disk
 
@@ -71,9 +71,9 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
     """Yields a temporary path next to `path` that is renamed to `path` at the end.
 
     A failure leaves no files behind. The temporary name is unique, so that several processes can
-    write the same file; the last process wins. A link at `path` is replaced; the file to which it
-    leads does not change. Temporary files that killed processes left in the folder are removed
-    before the first file that this process writes there.
+    write the same file. The last process wins. A link at `path` is replaced, but its target is not
+    changed. Temporary files that killed processes left in the folder are removed before this
+    process writes its first file there.
 
     Args:
         path: file to write.
@@ -81,7 +81,7 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
             lead out of it.
 
     Raises `UserError` if a link leads out of `within`, if `path` is a pipe or a device, or if the
-    file cannot be written, for instance because the disk is full.
+    file cannot be written, for example because the disk is full.
     """
     path = Path(path)
     if within is not None:
@@ -97,11 +97,11 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
 @contextmanager
 def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Yields a temporary folder whose files are moved to the folder `path` at the end: all files or none.
+    """Yields a temporary folder. At the end, either all of its files or none are moved to the folder `path`.
 
-    If `path` exists, files of the same names are replaced and other files are kept. Temporary
-    folders that killed processes left behind are removed. `within` is the folder that links must
-    not leave; see `atomic_write` for the errors.
+    If `path` exists, files with the same names are replaced, and all other files are kept.
+    Temporary folders that killed processes left behind are removed. Links must not lead out of the
+    folder `within`. The errors are described in `atomic_write`.
     """
     path = Path(path)
     if within is not None:
@@ -125,8 +125,8 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 def _temporary(path: Path) -> Iterator[Path]:
     """Yields a unique path next to `path`, and removes the file at this path at the end.
 
-    The folder is created. Errors with the unique path get `path` instead. An `OSError` about
-    either path, or about a folder above, becomes a `UserError`.
+    The folder is created. Error messages contain `path` instead of the unique path. An `OSError`
+    about either path, or about a parent folder, is converted to a `UserError`.
     """
     temporary = path
     try:
@@ -149,7 +149,7 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _remove_abandoned_once(folder: Path) -> None:
-    """Removes what killed processes left behind, before the first file of this process.
+    """Removes files that killed processes left behind, before the first file of this process.
 
     Listing the folder for each of thousands of files would take too long.
     """
@@ -200,7 +200,7 @@ def write_json(
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` without it, and converts `errors` to such errors."""
+    """Adds the name of a file to every `UserError` that lacks it, and converts `errors` to `UserError`."""
     try:
         yield
     except UserError as error:
@@ -213,13 +213,14 @@ def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator
 
 @contextmanager
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
-    """Holds a lock file that names process and host.
+    """Holds a lock file that names the process and the host.
 
-    Yields the name of a dead process that left the file behind, or "". If another process holds
-    the lock, `busy` is called with its name; `busy` raises an error, or returns to wait. `advice`
-    is part of the error for file systems without locks. The operating system releases the lock
-    when the process ends, for any reason. The lock is a POSIX record lock, which also works
-    between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has no such locks.
+    Yields the name of a dead process that left the file behind, or "". If another process holds the
+    lock, `busy` is called with the name of this process. `busy` either raises an error, or returns
+    to wait. `advice` is part of the error message for file systems without locks. The operating
+    system releases the lock when the process ends for any reason. The lock is a POSIX record lock,
+    which also works between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has no
+    such locks.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:
@@ -263,7 +264,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such file") from None
-    # Raised for a loop of links, and for names that are too long or contain a null character.
+    # Raised for a loop of links, and for names that are too long or contain a null character
     except (
         OSError,
         ValueError,
@@ -305,7 +306,7 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
-    """Returns the content of a JSON file, which must not contain NaN, infinity and lone surrogates."""
+    """Returns the content of a JSON file, which must not contain NaN, infinity or lone surrogates."""
     with naming(path, ValueError, prefix="not a JSON file: "):
         return parse_json(read_text(path, limit))
 
@@ -319,7 +320,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         content = json.loads(text, parse_constant=refuse)
         if "\\u" in (text if isinstance(text, str) else text.decode()):
-            # Encoding fails for a lone surrogate, which could not be written again.
+            # Encoding fails for a lone surrogate, which could not be written again
             json.dumps(content, ensure_ascii=False).encode()
     except RecursionError:
         raise ValueError("nested too deeply") from None
@@ -347,7 +348,7 @@ def read_yaml(path: str | Path) -> Any:
 def read_package_yaml(path: Path) -> Any:
     """Returns the plain content of a YAML file that is part of the package.
 
-    LibYAML reads it fifteen times as fast as `read_yaml`, which checks files of other people.
+    LibYAML is fifteen times as fast as `read_yaml`, which checks files from other people.
     """
     import yaml
 
@@ -362,7 +363,7 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
         if getattr(node, "tag", "").endswith(":int") and len(content) > YAML_DIGITS:
-            # An attacker could choose large integers as keys that all have the same hash.
+            # An attacker could choose large integers as keys that all have the same hash
             raise ValueError(
                 f"a whole number of more than {YAML_DIGITS} digits: {content[:YAML_DIGITS]}…"
             )
@@ -406,10 +407,10 @@ def read_npz(
 
 
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file; `mmap` maps it read-only and requires a path.
+    """Returns the array of an .npy file. `mmap` maps the file read-only, and requires a path.
 
-    Raises `UserError` if the file is damaged, contains objects, or is larger than the limits of
-    this module.
+    Raises `UserError` if the file is damaged, contains objects, or exceeds the limits of this
+    module.
     """
     import numpy as np
 
@@ -422,7 +423,7 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 
 @contextmanager
 def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
-    """Yields a file of arrays and its size. Errors for damaged content become `UserError`."""
+    """Yields a file of arrays and its size. Errors for damaged content are converted to `UserError`."""
     with ExitStack() as stack:
         name = ""
         if isinstance(source, Path):
@@ -473,9 +474,9 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
     """Opens a zip archive for reading. Raises `UserError` if it has more than `MAX_MEMBERS` members.
 
-    `zipfile` reads the directory of the archive at once and creates an object for each entry,
-    even if the archive states a smaller number of entries. Therefore, the size of the directory
-    is limited, too.
+    `zipfile` reads the directory of the archive at once, and creates an object for each entry, even
+    if the archive declares a smaller number of entries. Therefore, the size of the directory is
+    also limited.
     """
     directory = _DirectoryReader(file)
     with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
@@ -511,7 +512,7 @@ class _DirectoryReader:
 def check_member(member: zipfile.ZipInfo) -> None:
     """Refuses members of a zip archive that are not deflated.
 
-    `zipfile` only limits the unpacked bytes of deflated members.
+    `zipfile` limits the unpacked bytes of deflated members only.
     """
     if member.flag_bits & 1 or member.compress_type not in (
         zipfile.ZIP_STORED,

@@ -26,9 +26,9 @@ SECOND_NAME = (
 )
 
 WANDB_LINKS = re.compile(r"wandb/(latest-run|debug[\w-]*\.log|[\w-]+/logs/debug[\w-]*\.log)")
-"""Links of wandb from a run directory to its logs.
+"""Links that wandb creates from a run directory to its logs.
 
-wandb replaces them and writes a resumed run into another folder.
+wandb replaces them, and writes a resumed run to another folder.
 """
 
 _tokens: set[str] = set()
@@ -48,7 +48,7 @@ def check_tree(folder: Path) -> None:
     """Checks a folder from somebody else before libraries write into it.
 
     Libraries open files in place. Raises `UserError` if the folder contains a link that leads out
-    of it, a pipe, a device, or a file with a second name (hard link), through which a file
+    of the folder, a pipe, a device, or a file with a second name (hard link), through which a file
     elsewhere would be changed.
     """
     for parent, folders, files in os.walk(folder):
@@ -71,9 +71,9 @@ def check_tree(folder: Path) -> None:
 def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
-    Writing in place would also change the file that a link leads to, so links are not followed.
-    Raises `UserError` if the path is a link, not a regular file, or a file with a second name
-    (hard link).
+    Writing in place would also change the target of a link, so links are not followed. Raises
+    `UserError` if the path is a link, is not a regular file, or is a file with a second name (hard
+    link).
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -124,9 +124,9 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
     Args:
         folder: folder of the temporary files and folders.
         path: only temporary files for this file or folder are removed; None = for any.
-        is_locked: whether this process holds the lock that writers of such files need. If it
-            does, files of processes on other machines are removed, too. Otherwise, they remain,
-            since these processes may be alive.
+        is_locked: whether this process holds the lock that writers of such files need. If it does,
+            files of processes on other machines are also removed. Otherwise, these files remain,
+            because their processes may be alive.
     """
     if not folder.is_dir():
         return

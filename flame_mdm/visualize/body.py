@@ -16,14 +16,14 @@ from flame_mdm.safe_io import naming, read_npz
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
 """Limbs with a helper bone, by their first joint, and the share of a twist that the helper bone takes.
 
-The twist is the twist of the hip or shoulder; for the elbow, it is the twist of the wrist.
+It is the twist of the hip or shoulder or, for the elbow, the twist of the wrist.
 """
 HELPERS = tuple(
     (JOINT[f"{side}_{name}"], share)
     for side in ("left", "right")
     for name, share in TWISTED.items()
 )
-"""Joint, and share of the twist, for each bone after the 22 joints."""
+"""Joint, and share of the twist, of each bone after the 22 joints."""
 # The joint at which each bone begins
 ANCHORS = (
     *range(len(SMPL22)),
@@ -48,11 +48,10 @@ class Figure:
         fps: frames per second.
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
-        text: the caption or the name of the action; "" without either.
-        id: name of the motion: the name of a clip or file, or the text and sample number, which
-            determine the noise.
-        contacts: (F, N) bool, True = this joint of `skeleton.feet` is on the floor; None =
-            unknown.
+        text: the caption or the name of the action; "" if there is neither.
+        id: name of the motion. It is the name of a clip or file, or the text and the sample number,
+            which determine the noise.
+        contacts: (F, N) bool, True = this joint of `skeleton.feet` is on the floor; None = unknown.
     """
 
     joints: np.ndarray
@@ -63,11 +62,11 @@ class Figure:
     contacts: np.ndarray | None = field(default=None, kw_only=True)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns a body that moves like the joints and "", or None and the reason.
+        """Returns a body that moves like the joints and "", or None and the reason why there is no body.
 
-        The reason says why a skeleton is drawn instead.
+        Without a body, a skeleton is drawn instead.
 
-        `body` is the mesh; None = the mannequin. Without rotations, joints show no body.
+        `body` is the mesh; None = the mannequin. Joints without rotations cannot move a body.
         """
         return None, "the rotations of its joints are unknown"
 
@@ -92,7 +91,7 @@ def head(skeleton: Skeleton) -> int | None:
 def radii(skeleton: Skeleton) -> list[float]:
     """Returns the radius of the body around each joint in meters.
 
-    The radius grows with the number of the joint's descendants.
+    The radius increases with the number of the joint's descendants.
     """
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
@@ -101,16 +100,15 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose: an A-pose with the pelvis at 0. `tools/mannequin.py` writes it.
+    """A closed mesh in its stored pose, an A-pose with the pelvis at 0. `tools/mannequin.py` writes it.
 
     Attributes:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
-        weights: (V, 28) weights of SMPL's 22 joints and of `HELPERS`; at most four per point are
-            not 0.
-        triangles: (T, 3), counterclockwise seen from outside.
-        turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the
-            stored pose.
-        rest: (22, 3), position of each joint relative to its parent in the rest pose of SMPL.
+        weights: (V, 28) weights of SMPL's 22 joints and of `HELPERS`. At most four weights per
+            point are not 0.
+        triangles: (T, 3), counterclockwise as seen from outside.
+        turns: (28, 3, 3), world rotation of each bone from SMPL's rest pose to the stored pose.
+        rest: (22, 3), position of each joint relative to its parent in SMPL's rest pose.
         sole: height of the toe joints above the soles.
     """
 
@@ -147,7 +145,7 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def mannequin() -> Mesh:
-    """Returns the body that the package contains."""
+    """Returns the body of the package."""
     return Mesh(MANNEQUIN)
 
 
@@ -159,7 +157,7 @@ def read_body(name: str) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class FittedBody:
-    """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones."""
+    """A body with the bone lengths of a clip, and its motion. F = number of frames, B = 28 bones."""
 
     mesh: Mesh
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the
@@ -175,8 +173,7 @@ class FittedBody:
     turns: np.ndarray
     # (F, B, 3), start of each bone: the joints of the motion, lifted
     starts: np.ndarray
-    # Height in meters by which the body's joints are above the motion's joints: the thickness of
-    # the sole
+    # Height in meters of the body's joints above the motion's joints: the thickness of the sole
     lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:

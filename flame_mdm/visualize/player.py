@@ -1,4 +1,4 @@
-"""HTML player of motions: a single file that needs no network and opens from disk."""
+"""HTML player of motions, a single file that needs no network and opens from disk."""
 
 import base64
 import html
@@ -35,7 +35,7 @@ def write_player(
         path: the .html file.
         motions: the motions to play.
         title: title of the page.
-        options: further options of `player_page`.
+        options: additional options of `player_page`.
 
     Example:
         >>> write_player("walk.html", [motion], title="A walk")  # doctest: +SKIP
@@ -55,11 +55,11 @@ def player_page(
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
-    If a body does not fit a motion, a skeleton is shown, and the caption has the reason.
-    Positions are rounded to millimeters, or to 1/65534 of the span of a motion.
+    If no body fits a motion, a skeleton is shown, and the caption states the reason. Positions are
+    rounded to millimeters, or to 1/65534 of the span of a motion.
 
     Args:
-        motions: the motions, of any skeletons, lengths and frame rates; `title` is the heading of
+        motions: the motions, with any skeletons, lengths and frame rates. `title` is the heading of
             the page.
         about: HTML of a collapsible section below the heading of the page. Texts in it must
             already be escaped.
@@ -97,7 +97,7 @@ def player_page(
 def packed_motion(motion: Figure, begin: int = 0) -> dict[str, Any]:
     """Returns the frames of a motion for the player, starting at `begin`.
 
-    Earlier frames only determine rotations.
+    Earlier frames only influence the rotations.
     """
     return _packed(motion, "", "", (), None, begin)
 
@@ -141,7 +141,7 @@ def _packed(
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
     """Returns proportions, and a quaternion of 32 bits for each frame and bone.
 
-    The quaternions are exact to about 0.1 degrees. The two highest bits tell which of x, y, z and
+    The quaternions are exact to about 0.1 degrees. The two highest bits state which of x, y, z and
     w is largest. The three other components, from -0.71 to 0.71, follow with 10 bits each.
     """
     quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()

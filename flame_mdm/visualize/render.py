@@ -25,15 +25,15 @@ LINE = (205, 211, 219)
 TEXT = (28, 36, 48)
 FAINT = (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
-# Objects nearer to the camera than this, in meters, are not drawn
+# Objects closer to the camera than this, in meters, are not drawn
 NEAR = 0.3
-# Angles of the camera, which is in front of the body, to its left and above it
+# Angles of the camera, which is in front of the body, to its left, and above it
 YAW, PITCH = 0.6, 0.24
 TOWARD = np.array(
     [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
 )
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-# Number of the color space of HD video, which players assume for large videos without a color
+# Number of the color space of HD video, which players assume for large videos that declare no color
 # space
 BT709 = 1
 SMOOTH = 2  # images are drawn larger by this factor and then reduced
@@ -44,9 +44,9 @@ def write_gif(
 ) -> None:
     """Writes a looping animation of motions side by side, with captions below.
 
-    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second: the frame
-    rate is the highest frame rate of the motions, divided by the smallest whole number that
-    gives 50 or less. For example, 60 fps become 30, and 120 fps become 40. A motion that ends
+    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second. Therefore,
+    the frame rate is the highest frame rate of the motions, divided by the smallest integer that
+    results in 50 or less. For example, 60 fps become 30, and 120 fps become 40. A motion that ends
     earlier stays at its last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
@@ -57,8 +57,8 @@ def write_gif(
         image.quantize(palette=palette, dither=Image.Dither.NONE)
         for image in _video(motions, fps, size, body)
     ]
-    # GIF counts in hundredths of a second. Times are rounded, not durations, so that errors do
-    # not add up.
+    # GIF durations are in hundredths of a second. Times are rounded instead of durations, so that
+    # errors do not accumulate.
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     options = {"append_images": images[1:], "duration": (10 * np.diff(times)).tolist(), "loop": 0}
     with atomic_write(path) as temporary:
@@ -87,7 +87,7 @@ def write_mp4(
         context.colorspace = context.color_primaries = context.color_trc = BT709
         for image in _video(motions, fps, size, body):
             if not context.is_open:
-                # H.264 needs even widths and heights.
+                # H.264 requires even widths and heights
                 context.width = image.width // 2 * 2
                 context.height = image.height // 2 * 2
             pixels = np.asarray(image)[: context.height, : context.width]
@@ -149,7 +149,7 @@ def thumbnail(motion: Figure, height: int = 120) -> bytes:
 def _palette() -> Image.Image:
     """Returns one palette for all frames, so that colors do not flicker.
 
-    The palette has all colors, and their blends at smoothed edges.
+    The palette contains all colors, and their blends at smoothed edges.
     """
     drawn = np.array(
         [*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT]
@@ -181,7 +181,7 @@ def _video(
 
     with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
         for tick in range(count):
-            # after its end, a motion stays at its last frame
+            # After its end, a motion stays at its last frame
             now = [
                 min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1)
                 for motion in motions
@@ -237,7 +237,7 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     for parent, joint in motion.skeleton.edges:
         _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 255)
     dark = dark.filter(ImageFilter.BoxBlur(size / 192))
-    # The part is enlarged with a margin, so that it has the same edge as if the whole image were
+    # The part is enlarged with a margin, so that its edge is the same as if the whole image were
     # enlarged.
     if box := dark.getbbox():
         left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
@@ -290,9 +290,10 @@ def _rasterize(
 ) -> None:
     """Draws triangles into an image, the nearest triangle at each pixel.
 
-    Colors are interpolated between the corners. The image is (height, width, 3) uint8. `at` (V,
-    2) are pixel coordinates, y down; `depth` (V,) are distances from the camera; `colors` (V, 3)
-    are from 0 to 255. Triangles (T, 3) that are seen from inside, clockwise, are not drawn.
+    Colors are interpolated between the corners. The image is (height, width, 3) uint8. `at` (V, 2)
+    are pixel coordinates, y down; `depth` (V,) are distances from the camera; `colors` (V, 3) are
+    from 0 to 255. Triangles (T, 3) that are seen from inside, and therefore clockwise, are not
+    drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
@@ -305,7 +306,7 @@ def _rasterize(
     high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).T
     wide, tall = np.maximum(high - low, 0).astype(int)
     count = np.where(seen, wide * tall, 0)
-    # The shares of the second and third corner at a pixel are linear functions of the pixel's
+    # The weights of the second and third corner at a pixel are linear functions of the pixel's
     # column and row in the bounding box.
     twice = np.where(seen, twice, 1)
     right, down = low + 0.5 - a.T
@@ -385,7 +386,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
     """Returns at most three lines of a motion's caption, and a fourth line if it is drawn as a skeleton."""
     lines, font = [""], _font(size)
-    # The caption has room for three lines.
+    # The caption has room for three lines
     for word in shortened(motion.text or motion.id, width).split():
         longer = f"{lines[-1]} {word}".strip()
         if font.getlength(longer) <= width - 16:

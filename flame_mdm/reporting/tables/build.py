@@ -41,7 +41,7 @@ FORCED = "Forced: real motions do not have the values that the protocol expects.
 def build(name: str, spec: Config, results: Path) -> Table:
     """Builds the table of a spec from existing results and published numbers.
 
-    Raises `UserError` if they do not match.
+    Raises `UserError` if the results, the published numbers and the spec do not match.
     """
     published = (
         _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {})
@@ -79,7 +79,7 @@ def _published(path: Path, changed: int) -> Config:
 def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
     columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
     values = [column["value"] for column in part["columns"].values()]
-    # Distinct conditions of the rows; each of them has a footnote
+    # Distinct conditions of the rows, each of which has a footnote
     conditions: list[dict[str, str]] = []
     lines: list[Line] = []
     truths: dict[str, Line] = {}
@@ -151,8 +151,8 @@ def _condition_notes(
 
     Args:
         conditions: the conditions, in the order of their letters.
-        columns: the columns that were measured under the conditions of a letter; no entry if
-            these are all columns.
+        columns: the columns that were measured under the conditions of a letter. Letters without an
+            entry apply to all columns.
     """
     notes = []
     for facts in conditions:
@@ -174,7 +174,7 @@ def _condition_notes(
 def _warnings(
     lines: Sequence[Line], values: Sequence[str], columns: Sequence[str]
 ) -> list[tuple[str, str]]:
-    """Returns the footnotes on invalid rows, on the choice of checkpoints, and on columns with distances of 0."""
+    """Returns the footnotes about invalid rows, the choice of checkpoints, and columns with distances of 0."""
     invalid = [(line.label, line.facts.get("not valid because")) for line in lines]
     texts = [(label, f"NOT VALID: {reason}") for label, reason in invalid if reason]
     for line in lines:
@@ -218,8 +218,8 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
     Args:
         result: the result.
         timed: whether the table shows its seconds per motion.
-        shows_multimodality: whether the table shows multimodality. Otherwise, it does not matter
-            whether it was measured.
+        shows_multimodality: whether the table shows multimodality. If it does not, it is irrelevant
+            whether multimodality was measured.
     """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
     checkpoint = result.checkpoint
@@ -256,9 +256,9 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Describes how many motions and replications most values have.
+    """Returns a text with the numbers of motions and replications of most values.
 
-    The number of real motions is added if it differs.
+    The number of real motions is added if it is different.
     """
     values = [value for value in (result.values or {}).values() if value and value.replications]
     if not values:
@@ -393,7 +393,7 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Formats the numbers of each column with the same number of decimals.
 
     The largest number has about three digits. Values of settings with at most one decimal are
-    printed unchanged. Numbers that would round to zero show two significant digits.
+    unchanged. Numbers that would be rounded to zero are shown with two significant digits.
     """
     for index in range(columns):
         cells = [
@@ -466,7 +466,7 @@ def _reported(
 
 
 def _leading(text: str) -> float | None:
-    """Returns the number at the beginning of a printed value; 1,000 is one thousand."""
+    """Returns the number at the beginning of a printed value. "1,000" is read as one thousand."""
     number = re.match(r"[-+]?[\d,]*\.?\d+(?:[eE][-+]?\d+)?", text.strip())
     return float(number[0].replace(",", "")) if number else None
 
@@ -515,7 +515,7 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
 
 
 def _ratings(name: str, path: Path, reported: Config | None) -> Part:
-    """Builds the table of a user study, with people's preferences between models."""
+    """Builds the table of a user study, with the raters' preferences between models."""
     columns = {"Preferred": "none", "votes": "none", "raters": "none"}
     lines: list[Line] = []
     notes = [

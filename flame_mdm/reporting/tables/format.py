@@ -1,6 +1,6 @@
 """Writes tables of results as Markdown, LaTeX, CSV and HTML, with figures.
 
-The same table gives the same bytes.
+The same table results in the same bytes.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ KINDS = {
     "reported real": "Real motions, as reported",
     "reported": "As reported",
 }
-# states of rows whose values must not be mistaken for results
+# States of rows whose values must not be mistaken for results
 NO_RESULTS = ("NOT VALID", "QUICK")
 # Paths of audit cards in footnotes
 CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")
-# Rows that agree in these facts share a line in the list of sources.
+# Rows with identical values of these facts share a line in the list of sources
 SHARED = (
     "checkpoint sha256",
     "recipe",
@@ -62,7 +62,7 @@ class Line:
     cells: list[Cell | None]
     # Footnote marks; only rows with the same marks are compared
     marks: str = ""
-    # "" if the row is complete and valid, or a reason such as "no checkpoint"
+    # "" if the row is complete and valid; otherwise a reason, such as "no checkpoint"
     state: str = ""
     # Options for the x-axis of figures
     options: dict[str, float] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class Part:
     """One table within the table of a paper."""
 
     name: str
-    columns: dict[str, str]  # for each column label, which values are better: a key of `ARROWS`
+    columns: dict[str, str]  # which values are better, by column label: a key of `ARROWS`
     lines: list[Line]
     # Mark and text of each footnote; the mark may be empty
     notes: list[tuple[str, str]] = field(default_factory=list)
@@ -154,7 +154,7 @@ def _unranked(table: Table) -> str:
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
     """Splits a footnote into texts and their links.
 
-    "" = no link, for plain text and for a card that is not on this machine.
+    The link of plain text, and of a card that is not on this machine, is "".
     """
     return [
         (
@@ -186,7 +186,8 @@ def _head(column: str, better: str) -> str:
 def _sources(table: Table) -> list[str]:
     """Returns the provenance of rows.
 
-    Rows that agree in `SHARED` share a line, with `/` between their other facts.
+    Rows with identical values of the facts in `SHARED` share a line, in which `/` separates their
+    other facts.
     """
     rows = []
     for part in table.parts:
@@ -236,7 +237,7 @@ def _tex(text: str) -> str:
 def comma_separated(table: Table) -> str:
     """Returns the table as CSV.
 
-    A row has the number, interval and rank of each cell, and the provenance.
+    A row contains the number, interval and rank of each cell, and the provenance.
     """
     facts = list(
         dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts)
@@ -269,10 +270,10 @@ def _inert(text: str) -> str:
 
 
 def draw(part: Part, figure: Figure) -> Markup | None:
-    """Draws a figure of a part as SVG; None if it has no points.
+    """Draws a figure of a part as SVG. Returns None if the figure has no points.
 
-    Curves have the names of rows; reported values are dashed. In a column whose best value is the
-    value of real motions, this value is a dotted line.
+    Curves are labeled with the names of the rows. Curves of reported values are dashed. In a column
+    whose best value is the value of real motions, this value is a dotted line.
     """
     panels = []
     for column in figure.y:
@@ -311,7 +312,7 @@ def ranks(values: Sequence[float | None], better: str, real: float | None) -> li
     """Ranks values: 1 for the best, 2 for the second best, 0 for all others.
 
     A single value is not ranked. `better` is higher, lower, real (closest to `real`, the value of
-    real motions) or none. A missing value is None.
+    real motions) or none. Missing values are None.
     """
     if (
         better == "none"

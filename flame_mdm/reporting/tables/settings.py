@@ -18,7 +18,7 @@ HYPERPARAMETERS = LABELS["hyperparameters"]
 def hyperparameters(name: str) -> dict[str, Any]:
     """Returns the `HYPERPARAMETERS` of a recipe by key.
 
-    Unset keys have the default of their class.
+    Unset keys get the default values of their class.
     """
     config = compose(name)
     settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | _sizes(config)
@@ -26,7 +26,7 @@ def hyperparameters(name: str) -> dict[str, Any]:
 
 
 def value(config: Config, key: str) -> Any:
-    """Returns the value of a dotted key in a recipe, by default the default of the class, or None."""
+    """Returns the value of a dotted key in a recipe. Unset keys get the default value of the class, or None."""
     *path, name = key.split(".")
     node: Any = config
     for part in path:
@@ -41,7 +41,7 @@ def value(config: Config, key: str) -> Any:
 def _sizes(config: Config) -> dict[str, float]:
     """Returns the number of features, and the number of parameters of the denoiser in millions.
 
-    The language model does not count.
+    The parameters of the language model are not counted.
     """
     import torch
 
@@ -71,7 +71,7 @@ def setting_text(value: Any) -> str:
 def settings_table(name: str, part: Config, reported: Config | None) -> Part:
     """Builds a table of hyperparameters.
 
-    The rows are keys if there are more keys than recipes, or else recipes.
+    The rows are keys if there are more keys than recipes; otherwise, the rows are recipes.
     """
     for key in part["keys"].values():
         if key not in HYPERPARAMETERS:

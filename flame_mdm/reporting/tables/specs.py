@@ -1,4 +1,4 @@
-"""Specs of tables (the files in experiments/tables) and the evaluations that they need."""
+"""Specs of tables (the files in experiments/tables), and the evaluations that they require."""
 
 import hashlib
 import itertools
@@ -32,7 +32,7 @@ SWEPT = (
     "strength",
     "batch_size",
 )
-"""Options of a row that may be lists; each value of a list gives one row."""
+"""Options of a row that may be lists. Each value of a list results in one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
 """Maximum numbers of rows (after expanding lists of options), columns and plots of a table.
 
@@ -171,7 +171,7 @@ class Lengths(Schema):
 
 
 def spec_names() -> list[str]:
-    """Returns the names of this project's tables; numbers in names are sorted as numbers."""
+    """Returns the names of this project's tables. Numbers in names are sorted as numbers."""
     names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
     return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 
@@ -216,7 +216,7 @@ class Evaluation:
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Returns the path of the result, which depends only on the keys, so that tables share results."""
+        """Returns the path of the result, which depends only on the keys, so that tables can share results."""
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         subject = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(
@@ -242,7 +242,7 @@ class Evaluation:
 def evaluations(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Evaluation]]]:
     """Yields the rows of a part after expanding lists of options, with one evaluation per column.
 
-    The label of an expanded row lists the options that vary and have no column.
+    The label of an expanded row lists the options that vary and are not shown in a column.
     """
     shown = {column["value"] for column in part.get("columns", {}).values()}
     for row in part.get("rows", []):

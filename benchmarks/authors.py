@@ -1,4 +1,4 @@
-"""The training step of the authors' code, GuyTevet/motion-diffusion-model, from a clone of it.
+"""The training step of the authors' code, GuyTevet/motion-diffusion-model, run from a clone of it.
 
 The authors' network, diffusion, optimizer and loss logging are unchanged. CLIP is replaced with a
 stub that returns zeros, as in the framework's step. The body model is left out, because a step on
@@ -27,7 +27,7 @@ class _Clip(nn.Module):
 
 
 class _Rotation2xyz:
-    """A stub of the converter of SMPL's rotations, which a step on HumanML3D does not call."""
+    """A stub of the converter of SMPL rotations, which a step on HumanML3D does not call."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.smpl_model = nn.Module()

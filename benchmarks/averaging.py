@@ -21,7 +21,7 @@ DECAY = 0.999
 
 
 def updates(network: nn.Module) -> dict[str, Callable[[], object]]:
-    """Returns functions that update an average of the network's weights once."""
+    """Returns functions that each update an average of the network's weights once."""
     average: Any = MovingAverage(DECAY)
     average._average_model = AveragedModel(network)
     average.on_train_start(None, network)

@@ -1,10 +1,10 @@
 """Times an evaluation of HumanML3D's size without networks: `python benchmarks/evaluation.py`.
 
 A protocol measures random motions with HumanML3D's lengths (40 to 196 frames at 20 frames per
-second, 22 joints). The extractor returns 512 numbers of the motion and 512 random text features,
-and the source returns other windows of the same clips. The remaining time is the cost of the
-evaluation itself: reading and decoding motions, and computing metrics. FID is also compared to
-torchmetrics' implementation on the same features.
+second, 22 joints). The extractor returns 512 numbers of the motion and 512 random text features.
+The source returns other windows of the same clips. The remaining time is the cost of the evaluation
+itself: reading and decoding motions, and computing metrics. FID is also compared with torchmetrics'
+implementation on the same features.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ class Windows:
 
 
 def random_clips(count: int) -> Clips:
-    """Returns clips with random features; a third of the clips have the maximum length, as in HumanML3D."""
+    """Returns clips with random features. A third of the clips have the maximum length, as in HumanML3D."""
     generator = np.random.default_rng(0)
     lengths = np.minimum(generator.integers(40, 275, count), 199)
     ends = np.cumsum(lengths)
@@ -96,7 +96,7 @@ def random_clips(count: int) -> Clips:
 
 
 class Identity(nn.Module):
-    """An extractor for torchmetrics whose "images" already are features."""
+    """An extractor for torchmetrics whose "images" are already features."""
 
     num_features = WIDTH
 

@@ -1,4 +1,4 @@
-"""Times HumanML3D's features, compared to a loop in NumPy: `python benchmarks/features.py`."""
+"""Times HumanML3D's features, compared with a loop in NumPy: `python benchmarks/features.py`."""
 
 import time
 from collections.abc import Callable
@@ -32,9 +32,7 @@ def motion(seed: int) -> Tensor:
 
 
 def arc(rest: np.ndarray, bone: np.ndarray) -> np.ndarray:
-    """Returns the shortest rotation (3, 3) from the direction of a bone at rest,
-    a unit vector, to its current direction.
-    """
+    """Returns the shortest rotation (3, 3) from a bone's unit direction at rest to its current direction."""
     direction = bone / np.linalg.norm(bone)
     axis, cosine = np.cross(rest, direction), rest @ direction
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])

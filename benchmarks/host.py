@@ -1,13 +1,15 @@
 """Times the framework's share of a training step: `python benchmarks/host.py`.
 
 The network is a transformer with one layer of width 16 and no text encoder, so that most of the
-time is spent outside of the network. The framework is compared to bare Lightning. Bare Lightning
-trains the same network with the same masked loss, fused optimizer and clipping on batches that
-are in memory. It logs nothing, and has no averaged weights, loggers and checkpoints. All run on
-one thread and alternate. A step takes the mean time of all steps after the first ones, so that
-work for several steps counts, too: planned batches, logged values, checks of the losses. Times
-are times of the thread, which exclude other programs on the machine. The parts of the framework's
-step are timed one by one, without Lightning.
+time is spent outside the network. The framework is compared with bare Lightning. Bare Lightning
+trains the same network with the same masked loss, fused optimizer and clipping on batches that are
+in memory. It logs nothing, and has no averaged weights, loggers and checkpoints. All measurements
+run on one thread and alternate.
+
+A step takes the mean time of all steps after the first ones, so that work for several steps is also
+included: planned batches, logged values, and checks of the losses. Times are thread times, which
+exclude other programs on the machine. The parts of the framework's step are timed one by one,
+without Lightning.
 """
 
 import io
@@ -37,7 +39,7 @@ from flame_mdm.task import GeneratorTask
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.fit import fit
 
-WARM = 50  # steps that are not counted
+WARM = 50  # number of first steps that are not counted
 TINY = [
     "trainer.accelerator=cpu",
     "trainer.val_check_interval=1000000",
@@ -97,7 +99,7 @@ def log_interval() -> int:
 
 
 def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
-    """Returns batches and task of the framework's training."""
+    """Returns the batches and the task of the framework's training."""
     config = compose("quickstart", [*TINY, f"data_root={folder / 'data'}"])
     representation = instantiate(config["representation"])
     data: Any = instantiate(config["data"], representation=representation, seed=0)
@@ -121,7 +123,7 @@ class Bare(LightningModule):
 
     def __init__(self, task: GeneratorTask):
         super().__init__()
-        # In a list, the parameters of the task are not registered a second time.
+        # In a list, the parameters of the task are not registered a second time
         self.denoiser = task.generator.denoiser
         self.task = [task]
 

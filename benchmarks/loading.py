@@ -1,11 +1,11 @@
-"""Times two ways to load batches, compared to a training step: `python benchmarks/loading.py`.
+"""Times two ways of loading batches, compared with a training step: `python benchmarks/loading.py`.
 
 A synthetic data set is packed into a temporary folder. Three measurements alternate: batches
 gathered from memory (data.resident=true), batches of the data loader in the training process, and
-training steps of the small MDM encoder (forward pass, backward pass and update). They are
-measured in processor time of one core, which excludes other programs on the machine. Loading with
-workers is measured in wall time, which includes passing batches between processes and the load of
-the machine.
+training steps of the small MDM encoder (forward pass, backward pass and update). They are measured
+in processor time of one core, which excludes other programs on the machine. Loading with workers is
+measured in wall time, which includes passing batches between processes, and the load of the
+machine.
 """
 
 import itertools

@@ -1,10 +1,10 @@
 """Measures speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
 
-For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder
-(1.1 KB of disk per frame), with one worker per core. The results are the processor time of all
-processes together, the maximum resident memory of the main process and of its largest worker, and
-the private part of each, which is not shared with other processes and is sampled. Another result
-is the number of bytes by which the main process grows per frame.
+For each size, a new process prepares synthetic clips of about 51 frames in a temporary folder (1.1
+KB of disk per frame), with one worker per core. The results are the total processor time of all
+processes, the maximum resident memory of the main process and of its largest worker, and the
+private part of each, which is not shared with other processes and is sampled. Another result is the
+number of bytes per frame by which the main process grows.
 """
 
 import json
@@ -41,7 +41,7 @@ class Peaks(threading.Thread):
         self.done = threading.Event()
 
     def run(self) -> None:
-        """Keeps the largest memory of this process and of its children until `done` is set."""
+        """Records the maximum memory of this process and of its children until `done` is set."""
         while not self.done.wait(0.5):
             workers = [private(child.pid or 0) for child in multiprocessing.active_children()]
             self.main = max(self.main, private(multiprocessing.current_process().pid or 0))
@@ -49,7 +49,7 @@ class Peaks(threading.Thread):
 
 
 def prepare(clips: int) -> None:
-    """Prepares clips in this process; prints as JSON the frames, processor seconds and bytes of memory."""
+    """Prepares clips in this process, and prints frames, processor seconds and bytes of memory as JSON."""
     from flame_mdm.data.store import write_store
     from flame_mdm.data.synthetic import Synthetic
     from flame_mdm.representations.humanml import HumanML

@@ -1,9 +1,10 @@
 """Times training steps of one process and of two gloo processes: `python benchmarks/processes.py`.
 
-Both trainings use the same batches of 16 clips: one process has all 16 clips, two processes have
-8 clips each. Each process has one thread. With one core per process, the ideal ratio is 0.5; two
-processes on one core cannot be below 1. The overhead consists of reducing the gradients and
-waiting for the slower process. Times are measured between steps, so they do not include imports.
+Both trainings use the same batches of 16 clips: one process has all 16 clips, and two processes
+have 8 clips each. Each process has one thread. With one core per process, the ideal ratio is 0.5.
+Two processes on one core cannot be below 1. The overhead consists of reducing the gradients and
+waiting for the slower process. Times are measured between steps, so that they do not include
+imports.
 """
 
 import json

@@ -3,7 +3,7 @@
 This script trains nothing. It reads the runs in a folder, which were trained by `make train ...
 speed=...` and evaluated by `make evaluate`, with two or more seeds per data set and speed. The
 figures are means over the seeds with 95 % intervals by Student's t. Differences are between runs
-with the same seed, which begin with the same weights and see the same batches.
+with the same seed, which begin with the same weights and use the same batches.
 """
 
 import statistics
@@ -63,7 +63,7 @@ def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
 
 
 def shown(mean: float, half: float, sign: str = "") -> str:
-    """Returns mean and half width as text; both have the decimals of a half width with two significant digits."""
+    """Returns a mean and a half width as text, rounded to two significant digits of the half width."""
     decimals = next((count for count in range(6) if half >= 10 ** (1 - count)), 6 if half else 2)
     return f"{mean:{sign},.{decimals}f} ± {half:,.{decimals}f}"
 

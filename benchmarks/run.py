@@ -1,7 +1,7 @@
 """Measures the speed of the framework and writes docs/benchmarks/speed.md: `make bench [ONLY=a,b] [DEVICE=cuda]`.
 
-The scripts run one after another, each in its own process. With ONLY, the other sections keep
-their figures. DEVICE=cuda measures the sections that use a GPU, which are added to the page.
+The scripts run one after another, each in its own process. With ONLY, all other sections keep their
+figures. DEVICE=cuda measures the sections that use a GPU, which are added to the page.
 MDM_REPO=PATH, a clone of the authors' code, adds the authors' training step. ONLY=quality
 RUNS=FOLDER compares the quality of trained runs.
 """
@@ -124,7 +124,7 @@ def _position(name: str) -> tuple[int, bool]:
 def chosen(only: str, settings: Settings) -> list[str]:
     """Returns the scripts to run.
 
-    Ends the program with one line if a script, or something that it needs, does not exist.
+    Ends the program with one line if a script, or a requirement of a script, does not exist.
     """
     if settings.device not in ("cpu", "cuda"):
         raise SystemExit(
@@ -149,7 +149,7 @@ def chosen(only: str, settings: Settings) -> list[str]:
 
 
 def main(*words: str) -> None:
-    """Measures the chosen sections and writes the page after each."""
+    """Measures the chosen sections, and writes the page after each section."""
     options = dict(word.split("=", 1) for word in words)
     settings = Settings(
         device=options.get("device") or "cpu",

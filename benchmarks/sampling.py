@@ -1,9 +1,9 @@
 """Times sampling: `python benchmarks/sampling.py`.
 
-The first table has the latency at batch 1 and the throughput at batch 64 of MDM's encoder: for 1,
-2 and 4 steps of a distilled model, which has no guidance, and for 10, 50 and 1000 steps. The
-second table compares the samplers with this encoder; they alternate. The third table has the
-milliseconds per network call that the sampling loop itself takes, measured with a denoiser that
+The first table contains the latency at batch 1 and the throughput at batch 64 of MDM's encoder: for
+1, 2 and 4 steps of a distilled model, which has no guidance, and for 10, 50 and 1000 steps. The
+second table compares the samplers with this encoder, in alternating runs. The third table contains
+the milliseconds per network call that the sampling loop itself takes, measured with a denoiser that
 returns a stored tensor.
 """
 
@@ -40,7 +40,7 @@ RUNS = [
     (FlowMatching(), "rk4", 10),
     (FlowMatching(), "dopri5", 1),
 ]
-"""Process, sampler and number of steps; dopri5 chooses its steps itself."""
+"""Process, sampler and number of steps; dopri5 chooses its own steps."""
 
 
 class Counted:
@@ -63,12 +63,12 @@ class Size:
     latent_dim: int = 128
     num_layers: int = 4
     rounds: int = 5
-    # a run that would take more seconds is estimated from a run of 10 steps
+    # A run that would take more seconds is estimated from a run of 10 steps
     longest: float = 20.0
 
 
 def inputs(batch: int, size: Size) -> tuple[Tensor, Tensor, Condition]:
-    """Returns noise (B, F, D), mask (B, F) and a condition with a null."""
+    """Returns noise (B, F, D), a mask (B, F), and a condition with a null condition."""
     device = size.device
     null = Condition(
         torch.zeros(1, 512, device=device), torch.zeros(1, 0, 512, device=device), None
@@ -80,7 +80,7 @@ def inputs(batch: int, size: Size) -> tuple[Tensor, Tensor, Condition]:
 
 
 def options(sampler: str, steps: int) -> SamplerOptions:
-    """Returns the options of a sampler with a number of steps."""
+    """Returns the options of a sampler with a given number of steps."""
     return SamplerOptions(sampler=sampler, num_inference_steps=steps)
 
 

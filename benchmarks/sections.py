@@ -31,7 +31,7 @@ QUIET = [
 
 @dataclass(frozen=True)
 class Settings:
-    """What `make bench` passes to each script."""
+    """The settings that `make bench` passes to each script."""
 
     quick: bool = False  # tiny sizes, which only show that everything runs
     device: str = "cpu"  # cpu or cuda
@@ -62,7 +62,7 @@ def ratios(
 
 
 def cell(value: str | float | None) -> str:
-    """Returns text with three significant digits."""
+    """Returns the text of a cell. Numbers have three significant digits."""
     if value is None or isinstance(value, str):
         return value or ""
     if abs(value) >= 100 or value == round(value):
@@ -100,14 +100,14 @@ def take_turns(
 ) -> dict[str, float]:
     """Returns the median seconds of each function.
 
-    The functions alternate, so that a busy machine slows all of them. A first round, which warms
-    up, is not counted.
+    The functions alternate, so that a busy machine slows down all of them. A first round, which
+    warms up, is not counted.
 
     Args:
         runs: the functions, by name.
         rounds: number of counted calls of each function.
         device: with cuda, each call ends when the GPU has finished.
-        clock: function that returns seconds; `time.process_time` excludes other programs on the
+        clock: function that returns seconds. `time.process_time` excludes other programs on the
             machine.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}

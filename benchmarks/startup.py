@@ -2,8 +2,8 @@
 
 Commands answer `--help` and misspelled keys without importing torch. The work itself is minimal
 (one training step, one motion, one replication of eight motions), so that mainly imports and
-preparation are measured. For comparisons of machines, times are also given relative to `python -c
-"import torch"`.
+preparation are measured. To compare machines, times are also given relative to `python -c "import
+torch"`.
 """
 
 import itertools

@@ -1,10 +1,10 @@
 """Times training steps in both speeds: `python benchmarks/steps.py`.
 
-The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. It is compared to the
-authors' step, from a clone of their code, and to a plain PyTorch loop, which trains an
+The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. It is compared with the
+authors' step, from a clone of their code, and with a plain PyTorch loop, which trains an
 `nn.TransformerEncoder` of the same size. Both get the same clips, padded to 196 frames as in the
-published codes. Further tables have a step of every network in the size for CPUs and, on the CPU,
-the quickstart in the complete framework. All measurements alternate in one run.
+published codes. Further tables contain a step of every network in the size for CPUs and, on the
+CPU, the quickstart in the complete framework. All measurements alternate in one run.
 """
 
 import statistics
@@ -33,7 +33,7 @@ from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens of a caption
-# rounds of the full-size step: all implementations train on each batch in turn, twice
+# Rounds of the full-size step. All implementations train on each batch in turn, twice.
 ROUNDS, BATCHES = 2, 8
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
@@ -134,7 +134,7 @@ def drawn_lengths(rows: int, batches: int) -> list[np.ndarray]:
 
 
 def full_size(settings: Settings) -> tuple[list[Row], str]:
-    """Returns rows of the full-size step, and a text about the batches."""
+    """Returns the rows of the full-size step, and a text about the batches."""
     words = ["data.batch_size=16"]
     if settings.quick:
         words = [
@@ -219,7 +219,7 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
             folder = Path(tempfile.mkdtemp(dir=name))
             fit(folder, compose("quickstart", [*words, f"run.dir={folder}", f"speed={speed}"]))
             history = read_history(folder)["train/seconds_per_step"]
-            # The first steps warm up and do not count.
+            # The first steps warm up and do not count
             times[speed] += [value for step, value in history.items() if step >= steps // 3]
 
     medians = {speed: statistics.median(taken) for speed, taken in times.items()}
@@ -234,7 +234,7 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Returns a sentence on both speeds, compared to the first row, the slowest peer."""
+    """Returns a sentence about both speeds, compared with the first row, the slowest peer."""
     peer = str(rows[0]["training"]).partition(",")[0]
     reference, fast = (row["times as fast"] for row in rows[-2:])
     return (

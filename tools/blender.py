@@ -30,7 +30,7 @@ PLATFORMS = {
     "windows-x64": ("win_amd64",),
     "macos-arm64": ("macosx_14_0_arm64",),
 }
-"""Blender's names of platforms, and the tags of their wheels."""
+"""Blender's names of platforms -> the tags of their wheels."""
 MODULES = (
     RUNNER,
     *(
@@ -63,7 +63,7 @@ def build(model: str, out: Path, target: str) -> None:
         export_onnx(model, folder / "model", half=True)
         (folder / "model" / RUNNER.name).unlink()
         for path in (*MODULES, SOURCE / "__init__.py"):
-            # inside Blender, the extension is imported under another package name
+            # Inside Blender, the extension is imported under another package name
             code = re.sub(
                 r"from flame_mdm\.(\w+\.)*(\w+) import",
                 r"from .\2 import",
@@ -87,7 +87,7 @@ def build(model: str, out: Path, target: str) -> None:
 def fetch_wheels(folder: Path, target: str) -> None:
     """Downloads the wheels of onnxruntime and its requirements.
 
-    The version of onnxruntime is the version that exported the model.
+    onnxruntime has the version that exported the model.
     """
     names = [
         re.split(r"[^\w-]", line)[0]

@@ -1,10 +1,10 @@
 """Imports motion files in Blender and renders frames with Cycles, as small PNG files.
 
 Run `PYTHON blender_render.py JOB.json` with a Python that has the package bpy (Blender 4.2 or
-later). The job has `width`, `height`, `samples`, and a list of `files`. Each file has `path`;
-`out`, the beginning of the names of the pictures, which end in _000.png and so on; `every`, the
-number of frames from one picture to the next (0 = `count` pictures from the first to the last
-frame); and `bones` (true = the skeleton without the skin).
+later). The job contains `width`, `height`, `samples`, and a list of `files`. Each file contains
+`path`; `out`, the beginning of the names of its pictures, which end in _000.png and so on; `every`,
+the number of frames between pictures (0 = `count` pictures from the first to the last frame); and
+`bones` (true = the skeleton without the skin).
 """
 
 import json
@@ -20,7 +20,7 @@ OPERATORS = {".fbx": bpy.ops.import_scene.fbx, ".glb": bpy.ops.import_scene.gltf
 BONE = (0.75, 0.18, 0.03, 1)  # color of the bones
 THICK = 0.16  # width of a bone relative to its length
 TILE = 0.5  # size of the floor's squares in meters
-# distance from the person in meters; the person faces -y in Blender
+# Distance from the person in meters. The person faces -y in Blender.
 CAMERA = mathutils.Vector((2.9, -2.9, 1.6))
 
 
@@ -78,7 +78,7 @@ def draw_bones(mesh, armature):
     """
     points, faces, at = [], [], heads(armature)
     for bone in armature.pose.bones:
-        # the bone from a root on the floor to the hips would hide the legs
+        # The bone from a root on the floor to the hips would hide the legs
         if bone.parent is None or bone.parent.name.lower() == "root":
             continue
         begin, end = at[bone.parent.name], at[bone.name]
@@ -108,7 +108,7 @@ def render(job, file):
     scene = bpy.context.scene
     armature = next(item for item in scene.objects if item.type == "ARMATURE")
     skins = [item for item in scene.objects if item.type == "MESH"]
-    # the importer of glTF adds a mesh for the shape of bones, which is not a skin
+    # The glTF importer adds a mesh for the shape of bones, which is not a skin
     for item in [*skins, armature]:
         is_skin = item.type == "MESH" and any(part.type == "ARMATURE" for part in item.modifiers)
         item.hide_render = bool(file.get("bones")) or not is_skin

@@ -1,7 +1,7 @@
 """Draws the pictures of docs/engines.md with Blender: `python tools/engine_pictures.py [SET]`.
 
-`FLAME_MDM_BLENDER` names a Python that has the package bpy. SET is the folder of a set of FBX
-files; with it, every frame of each clip is drawn into SET/frames.
+`FLAME_MDM_BLENDER` is the path of a Python that has the package bpy. SET is the folder of a set of
+FBX files. If it is given, every frame of each clip is drawn into SET/frames.
 """
 
 import json
@@ -32,7 +32,7 @@ CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Tu
 def rendered(
     files: Sequence[Mapping[str, object]], size: tuple[int, int], samples: int, folder: Path
 ) -> list[list[Path]]:
-    """Renders files in Blender; returns the pictures of each file, in the order of the frames.
+    """Renders files in Blender. Returns the pictures of each file, in the order of the frames.
 
     Args:
         files: the path and the drawing options of each file, as in `blender_render.py`. This
@@ -42,7 +42,7 @@ def rendered(
         folder: the folder for the pictures.
 
     Raises:
-        UserError: If no Python with bpy is named, or Blender fails.
+        UserError: If no Python with bpy is named, or if Blender fails.
     """
     python = os.environ.get("FLAME_MDM_BLENDER")
     if python is None:

@@ -2,7 +2,7 @@
 
 Writes flame_mdm/visualize/mannequin.npz. The figure contains no third-party data. Its parts have
 elliptic cross sections along the bones of `ADULT`, with the widths and depths of an adult of 1.78
-m. Smooth unions join the parts into one surface. The left half is triangulated and simplified;
+m. Smooth unions join the parts into one surface. The left half is triangulated and simplified, and
 the right half is its mirror image. This script requires the packages in tools/requirements.txt.
 """
 
@@ -34,8 +34,8 @@ from flame_mdm.visualize.body import (
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
 """Rotations of the left side, in degrees about x, y and z, from SMPL's rest pose to the stored pose.
 
-The arms are lowered in the stored pose: arms mostly hang, so the skin is stretched less than from
-outstretched arms.
+The arms are lowered in the stored pose. In most motions, the arms hang down, so the skin is
+stretched less than from outstretched arms.
 """
 KNUCKLES, CURL = 0.088, 0.034
 """Distance of the knuckles from the wrist, and radius of the arc of the fingers, in meters."""
@@ -55,12 +55,12 @@ def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0
 
     Args:
         origin: the point at length 0.
-        axes: (3, 3) rows: the directions of the length and of the two half widths.
-        stations: several cross sections, separated by semicolons: the length, the two coordinates
-            of the center and the two half widths, in millimeters. They are interpolated without
-            overshoot.
-        power: exponent of the cross section; 2 = ellipses, larger values look more like
-            rectangles.
+        axes: (3, 3), rows with the directions of the length and of the two half widths.
+        stations: several cross sections, separated by semicolons. Each consists of the length, the
+            two coordinates of the center and the two half widths, in millimeters. They are
+            interpolated without overshoot.
+        power: exponent of the cross section; 2 = ellipses. With larger values, the cross section is
+            more similar to a rectangle.
     """
     table = np.array(stations.replace(";", " ").split(), float).reshape(-1, 5) / 1000
     shape = PchipInterpolator(table[:, 0], table[:, 1:])
@@ -84,7 +84,7 @@ def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Field:
 
 
 def union(first: np.ndarray, second: np.ndarray, blend: float) -> np.ndarray:
-    """Joins two signed distances; surfaces closer than `blend` meters are rounded into each other."""
+    """Joins two signed distances. Surfaces closer than `blend` meters are blended smoothly."""
     share = np.maximum(blend - np.abs(first - second), 0) / blend
     return np.minimum(first, second) - share**2 * blend / 4
 
@@ -103,7 +103,7 @@ def pose() -> tuple[np.ndarray, np.ndarray]:
 
 
 def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the origin and the axes of a tube along a bone; `u` is the direction of its first half width."""
+    """Returns the origin and axes of a tube along a bone; `u` is the direction of its first half width."""
     joints, turned = pose()
     at = JOINT[start]
     return joints[at], orthonormal(joints[JOINT[end]] - joints[at], turned[at] @ np.array(u, float))
@@ -229,7 +229,7 @@ def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndar
     joints, turned = pose()
     wrist, axes = joints[JOINT["left_wrist"]], axes_of_hand(turned[JOINT["left_wrist"]])
     local = (points - wrist) @ axes.T
-    # The thumb stays straight
+    # The thumb remains straight
     fingers = (np.linalg.norm(local, axis=1) < 0.25) & (local[:, 2] < 0.06)
     beyond = np.where(fingers, np.maximum(local[:, 0] - KNUCKLES, 0), 0)
     angle = beyond / CURL
@@ -283,7 +283,7 @@ def head() -> Field:
 
 
 def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
-    """Returns the signed distance of the whole body; points have x >= 0."""
+    """Returns the signed distance of the entire body; points have x >= 0."""
     mirrored = points * [-1, 1, 1]
     leg = union(
         union(parts["thigh"](points), parts["calf"](points), 0.02), parts["foot"](points), 0.03
@@ -334,7 +334,7 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
     points, triangles, _, _ = measure.marching_cubes(values, 0.0, spacing=(CELL,) * 3)
     points = points + [axis[0] for axis in axes]
     share = 1 - 2 * VERTICES / len(triangles)
-    # The result depends on the order of the axes; this order keeps the border closed
+    # The result depends on the order of the axes. This order keeps the border closed.
     order = np.array([1, 2, 0])
     points, triangles = fast_simplification.simplify(
         np.ascontiguousarray(magnified(points)[:, order], np.float32),
@@ -418,7 +418,7 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
         children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
         below = whole[:, children].sum(1)
         too_much = np.maximum(1, below / np.maximum(whole[:, joint], 1e-9))
-        # joints on both sides of the middle share the weight of their parent
+        # Joints on both sides of the middle share the weight of their parent
         for child in children:
             for joint_below in descendants(child):
                 weights[:, joint_below] /= too_much
@@ -484,7 +484,7 @@ def make() -> dict[str, np.ndarray]:
     points, normals = curled(points, normals)
     normals = np.concatenate([normals, normals[beside] * flip])
     near = normals[triangles].sum(1)
-    # Softer normals in folds than the gradient of the surface
+    # In folds, these normals are softer than the gradient of the surface
     np.add.at(normals, triangles.ravel(), np.repeat(near, 3, axis=0))
     return packed(
         np.concatenate([points, points[beside] * flip]),

@@ -6,19 +6,18 @@ The figures of this repository are in docs/benchmarks/referee_calibration.json;
 `tools/referee_page.py` shows them.
 
 The arguments are prepared data sets with SMPL's 22 joints. A hash of their names splits the
-recordings into two halves. Thresholds come from one half, figures from the other half. Sums over
-both halves are "crossed": each half is judged with the thresholds of the other half. Procedural
-motions set no thresholds, and have separate figures.
+recordings into two halves. Thresholds are calibrated on one half, and figures are measured on the
+other half. Sums over both halves are "crossed": each half is judged with the thresholds of the
+other half. Procedural motions set no thresholds, and have separate figures.
 
-A claim of a caption counts as true of its motion. A falsified claim counts as false: it states
-another side, direction or speed, one repetition more or fewer, the reverse order, another
-duration, or the other end of the motion. Captions are sometimes wrong, and the figures include
-their errors.
+A claim of a caption counts as true for its motion. A falsified claim counts as false. It states
+another side, direction or speed, one repetition more or fewer, the reverse order, another duration,
+or the other end of the motion. Captions are sometimes wrong, and the figures include their errors.
 
-Captions hardly ever state durations. If the captions of a recording only state that the body
-walks, runs or stands still, the recording is cut to two, three and four seconds, so that "for
-three seconds" is true of the cut. A walking body is assumed to stand at the start and at the end.
-Claims about durations and ends set no thresholds.
+Captions hardly ever state durations. If the captions of a recording only state that the body walks,
+runs or stands still, the recording is cut to two, three and four seconds, so that "for three
+seconds" is true for the cut. A walking body is assumed to stand at the start and at the end. Claims
+about durations and ends set no thresholds.
 """
 
 import re
@@ -52,7 +51,7 @@ SYNTHETIC = "synthetic"
 UNCALIBRATED = ("count", "duration", "start", "end")
 LASTING = ("walk", "run", "stand still")
 BESIDE = {"travel", "veer", "pace"}
-"""Claims that do not exclude that the body walks or runs from the first to the last frame."""
+"""Claims that are compatible with walking or running from the first to the last frame."""
 MOST_SYNTHETIC = 600  # procedural motions of the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
 # false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
@@ -89,7 +88,7 @@ def main(folders: Sequence[Path], figures: Path | None) -> None:
     cases = [case for example in examples for case in cases_of(example)]
     cases += [case for example in examples for case in built_cases(example)]
     halves = [[case for case in cases if case.example.half == half] for half in (0, 1)]
-    # The calibration on this half comes last, so its thresholds remain
+    # The calibration on this half comes last, so that its thresholds remain
     calibrate(halves[1])
     other = tally(halves[0])
     calibrate(halves[0])
@@ -199,11 +198,11 @@ def calibrate(cases: Sequence[Case]) -> None:
 
 
 def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[float, float]:
-    """Returns two thresholds: claims are false up to the first score, and true from the second score.
+    """Returns two thresholds: claims are false up to the first score, and true from the second score on.
 
-    The first threshold is set by hand and lowered until at most `MOST_REFUSED` of the true claims
-    are judged false. The second threshold is raised until `LEAST_REFUSED` of the decided
-    falsified claims are judged false.
+    The first threshold is set by hand, and lowered until at most `MOST_REFUSED` of the true claims
+    are judged false. The second threshold is raised until `LEAST_REFUSED` of the decided falsified
+    claims are judged false.
     """
     refused = int(MOST_REFUSED * len(true))
     lowest = float(np.sort(true)[refused])

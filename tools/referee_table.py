@@ -1,11 +1,11 @@
-"""Compares systems by the referee and by R-precision, in docs/benchmarks/referee_systems.json.
+"""Compares systems by the referee and by R-precision; writes docs/benchmarks/referee_systems.json.
 
     python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ... runs/bandai/mdm_small/default ...]
 
-Four systems are compared on clips of the synthetic test split: motions of the package's model,
-the real motions, their mirror images, and real motions with captions of other motions.
-R-precision is `MotionsForText` with the package's motion-CLIP. The arguments add prepared data
-sets with SMPL's 22 joints, without R-precision, and models that were trained on them.
+Four systems are compared on clips of the synthetic test split: motions of the package's model, the
+real motions, their mirror images, and real motions with captions of other motions. R-precision is
+`MotionsForText` with the package's motion-CLIP. The arguments add prepared data sets with SMPL's 22
+joints, without R-precision, and models that were trained on them.
 """
 
 import sys
@@ -113,7 +113,7 @@ def label(run: Path) -> str:
 def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarray]:
     """Returns motions (F, 22, 3) that a run generates for captions, each as long as a real motion.
 
-    The maximum is `LONGEST` seconds.
+    They are at most `LONGEST` seconds long.
     """
     seconds = [min(LONGEST, len(motion) / FPS) for motion in joints]
     model = flame_mdm.load(run)

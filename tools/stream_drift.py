@@ -1,10 +1,11 @@
-"""Measures long streams: writes docs/benchmarks/streams.json, and the page and the figure that show it.
+"""Measures long streams, and writes docs/benchmarks/streams.json and the page and figure that show the results.
 
     python tools/stream_drift.py [MODEL]
 
-Several streams of five minutes get a new text every ten seconds. The texts are captions of single synthetic actions
-that rules can recognize. The last minute has the same texts as the first one, so that both can be compared. Without
-MODEL, only the page and the figure are written again.
+In several streams of five minutes, the text changes every ten seconds. The texts are captions of
+single synthetic actions that rules can recognize. The texts of the last minute are the texts of the
+first minute, so that both can be compared. Without MODEL, only the page and the figure are written
+again.
 """
 
 import sys
@@ -128,7 +129,7 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
 
 
 def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
-    """Returns figures of each ten seconds of streams (B, F, 22, 3)."""
+    """Returns figures for each ten seconds of streams (B, F, 22, 3)."""
     length = round(SECONDS_PER_TEXT * fps)
     parts = [joints[:, begin : begin + length] for begin in range(0, joints.shape[1], length)]
     return {
@@ -231,7 +232,7 @@ def in_period(
 
 
 def encoded(extractor: MotionCLIPExtractor, windows: np.ndarray) -> torch.Tensor:
-    """Returns features (N, E) of windows (N, F, 22, 3); positions and headings in the world do not matter."""
+    """Returns features (N, E) of windows (N, F, 22, 3), independent of world positions and headings."""
     representation = HumanML(variant="clean")
     features = torch.stack([representation.encode(torch.from_numpy(w).float()) for w in windows])
     mask = torch.ones(features.shape[:2], dtype=torch.bool)
@@ -240,7 +241,7 @@ def encoded(extractor: MotionCLIPExtractor, windows: np.ndarray) -> torch.Tensor
 
 
 def real_windows(count: int, length: int, fps: float, seed: int) -> np.ndarray:
-    """Returns windows (N, F, 22, 3) of the synthetic motions that such models learn from, which they have not seen."""
+    """Returns windows (N, F, 22, 3) of synthetic motions like the training data, which the model has not seen."""
     source = SyntheticSequences(clips=10 * count, seed=seed)
     rng = np.random.default_rng(seed)
     windows: list[np.ndarray] = []
@@ -286,7 +287,7 @@ def recognized(
 
 
 def is_shown(motion: np.ndarray, attributes: Attributes, fps: float) -> bool:
-    """Returns whether the rules see the requested action in a motion (F, 22, 3)."""
+    """Returns whether the rules recognize the requested action in a motion (F, 22, 3)."""
     action = {"action": attributes["action"]}
     return bool(right_attributes(read_all(motion, fps), action).get("action"))
 

@@ -1,6 +1,7 @@
-"""Builds the page that needs no installation, in build/web: `make web`.
+"""Builds the web page that needs no installation, in build/web: `make web`.
 
-The page samples with the model in this package in the browser. onnxruntime-web comes from npm at a pinned version.
+The page runs the model of this package in the browser. onnxruntime-web comes from npm at a pinned
+version.
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ RUNTIME, INTEGRITY = (
     "onnxruntime-web@1.30.0",
     "q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ==",
 )
-"""The npm package and the SHA-512 of its archive."""
+"""The npm package, and the SHA-512 of its archive."""
 RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
-STREAM = "stream"  # folder of the model of the stream, if it is another one than of single motions
+STREAM = "stream"  # folder of the stream's model, if it is not the model of single motions
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
 )
@@ -78,7 +79,7 @@ def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None =
         model: the model of single motions.
         out: the folder.
         streaming: the model of the stream, which continues frames. Default: `model`, if it
-            continues frames; otherwise there is no page with a stream.
+            continues frames. Otherwise, there is no page with a stream.
 
     Raises:
         UserError: If a model's captions do not name single actions, `streaming` does not continue frames, or
@@ -96,7 +97,7 @@ def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None =
         shutil.copy(path, out)
     if stream is None:
         (out / "live.html").unlink()
-    # Folder of the model of the stream, null without one
+    # Folder of the stream's model; null = no stream
     write_text(out / "models.js", f"export const STREAM = {json.dumps(stream)};\n")
     write_text(out / "schema.js", f"export const SCHEMA = {json.dumps(SCHEMA)};\n")
     fetch_runtime(out / "ort")
@@ -139,8 +140,7 @@ def write_model(model: MotionGenerator, folder: Path) -> None:
 def write_language(out: Path) -> None:
     """Writes `language.json` and `language.bin`, the tables with which the page understands texts.
 
-    `language.bin` contains the vectors of the words, with 8 bits per number, followed by the
-    words.
+    `language.bin` contains the word vectors, with 8 bits per number, followed by the words.
     """
     arrays = read_npz(vectors.FILE)
     count, dimensions = arrays["vectors"].shape
@@ -231,7 +231,8 @@ def fetch_runtime(folder: Path) -> None:
     """Downloads onnxruntime-web with npm.
 
     Raises:
-        UserError: If npm is missing or fails, or if the archive is not the pinned archive.
+        UserError: If npm is missing or fails, or if the downloaded archive is not the pinned
+            archive.
     """
     if shutil.which("npm") is None:
         raise UserError("make web needs npm to download onnxruntime-web. Install Node.js")

@@ -3,16 +3,17 @@
     pip install "flame-mdm[offline]"
     python tools/word_vectors.py [OUT.npz]
 
-The method is model2vec (Tulkens & van Dongen 2024): each word is encoded alone, and principal
-components reduce the outputs to `WIDTH` numbers. Words are encoded after "a person", so that a
-word that is both a verb and a noun has the meaning of the verb. This was checked on the most
-certain third of the words for actions: for 83 % of them, the nearest word means the same action;
-without "a person", for 69 %. Frequent words count less in a mean of several words (smooth inverse
-frequency, Arora et al. 2017); `flame_mdm.conditions.language.vectors` computes the weight from
-the rank of a word. Vectors have length 1, and 8 bits per number.
+The method is model2vec (Tulkens & van Dongen 2024): each word is encoded separately, and principal
+components reduce the outputs to `WIDTH` numbers. Words are encoded after "a person", so that a word
+that is both a verb and a noun has the meaning of the verb. This was checked on the most certain
+third of the words for actions. For 83 % of them, the nearest word means the same action; without "a
+person", for 69 %. Frequent words have less weight in a mean of several words (smooth inverse
+frequency, Arora et al. 2017). `flame_mdm.conditions.language.vectors` computes the weight from the
+rank of a word. Vectors have length 1, and 8 bits per number.
 
-The words are the first `FREQUENT` whole words of BERT's vocabulary, which is sorted by frequency, and the words of
-`actions.yaml`, `phrases.yaml` and `MOTION`. Model and vocabulary are under the Apache License 2.0.
+The words are the first `FREQUENT` whole words of BERT's vocabulary, which is sorted by frequency,
+and the words of `actions.yaml`, `phrases.yaml` and `MOTION`. Model and vocabulary are licensed
+under the Apache License 2.0.
 """
 
 import io
@@ -68,7 +69,7 @@ def main(out: Path) -> None:
         for name, array in {"words": text, "vectors": quantized}.items():
             buffer = io.BytesIO()
             np.save(buffer, array)
-            # a fixed time, so that the same words and model give the same bytes
+            # A fixed time, so that the same words and model result in the same bytes
             file.writestr(
                 zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)),
                 buffer.getvalue(),

@@ -1,4 +1,4 @@
-"""Blender extension that generates motions from a sentence, in the sidebar of the 3D view."""
+"""Blender extension that generates motions from sentences, in the sidebar of the 3D view."""
 
 import json
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,7 +18,7 @@ from .skeleton import SMPL22
 
 FOLDER = Path(__file__).parent
 AXES = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Rotation from y up, facing +z, to Blender's z up, facing -y."""
+"""Rotation from y up and facing +z to Blender's z up and facing -y."""
 POOL = ThreadPoolExecutor(1)
 
 
@@ -76,8 +76,8 @@ def read_armature(armature):
     """Returns the rest pose of an armature at the origin, and the size of the armature.
 
     Raises:
-        ValueError: If the bones belong to no known skeleton, or if the armature is mirrored,
-            scaled unevenly or not upright.
+        ValueError: If the bones belong to no known skeleton, or if the armature is mirrored, scaled
+            unevenly or not upright.
     """
     bones = sorted(armature.data.bones, key=lambda bone: len(bone.parent_recursive))
     names = [bone.name for bone in bones]
@@ -151,7 +151,7 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
         armature: the armature.
         name: name of the action.
         motion: the motion.
-        own: whether `new_armature` created the armature. Then every joint gets its position in
+        own: whether `new_armature` created the armature. If so, every joint gets its position in
             the motion.
     """
     pose, size = read_armature(armature)
@@ -197,7 +197,7 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
 
 
 def located(rig: Rig, world: np.ndarray, positions: np.ndarray, joint: int) -> np.ndarray:
-    """Returns the location (F, 3) of a bone in the frame of its rest pose, so that its head is at `positions`."""
+    """Returns the location (F, 3) of a bone relative to its rest pose, such that its head is at `positions`."""
     parent = rig.parents[joint]
     if parent < 0:
         return (positions[:, joint] - rig.positions[joint]) @ rig.turns[joint]
@@ -260,7 +260,7 @@ class Generate(bpy.types.Operator):
         return True
 
     def finish(self, context) -> set[str]:
-        """Adds the motion to the scene when it is sampled."""
+        """Adds the motion to the scene once it has been sampled."""
         armature = bpy.data.objects.get(self.armature) if self.armature else None
         made = None
         try:

@@ -45,7 +45,7 @@ HEAD = """# Speed
 a ratio of measurements that alternate in one run, on an idle machine unless the section states otherwise. The absolute
 figures next to it hold only for that machine. `make bench ONLY=host,steps` repeats some sections, and `make bench
 DEVICE=cuda` adds the sections of a GPU. With `MDM_REPO=PATH`, a clone of the authors' code, the authors' training step
-is measured, too. A section that names a commit has not been measured again since. Another page explains [which options
+is also measured. A section that names a commit has not been measured again since. Another page explains [which options
 to choose](../speed.md).
 """
 

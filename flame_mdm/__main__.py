@@ -33,8 +33,9 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a command line and returns its exit code; `argv` are the arguments after `flame-mdm`.
-    Default: the arguments of this process.
+    """Runs a command line and returns its exit code.
+
+    `argv` are the arguments after `flame-mdm`. Default: the arguments of this process.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):

@@ -122,7 +122,7 @@ def test_decoded_features_are_as_near_as_the_note_says(kind, tmp_path: Path):
     motion.save(tmp_path / "a.bvh")
     encoded = with_features(kind(20.0), read(tmp_path / "a.bvh"))
     (note,) = encoded.notes
-    start = "rotations are those of the file, on the body of an adult: mean error "
+    start = "rotations were read from the file, on the body of an adult: mean error "
     assert note.startswith(start)
     assert 0 < float(note.removeprefix(start).split()[0]) < 4
     raw = raw_motion(read(tmp_path / "a.bvh"), SMPL(20.0))

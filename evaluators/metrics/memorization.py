@@ -41,7 +41,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 class TrainingMotions:
     """The training motions, among which the nearest neighbor of a motion is found."""
 
-    #: (N, 3J) poses of all frames of all motions, one after another; see `poses`.
+    #: (N, 3J) poses of all frames of all motions, concatenated; see `poses`.
     poses: Tensor
     #: (M,) int64, number of frames of each motion.
     lengths: Tensor

@@ -197,7 +197,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
             raise UserError(
                 f"{path} is damaged: its weights are not dense tensors of real numbers by name: {shown}"
             )
-    # The factor 2 allows for tensors that two names share, since the file holds them only once.
+    # The factor 2 allows for tensors that two names share, because the file contains them only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())
     if size > 2 * path.stat().st_size:
         raise UserError(f"{path} is damaged: its weights are declared to be larger than the file")

@@ -106,7 +106,7 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
     else:
         joints = resample(motion.joints.astype(float), motion.fps, fps, cubic=True)
         if motion.bones.poses is not None:
-            source, body = "are those of the file", motion.bones.poses.resampled(motion.fps, fps)
+            source, body = "were read from the file", motion.bones.poses.resampled(motion.fps, fps)
         else:
             because = f" ({motion.bones.reason})" if motion.bones.reason else ""
             source = f"were fitted to joints{because}"

@@ -304,8 +304,8 @@ def planted_loop(motion: GroundedMotion) -> GroundedMotion:
 
     The result is still a loop: its last pose is its first pose.
     """
-    # Contacts are cut at the ends of a single cycle. Therefore several cycles in a row are
-    # planted. The middle one is kept, because its neighbors are cycles, too.
+    # Contacts are cut at the ends of a single cycle. Therefore, several cycles in a row are planted.
+    # The middle cycle is kept, because its neighbors are also cycles.
     count = len(motion) - 1
     several = planted(repeated(motion))
     middle = several.local[count * (COPIES // 2) : count * (COPIES // 2 + 1) + 1].copy()

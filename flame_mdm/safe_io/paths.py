@@ -22,7 +22,7 @@ from typing import IO
 from flame_mdm.errors import UserError
 
 SECOND_NAME = (
-    "a file with a second name (hard link), which would be changed, too. Replace it with a copy"
+    "a file with a second name (hard link), which would also be changed. Replace it with a copy"
 )
 
 WANDB_LINKS = re.compile(r"wandb/(latest-run|debug[\w-]*\.log|[\w-]+/logs/debug[\w-]*\.log)")

@@ -49,8 +49,8 @@ def bends(
     """Returns the angles in radians to add to the turns of the root so that it passes waypoints.
 
     The direction of travel approaches the direction of the next waypoint. The angle is bounded
-    per second and per meter of the path. If a waypoint is too near beside the person, the path
-    stays straight until there is room for a curve.
+    per second and per meter of the path. If a waypoint is beside the person and too near, the
+    path stays straight until there is room for a curve.
 
     Args:
         turns: (F) turns in radians from each frame to the next, positive to the left.

@@ -169,7 +169,7 @@ def adapt(
         )
 
     write_results()
-    # All processes wait here, since the launcher ends them when the first process exits.
+    # All processes wait here, because the launcher ends them when the first process exits.
     if torch.distributed.is_initialized():
         torch.distributed.barrier()
     return path

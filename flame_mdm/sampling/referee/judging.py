@@ -216,7 +216,7 @@ def _order(body: Body, claim: Claim) -> Reading:
     if first.answer != "yes" or second.answer != "yes" or not firsts or not seconds:
         return Reading(math.nan, 0.0, "s later", "body", (), "its parts are not clearly there")
     later, reverse = max(seconds) - min(firsts), max(firsts) - min(seconds)
-    unclear = "the reverse order happens, too" if min(later, reverse) > 0.3 else ""
+    unclear = "the reverse order also happens" if min(later, reverse) > 0.3 else ""
     spans = (
         first.reading.spans[firsts.index(min(firsts))],
         second.reading.spans[seconds.index(max(seconds))],
@@ -228,7 +228,7 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
     """Measures a claim at the start or at the end.
 
     Postures and contacts are measured in `END` seconds, movements in half the motion. The claim
-    is unclear if the other end shows the same. Standing is an exception, because it is usual at
+    is unclear if the other end shows the same posture or movement. Standing is an exception, because it is usual at
     both ends.
     """
     kind = KINDS[claim.kind]

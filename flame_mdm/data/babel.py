@@ -192,7 +192,10 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip of a label, or the reason why the label gives no clip."""
+    """Returns the first frame of each clip of a label, or the reason why the label gives no clip.
+
+    `frames` is the number of frames of the motion.
+    """
     none = range(0)
     if label.text == "transition":
         return none, "transitions"

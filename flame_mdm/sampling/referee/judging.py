@@ -228,8 +228,8 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
     """Measures a claim at the start or at the end.
 
     Postures and contacts are measured in `END` seconds, movements in half the motion. The claim
-    is unclear if the other end shows the same posture or movement. Standing is an exception, because it is usual at
-    both ends.
+    is unclear if the other end shows the same posture or movement. Standing is an exception, because
+    it is usual at both ends.
     """
     kind = KINDS[claim.kind]
     reading = kind.measure(body, replace(claim, when=""))

@@ -203,7 +203,7 @@ def streamed(
 
 
 def seams_of(joints: np.ndarray, seams: np.ndarray) -> dict[str, float]:
-    """Returns median and 99th percentile of the largest step (m) and change of step of a joint, at seams and inside."""
+    """Returns the median and 99th percentile of a joint's largest step (m) and change of step, at seams and inside."""
     figures = {}
     for name, order in (("step", 1), ("change of step", 2)):
         size = np.linalg.norm(np.diff(joints, order, axis=1), axis=-1).max(-1)

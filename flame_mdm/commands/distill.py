@@ -1,4 +1,4 @@
-"""`flame-mdm distill CKPT [OUT] key=value ...`: trains a student of a model that samples in one to four steps."""
+"""`flame-mdm distill CKPT [OUT] key=value ...`: trains a student model that samples in one to four steps."""
 
 import os
 import shutil

@@ -65,7 +65,7 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Returns axes as rows (3, 3).
+    """Returns orthonormal axes as rows (3, 3).
 
     The rows are the direction, then `u` made orthogonal to it, then the third axis.
     """

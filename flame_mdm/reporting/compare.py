@@ -289,7 +289,7 @@ def in_common(runs: Mapping[str, Run]) -> list[str]:
 
 
 def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:
-    """Returns titles and rows (see `HEAD`) of the differences between each result and the first result."""
+    """Returns the titles and rows (see `HEAD`) of the differences between each result and the first result."""
     (first, base), *others = columns
     tables = []
     for index, (label, result) in enumerate(others, 2):

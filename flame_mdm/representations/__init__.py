@@ -119,7 +119,7 @@ class Representation(nn.Module, ABC):
         return features.new_zeros(*features.shape[:-1], 0, 6)
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean and std (D,) for normalization, computed from all training frames (N, D).
+        """Returns the mean and std (D,) for normalization, computed from all training frames (N, D).
 
         Without `slices`, mean and std are 0 and 1.
         """

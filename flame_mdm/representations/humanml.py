@@ -225,7 +225,7 @@ class HumanML(Representation):
         )
 
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
-        """Returns x and z (N, 2) of the direction that hips and shoulders face.
+        """Returns x and z (N, 2) of the direction that the hips and shoulders face.
 
         The direction is the cross product of the vertical and the direction to the right. It is
         shorter if the body lies on its side. `hips` is the weight of the hips.

@@ -111,7 +111,7 @@ class Rifke(Representation):
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns the mean and unbiased std of each feature.
+        """Returns the mean and the unbiased std of each feature.
 
         The std of a constant feature is 1.
         """

@@ -29,7 +29,7 @@ class WriteProvenance(Callback):
         self.config = config
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Writes recipe and provenance into the run directory and to the loggers."""
+        """Writes the recipe and the provenance to the run directory and the loggers."""
         if not trainer.is_global_zero:
             return
         assert isinstance(pl_module, Task)

@@ -177,7 +177,7 @@ class FittedBody:
     lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""
+        """Returns the vertices and normals (V, 3) of a frame, by linear blend skinning."""
         turns = self.turns[frame]
         moves = self.starts[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
         blended = self.mesh.weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)

@@ -28,8 +28,7 @@ Kind = Literal["loop", "start", "stop", "turn"]
 CYCLE = (0.5, 1.8)
 # A gait is steady above this fraction of its full speed
 STEADY = 0.85
-# Seconds over which the speed is averaged, because the speed of side steps varies between 0 and its
-# maximum
+# Seconds over which the speed is averaged, because a body stops briefly between side steps
 EVEN = 0.2
 # Minimum speed of a gait in m/s
 SLOWEST = 0.2

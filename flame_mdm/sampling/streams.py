@@ -242,7 +242,8 @@ class OnlineCleanup:
 class PastBlock(NamedTuple):
     """A past block of a single stream, which can be cut.
 
-    `begin` is the number of its first frame, and `number` is the number of its draw of noise.
+    `begin` is the number of its first frame. `number` is the number of the block, which determines
+    its noise.
     """
 
     begin: int

@@ -276,7 +276,7 @@ class Evaluation:
             )
         if self.protocol.cuts_motions and self._expected():
             lines.append(
-                "the expected values of real motions were not checked: the first frames are not measured here"
+                "the expected values of real motions were not checked: this protocol does not measure the first frames"
             )
         return lines
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 ARROWS = {"higher": "↑", "lower": "↓", "real": "→", "none": ""}
 KINDS = {
-    "real": "Real motions, measured here",
-    "measured": "Measured here",
+    "real": "Real motions, measured",
+    "measured": "Measured",
     "reported real": "Real motions, as reported",
     "reported": "As reported",
 }

@@ -152,7 +152,7 @@ def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
 BASE, STORED, REAL = "decoded and encoded", "as stored", "reference"
 """Sets of motions in every audit.
 
-All perturbed motions are compared with `BASE`. `STORED` has the stored features. `REAL` is a
+All perturbed motions are compared with `BASE`. `STORED` contains the stored features. `REAL` is a
 second draw of real motions, for metrics that compare sets.
 """
 

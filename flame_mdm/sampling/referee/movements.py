@@ -54,9 +54,10 @@ def travel(body: Body, claim: Claim) -> Reading:
 def veer(body: Body, claim: Claim) -> Reading:
     """Measures the largest displacement to the claimed side, in meters.
 
-    Measured are the displacement from the start, to the side of the initial heading, and the sum of
-    the sideways steps relative to the current heading. The larger of the two counts. The reading is
-    unclear if the displacement to the other side is more than half as large.
+    Two displacements are measured: the displacement from the start, relative to the initial heading,
+    and the sum of all sideways steps, relative to the current heading. The larger displacement
+    counts. The reading is unclear if it exceeds 0.2 m and the displacement to the other side is more
+    than half as large.
     """
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0

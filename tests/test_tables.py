@@ -473,7 +473,9 @@ def test_rows_are_measured_from_their_checkpoint(trained, data_root, tmp_path, m
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
     assert b"ddim, eta 0.5" in first["mine.html"]
-    assert b"Options that differ from the protocol: replications = 1, samples = 4." in first["mine.md"]
+    assert (
+        b"Options that differ from the protocol: replications = 1, samples = 4." in first["mine.md"]
+    )
     assert main(["tables", *words]) == 0
     assert "evaluating" not in capsys.readouterr().out
     assert files(Path("runs/tables")) == first
@@ -629,7 +631,9 @@ def test_multimodality_is_measured_for_tables_that_show_it_alone(folder):
     ), "as the spec says"
 
     change(folder, "MFM", changed={"multimodality": False})
-    assert "Options that differ from the protocol" not in rendered(made(folder), "md"), "no column shows it"
+    assert "Options that differ from the protocol" not in rendered(made(folder), "md"), (
+        "no column shows it"
+    )
     change(folder, "MFM", changed={"samples": 5})
     assert "Options that differ from the protocol: samples = 5." in rendered(made(folder), "md")
 

@@ -1,2 +1,2 @@
 # pyright: standard
-"""Sampling: requests, generation, editing, sequences of texts, and targets in the world."""
+"""Sampling: requests, generation, editing, sequences of texts, and world-space targets."""

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Targets in the world: waypoints of the root, joint positions, and poses at given times."""
+"""World-space targets: waypoints of the root, joint positions, and poses at given times."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

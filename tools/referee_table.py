@@ -2,7 +2,7 @@
 
     python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ... runs/bandai/mdm_small/default ...]
 
-Four systems are compared on clips of the synthetic test split: motions of the package's model, the
+These systems are compared on clips of the synthetic test split: motions of the shipped models, the
 real motions, their mirror images, and real motions with captions of other motions. R-precision is
 `MotionsForText` with the package's motion-CLIP. The arguments add prepared data sets with SMPL's 22
 joints, without R-precision, and models that were trained on them.
@@ -34,6 +34,7 @@ OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks" / "referee_sys
 FPS = 20.0
 COUNT = 128  # motions per row
 CLIPS = 1600  # number of synthetic clips; their test split is used
+SHIPPED = ("quickstart", "package", "package_dip")
 LONGEST = 3.0  # duration in seconds of the longest motion of the package's model
 REAL, MIRRORED, SHUFFLED = "real motions", "mirrored real motions", "captions of other motions"
 
@@ -42,10 +43,12 @@ Joints = Sequence[np.ndarray]
 
 def main(folders: Sequence[Path]) -> None:
     ids, joints, captions = synthetic()
-    model = flame_mdm.load("quickstart")
     seconds = [min(LONGEST, len(motion) / FPS) for motion in joints]
-    generated = flame_mdm.generate(model, captions, seconds=seconds, seed=0, split=False)
-    sets = {"quickstart": ([motion.joints for motion in generated], captions)}
+    sets = {}
+    for name in SHIPPED:
+        model = flame_mdm.load(name)
+        generated = flame_mdm.generate(model, captions, seconds=seconds, seed=0, split=False)
+        sets[name] = ([motion.joints for motion in generated], captions)
     sets |= baselines(joints, captions)
 
     extractor = MotionCLIPExtractor("motion_clip_synthetic", "cpu")

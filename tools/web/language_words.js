@@ -167,7 +167,7 @@ export function corrections(word) {
   return once(`corrections of ${word}`, () => {
     const shortest = constant("never_corrected");
     if (word.length <= shortest || /\p{Nd}/u.test(word)) return [];
-    const most = word.length <= 4 ? 1 : 2;
+    const most = word.length <= 5 ? 1 : 2;
     const near = new Map();
     for (const other of correctWords()) {
       if (other.length <= shortest) continue;
@@ -175,7 +175,7 @@ export function corrections(word) {
       if (far > most) continue;
       const beginsOtherwise = sortedLetters(other.slice(0, 2)) !== sortedLetters(word.slice(0, 2)) && other[0] !== word[0];
       const hasReplaced = other.length === word.length && sortedLetters(other) !== sortedLetters(word);
-      const cost = 2 * far + beginsOtherwise + hasReplaced;
+      const cost = 3 * far + beginsOtherwise + hasReplaced;
       if (!near.has(cost)) near.set(cost, []);
       near.get(cost).push(other);
     }

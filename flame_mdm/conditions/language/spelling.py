@@ -56,12 +56,13 @@ def distance(first: str, second: str, most: int) -> int:
 def corrections(word: str) -> tuple[str, ...]:
     """Returns the words of the tables that a misspelled word may stand for; () if none is similar.
 
-    All returned words have the same number of edits. A word of up to four letters may have one
-    wrong letter, and a longer word may have two. Numbers are not corrected.
+    All returned words are equally likely: they differ from the misspelled word by the same number
+    of edits of the same kind. A word of up to five letters may have one wrong letter, and a longer
+    word may have two. Numbers are not corrected.
     """
     if len(word) <= NEVER_CORRECTED or any(char.isdecimal() for char in word):
         return ()
-    most = 1 if len(word) <= 4 else 2
+    most = 1 if len(word) <= 5 else 2
     near: dict[int, list[str]] = {}
     for other in _correct_words():
         if len(other) > NEVER_CORRECTED and (far := distance(word, other, most)) <= most:
@@ -69,7 +70,7 @@ def corrections(word: str) -> tuple[str, ...]:
             # swapped letter.
             begins_otherwise = sorted(other[:2]) != sorted(word[:2]) and other[0] != word[0]
             has_replaced = len(other) == len(word) and sorted(other) != sorted(word)
-            near.setdefault(2 * far + begins_otherwise + has_replaced, []).append(other)
+            near.setdefault(3 * far + begins_otherwise + has_replaced, []).append(other)
     return tuple(near[min(near)]) if near else ()
 
 

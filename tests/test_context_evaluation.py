@@ -70,7 +70,7 @@ def test_expected_values_of_whole_motions_are_not_those_of_cut_ones(
             evaluation = Evaluation(measured, clips, None, model.representation)
             assert len(evaluation._unexpected(values)) == count
     lines = Evaluation(cut, clips, None, model.representation)._conditions()
-    assert any("the first frames are not measured" in line for line in lines)
+    assert any("does not measure the first frames" in line for line in lines)
 
 
 def test_the_authors_begin_in_one_of_the_first_frames_and_measure_the_whole_length(protocol, clips):

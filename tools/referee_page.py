@@ -14,20 +14,22 @@ FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
 SETS = {"cmu": "CMU", "package": "free motion capture", "bandai": "Bandai-Namco", "synthetic": "synthetic"}  # fmt: skip
 INTRODUCTION = """# The referee, measured
 
-[The referee](../referee.md) explains what is judged. The tables are written by `tools/referee_page.py` from results in
+[The referee](../referee.md) explains what is judged. `tools/referee_page.py` writes the tables from the result files in
 this folder.
 
 ## Right verdicts on real motions
 
-Thresholds come from one half of the recordings, these figures from the other half. A claim of a caption counts as true
-of its motion. A falsified claim states the other side, direction or speed, one repetition more or fewer, the reverse
-order, another duration, or the other end of the motion. It counts as false. Wrong captions count as errors. Patterns
-and measurements were corrected while the errors on both halves were known, so the figures are optimistic for other
-data. The last correction concerns CMU: "kicking his legs" was read as both legs at the same time, which made one of 30
-decided claims false (96.7 %). It was corrected after it had been seen.
+The thresholds were set on one half of the recordings, and these figures were measured on the other half. Each claim in
+the caption of a motion counts as true. Falsified claims count as false. They state the other side, direction or speed,
+one repetition more or fewer, the reverse order, another duration, or the other end of the motion. A wrong caption
+counts as an error of the referee. We corrected patterns and measurements after we had seen errors on both halves, so
+expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as kicking with both
+legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the CMU claims would be
+right.
 
-CMU's captions come from HumanML3D's test split and from KIT-ML, for the recordings at hand. Bandai-Namco's captions
-are templates of its labels, so its many clips have few different sentences. Read the figures of each set separately.
+CMU's captions come from HumanML3D's test split and from KIT-ML; they cover only the recordings that were available.
+Bandai-Namco's captions are built from its labels with templates, so its many clips have few different sentences. Read
+the figures for each set separately.
 """
 
 
@@ -65,7 +67,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
             true = share(row["true_right"], row["true_decided"])
             false = share(row["false_right"], row["false_decided"])
             lines.append(f"| {title} | {group} | {decided} | {true} | {false} |")
-    lines += ["", "Captions of all recordings of a set, both halves:", ""]
+    lines += ["", "Captions of all recordings in a set, both halves:", ""]
     lines += ["| set | captions | with a claim | with a decided claim |", "|---|---:|---:|---:|"]
     for row in rows:
         if "captions" in row:
@@ -76,7 +78,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
     lines += built_table(rows)
     kinds = [row for row in rows if row["set"] == "real" and row["group"].startswith("kind ")]
     lines += below_the_targets(kinds)
-    lines += ["", "By kind, over all real sets:", ""]
+    lines += ["", "This table shows each kind of claim, over all real sets:", ""]
     lines += [
         "| kind | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",
@@ -105,10 +107,10 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
             lines.append(f"| {title} | {both_shares(row)} |")
     lines += [
         "",
-        "CMU's figures are below the targets. Four of its falsified claims are not judged false. Three of them state",
-        "the other direction of motions that go both ways. The fourth is about squats: the caption states three, but",
-        "the referee counts two. The true claims that are judged false are about these squats, a jog in place, and a",
-        "walk at 1.8 m/s that one caption calls slow and another one brisk.",
+        "CMU's figures are below the targets. Four of its falsified claims are not judged false. Three of the four",
+        "state the opposite direction of motions that go both ways. The fourth is about squats: the caption states",
+        "three squats, but the referee counts two. The true claims that are judged false are about these squats, a jog",
+        "in place, and a walk at 1.8 m/s that one caption calls slow and another caption calls brisk.",
     ]
     return lines
 
@@ -117,11 +119,11 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns the figures of built claims about durations, the start and the end."""
     lines = [
         "",
-        "Captions hardly ever state a duration, a start or an end. Therefore, these claims are built, not written by",
-        "people: if the captions of a recording only state that the body walks, runs or stands still, it is cut to",
-        "two, three and four seconds. Falsified claims state twice the duration, or half of it. In recordings of",
-        "walks, the person is assumed to stand upright at the start and at the end, so lying there is a falsified",
-        "claim. The other tables do not contain these claims.",
+        "Captions hardly ever state a duration, a start or an end, so these claims were constructed instead. If the",
+        "captions of a recording only state that the body walks, runs or stands still, the recording is cut to two,",
+        "three and four seconds. Falsified claims state twice or half the duration. In recordings of walks, the person",
+        "is assumed to stand upright at the start and at the end. A claim that the person lies there is therefore",
+        "falsified. The other tables do not contain these claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",
@@ -150,7 +152,8 @@ def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
     return [
         "",
-        f"Below the targets of 97 % of true claims and 90 % of falsified claims: {', '.join(missed)}.",
+        "The targets are right verdicts on 97 % of true claims and 90 % of falsified claims. These kinds miss them: "
+        f"{', '.join(missed)}.",
     ]
 
 
@@ -164,14 +167,14 @@ def systems_table(content: Mapping[str, Any]) -> list[str]:
     lines = ["", "## Systems", ""]
     both = sum(row["top3"] is not None for row in content["rows"])
     lines += [
-        "The table has the shares of decided claims that are true, and R-precision (`MotionsForText`, top 3,",
-        "motion-CLIP of the package) on the same motions, at most",
-        f"{content['motions']} per row. Over the {both} rows with both values, the rank correlation is",
-        f"{content['rank_correlation']:.2f}. Motions of models are at most three seconds",
-        "long, which is too short for some turns. The model on Bandai-Namco is small and was trained for eleven",
-        "minutes on one thread. A model on CMU has no row: the recordings at hand have only 23 clips to train on.",
-        "[A table of four models on Bandai-Namco](bandai_small.md), trained for the same time, has both values for",
-        "FLAME, MDM, MFM and DiP.",
+        "The table shows the share of decided claims that are true, and R-precision (`MotionsForText`, top 3, with",
+        "the package's motion-CLIP) on the same motions. Each row has at most",
+        f"{content['motions']} motions. Over the {both} rows with both values, the rank correlation is",
+        f"{content['rank_correlation']:.2f}. Generated motions are at most three seconds",
+        "long, which is too short for some turns. The model for Bandai-Namco is small and was trained for eleven",
+        "minutes on one thread. There is no model for CMU, because only 23 training clips were available.",
+        "[Another table](bandai_small.md) has both values for FLAME, MDM, MFM and DiP models that were trained on",
+        "Bandai-Namco for the same time.",
     ]
     groups = ("all", "side", "direction", "count", "movement", "posture", "contact")
     lines += ["", f"| data | motions | {' | '.join(groups)} | decided | R-precision |"]
@@ -187,8 +190,9 @@ def eye_table(verdicts: list[dict[str, Any]]) -> list[str]:
     agreed = sum(verdict["agrees"] for verdict in verdicts)
     lines = ["", "## Verdicts checked by eye", ""]
     lines.append(
-        f"{len(verdicts)} verdicts on motions of the second half, at most one per motion and spread over the kinds, "
-        f"were compared with twelve pictures of each motion: {agreed} agree."
+        f"We compared {len(verdicts)} verdicts on motions from the second half with twelve pictures of each motion. "
+        f"The verdicts are spread over the kinds of claims, with at most one per motion. {agreed} of them agree with "
+        "the pictures."
     )
     lines += ["", "| motion | verdict | agrees | |", "|---|---|---|---|"]
     for verdict in verdicts:

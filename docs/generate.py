@@ -40,12 +40,12 @@ def recipes_page() -> str:
     page = f"""# Recipes
 
 {HEAD}
-FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023, arXiv:2209.14916) and Motion Flow
-Matching (Hu et al., 2023, arXiv:2312.08895) have a recipe for each of their rows in the tables of the papers, such as
-`make train EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate.
-"As in mdm" means the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch
-contains motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on
-validation clips.
+Every table row for FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023, arXiv:2209.14916) and
+Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895) in their papers has a recipe, such as
+`make train EXP=humanml3d/mdm`. Recipes that name no table do not correspond to a row in a paper. Their files list the
+deviations from the paper. "As in humanml3d/mdm" means that all deviations listed for that recipe also apply. Three
+deviations apply to all recipes: a batch contains motions of about the same length, every sample in a batch has the same
+weight, and checkpoints are selected on validation clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
@@ -92,7 +92,7 @@ def printed(text: str) -> Any:
 TABLES = published_tables()
 
 DEVIATIONS = {
-    ("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen to come close"
+    ("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen so that the number is close"
 }
 """Deviations of recipes from their papers, by (recipe, key), with the reason."""
 
@@ -108,10 +108,10 @@ def hyperparameters_page() -> str:
     page = f"""# Hyperparameters
 
 {HEAD}
-The tables show the values of the recipes. A value is bold if the paper gives the same value. If the paper gives another
-value, both are shown. The other values are not in the papers; most come from the authors' code. "–" means that the
-recipe has no such value. If a paper names only the kind of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the
-checkpoint is our choice.
+The tables show the values in the recipes. A value is bold if the paper states the same value. If the paper states a
+different value, both values are shown. All other values are not in the papers; most of them come from the authors'
+code. "–" means that the recipe has no such value. If a paper names only the type of a text encoder (MFM: CLIP, T5; MDM:
+sentence-BERT), the checkpoint is our choice.
 """
     for title, published in TABLES.items():
         columns = {name: hyperparameters(name) for name in published}
@@ -305,14 +305,14 @@ SIZES: dict[str, tuple[str, list[str]]] = {
 }
 """Rows of the page about memory: a recipe and overrides, by label."""
 
-MEMORY = """# Memory of a training
+MEMORY = """# Memory for training
 
 {head}
 This table is computed from the recipes. The figures are GiB per process, in float32, with the recipe's batch size and
-its longest motions. The state consists of the weights, their gradients, both states of Adam and, if the recipe averages
-weights, the averaged weights. Its size does not depend on the batch size. Activations are tensors that the forward pass
-keeps for the backward pass. Their size grows with `data.batch_size`, and `speed=fast` on a GPU halves it. The frozen
-text encoder is not on the device while the model trains. Libraries and kernels also need memory.
+longest motions. The state consists of the weights, their gradients, Adam's two states and, if the recipe averages
+weights, the averaged weights. The size of the state does not depend on the batch size. Activations are tensors that the
+forward pass keeps for the backward pass. Their size grows with `data.batch_size`. On a GPU, `speed=fast` halves this
+size. A frozen text encoder is not on the device during training. Libraries and kernels need additional memory.
 
 | model | parameters, M | batch | state | activations | with `task.checkpoint_activations` |
 |---|---:|---:|---:|---:|---:|
@@ -326,7 +326,7 @@ The overrides of the wide models are `denoiser.latent_dim`, `denoiser.ff_size` (
 
 
 def memory_page() -> str:
-    """Returns the page with the memory that trainings need."""
+    """Returns the page about the memory that training needs."""
     rows = []
     for label, (recipe, words) in SIZES.items():
         config = compose(recipe, words)

@@ -318,8 +318,7 @@ size. A frozen text encoder is not on the device during training. Libraries and 
 |---|---:|---:|---:|---:|---:|
 {rows}
 
-The overrides of the wide models are `denoiser.latent_dim`, `denoiser.ff_size` (four times as wide) and
-`denoiser.num_layers`.
+The wide models override `denoiser.latent_dim`, `denoiser.ff_size` (four times the width) and `denoiser.num_layers`.
 
 [GPUs and clusters](clusters.md#larger-models) explains what to do if a model does not fit.
 """

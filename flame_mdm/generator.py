@@ -50,7 +50,7 @@ class Parts:
 
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
-        """Builds the parts of a recipe. Sizes that depend on other parts are set here."""
+        """Builds the parts that a recipe describes, and sets the sizes that depend on other parts."""
         process: Process = instantiate(config["process"])
         condition: ConditionEncoder = instantiate(config["condition"], {"num_actions": num_actions})
         sizes = sizes_of_denoiser(config, representation, process, condition)
@@ -71,7 +71,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames that divides every length in training."""
+    """Returns the number of frames of which all lengths in training are multiples."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -85,7 +85,7 @@ def sampling_defaults(
         UserError: If a value is invalid.
     """
     if num_inference_steps is None:  # a recipe may come from a file
-        raise UserError("task.num_inference_steps=null: give the number of sampling steps")
+        raise UserError("task.num_inference_steps=null: set it to the number of sampling steps")
     try:
         return SamplerOptions(
             guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
@@ -97,7 +97,7 @@ def sampling_defaults(
 class Model:
     """Base class of the models that checkpoints hold."""
 
-    # Content of its checkpoints, for messages
+    # What the model's checkpoints contain, for messages
     noun = "a model"
     # The recipe, saved in checkpoints
     config: Config
@@ -159,7 +159,7 @@ class MotionGenerator(Model, nn.Module):
             config: the recipe.
             representation: features of a motion.
             actions: names of the actions in the training data.
-            facts: further facts about the training data; see `add_facts`. Default: none.
+            facts: additional facts about the training data; see `add_facts`. Default: none.
         """
         parts = Parts.build(config, representation, len(actions))
         section = config["task"]
@@ -366,7 +366,8 @@ class Blocks:
         if prefix is None or tuple(prefix.shape) != expected:
             shape = None if prefix is None else tuple(prefix.shape)
             raise UserError(
-                f"the prefix has shape {shape}, but this model continues frames of shape {expected}. Give such frames"
+                f"the prefix has shape {shape}, but this model continues frames of shape {expected}. Pass "
+                "such frames"
             )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
@@ -456,9 +457,9 @@ class DistilledGenerator(MotionGenerator):
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):
             raise UserError(
-                f"guidance_scale={scale}: the guidance is built into this distilled model. Omit it"
+                f"guidance_scale={scale}: the guidance is built into this distilled model. Omit guidance_scale"
             )
         if unconditioned and self.condition.features:
             raise UserError(
-                f"this distilled model needs a {self.condition.reads}, as in its training. Add one"
+                f"this distilled model was trained with a condition only. Pass a {self.condition.reads}"
             )

@@ -27,7 +27,7 @@ from flame_mdm.sampling.reading import part_of, read_motion, with_features
 from flame_mdm.sampling.resolution import ResolvedRequest, resolve
 
 MFM_STEPS = 25
-"""Number of sampling steps of MFM's edits.
+"""Number of sampling steps for MFM's edits.
 
 With `until` = 0.2, "the first 6 time steps" are the steps up to "0.2 time" (i / 25 <= 0.2).
 """
@@ -97,7 +97,7 @@ def edit(
             unless `actions` are given.
         fps: frames per second of an array or an .npy file. For other files, it overrides the rate
             in the file.
-        cut: [begin, end] in seconds of the part of the motion to use. Default: the entire motion.
+        cut: the part of the motion to use, as [begin, end] in seconds. Default: the entire motion.
         stages: list that receives clean estimates of the first motion, at equal intervals of the
             sampling, and then the motion itself.
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
@@ -152,11 +152,11 @@ def resolve_edit(
     if length > longest and not request.is_sequence:
         raise UserError(
             f"{original.id or 'the motion'}: {length} frames, but the model was trained on at most {longest} "
-            f"({longest / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
+            f"({longest / original.fps:g} seconds). Select a part with cut=[begin, end], in seconds"
         )
     keep, kept_joints = kept_parts(representation, length, editing)
     if not keep.any() and editing.strength is None:
-        advice = "choose region=..., region_seconds=... or joints=..., or vary all of it with strength=0.5"
+        advice = "choose region=..., region_seconds=... or joints=..., or vary the entire motion with strength=0.5"
         raise UserError(f"no part of the motion is kept: {advice}")
 
     edit_options, options = method_options(model.process, editing, request.options)
@@ -220,17 +220,17 @@ def _original(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the number of frames of each part that states no seconds.
+    """Returns the number of frames of each part without a stated duration.
 
-    All parts together must be as long as the motion.
+    Together, all parts must be as long as the motion.
     """
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)
     fits = rest == 0 if others == 0 else rest >= others and rest % others == 0
     if not fits:
         raise UserError(
-            f"the parts are not as long as the motion, which has {length / fps:g} seconds. Give each part its "
-            "seconds, as in 'walks @2 | sits @1'"
+            f"the parts are not as long as the motion, which lasts {length / fps:g} seconds. State the "
+            "seconds of each part, as in 'walks @2 | sits @1'"
         )
     return rest // max(1, others)
 
@@ -281,9 +281,9 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options of `Edit` and of the sampler.
+    """Returns the options for `Edit` and for the sampler.
 
-    The options belong to the requested method or, by default, to the method of the process.
+    They belong to the requested method. Without one, they belong to the default method of the process.
     """
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes

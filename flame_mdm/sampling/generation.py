@@ -100,7 +100,7 @@ def sample(
     if model.denoiser.context_frames and (stages is not None or resolved.edit is not None):
         keyword = "edit" if stages is None else "trajectory"
         raise UserError(
-            f"{keyword}: this model continues frames block by block, without {keyword}. Omit it"
+            f"{keyword}: not supported by models that continue frames block by block. Omit {keyword}"
         )
     if stages is not None and request.candidates > 1:
         raise UserError(
@@ -153,7 +153,7 @@ class _Row:
 
 
 def _rows(resolved: ResolvedRequest) -> list[_Row]:
-    """Returns the motions to sample. The motions of the first prompt come first."""
+    """Returns the motions to sample, starting with those for the first prompt."""
     copies = resolved.request.samples * resolved.request.candidates
     counts: Counter[str] = Counter()
     rows = []

@@ -39,7 +39,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "mfm": {"mode": "trajectory", "until": 0.2},
 }
 """Editing methods of the papers, as options of `flame_mdm.batch.Edit`."""
-# Names for the frames to resample
+# Names that `region` accepts for the frames to resample
 REGIONS = (
     "in_between",
     "prediction",
@@ -48,7 +48,7 @@ REGIONS = (
     "interpolate",
 )
 
-# Text of a part of a sequence, and its seconds if the text states them
+# Text of one part of a sequence, and its duration in seconds, or None if the text states no duration
 Part = tuple[str, float | None]
 Waypoints = Sequence[tuple[float, float]]  # x and z in meters
 Ranges = Sequence[float] | Sequence[Sequence[float]]
@@ -102,7 +102,7 @@ class EditRequest:
 
     def __post_init__(self) -> None:
         if self.region is not None and self.region_seconds is not None:
-            raise UserError("give region or region_seconds, not both")
+            raise UserError("region and region_seconds exclude each other. Use one of them")
         for name, choices in (("region", REGIONS), ("method", METHODS)):
             value = getattr(self, name)
             if isinstance(value, str) and value not in choices:
@@ -115,15 +115,15 @@ class EditRequest:
                 "joints: no joint is named. Name the joints to resample, or omit joints for all of them"
             )
         if type(self.resample) is not int or self.resample < 1:
-            raise UserError(f"resample={self.resample}: give a whole number, 1 or more")
+            raise UserError(f"resample={self.resample}: expected a whole number, at least 1")
         if self.strength is not None and not 0 < self.strength <= 1:
-            raise UserError(f"strength={self.strength:g}: give a number above 0, up to 1")
+            raise UserError(f"strength={self.strength:g}: expected a number above 0 and at most 1")
         if self.method is not None:
             self.method_options(self.method)
 
     @property
     def ranges(self) -> list[tuple[float, float]] | None:
-        """The ranges of `region` or `region_seconds`; None if there are no ranges."""
+        """The ranges in `region` or `region_seconds`; None if neither contains ranges."""
         name = "region" if self.region_seconds is None else "region_seconds"
         value: Any = getattr(self, name)
         if value is None or (name == "region" and isinstance(value, str)):
@@ -131,7 +131,7 @@ class EditRequest:
         listed = [value] if is_range(value) else value
         if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
             raise UserError(
-                f"{name}={value}: write [begin, end], or several ranges as [[begin, end], [begin, end]]"
+                f"{name}={value}: expected [begin, end], or several ranges as [[begin, end], [begin, end]]"
             )
         return [(begin, end) for begin, end in listed]
 
@@ -139,7 +139,7 @@ class EditRequest:
         """Returns the options of `flame_mdm.batch.Edit` for a method.
 
         Raises:
-            UserError: If this request has options that the method lacks.
+            UserError: If this request sets an option that the method does not have.
         """
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
@@ -184,8 +184,8 @@ class SamplingRequest:
     seconds: float | Sequence[float] | None = option(
         None,
         "length of the motion in seconds, or a list with one length per text. In a sequence, the "
-        "length of each part whose text does not state one (@2). Default: 3, or the longest "
-        "motion in training if that is shorter",
+        "length of each part whose text does not state its own (as @2 does). Default: 3, or the "
+        "length of the longest motion in training if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
         None, "length in frames, or a list of lengths, instead of seconds"
@@ -193,13 +193,11 @@ class SamplingRequest:
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
-        "number of motions generated for each motion that is kept; the best motion without "
-        "faults is kept, or the best of all if all have faults",
+        "number of motions to generate for each motion that is kept. The best motion without "
+        "faults is kept or, if all have faults, the best of all",
     )
     seed: int = option(0, "seed of the noise")
-    after: str | Path | Motion | None = option(
-        None, "motion that the result continues: FILE or dataset:id"
-    )
+    after: str | Path | Motion | None = option(None, "motion to continue: FILE or dataset:id")
     split: bool = option(
         True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
     )
@@ -259,15 +257,17 @@ class SamplingRequest:
         for name in ("samples", "candidates"):
             value = getattr(self, name)
             if not isinstance(value, Integral) or not 1 <= int(value) <= MAX_SAMPLES:
-                raise UserError(f"{name}={value}: give 1 to {MAX_SAMPLES:,}")
+                raise UserError(
+                    f"{name}={value}: expected a whole number from 1 to {MAX_SAMPLES:,}"
+                )
         if not isinstance(self.seed, Integral):
-            raise UserError(f"seed={self.seed!r}: give a whole number")
+            raise UserError(f"seed={self.seed!r}: expected a whole number")
         self._check_prompts()
         self._check_lengths()
         if self.path is not None:
             if self.targets is not None:
                 raise UserError(
-                    f"path={self.path}: targets cannot be given with a path. Give one of the two"
+                    f"path={self.path}: path and targets exclude each other. Use one of them"
                 )
             object.__setattr__(self, "path", read_path(self.path))
 
@@ -275,7 +275,7 @@ class SamplingRequest:
         if self.after is not None and other is not None:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
             raise UserError(
-                f"after={name}: a motion that continues another cannot have {other}. Give one of the two"
+                f"after={name}: a motion that continues another one cannot have {other}. Omit after or {other}"
             )
 
         if (edit := self.editing) is not None:
@@ -283,32 +283,32 @@ class SamplingRequest:
             self.check_edit(edit.strength is not None and is_whole)
             if self.seconds is not None or self.frames is not None:
                 raise UserError(
-                    "an edit is as long as its motion: omit seconds and frames, or give cut=[begin, end]"
+                    "an edit is as long as its motion. Omit seconds and frames, or select a part with cut=[begin, end]"
                 )
 
     def _check_prompts(self) -> None:
         if self.texts is not None and self.actions is not None:
-            raise UserError("give texts or actions, not both")
+            raise UserError("texts and actions exclude each other. Use one of them")
         for prompt in self.prompts:
             if not isinstance(prompt, str):
                 raise UserError(
-                    f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'"
+                    f"{self.kind}={prompt!r} is not a string. Pass a string, such as {self.kind}='walk'"
                 )
             check_length(prompt)
         if self.texts is not None and not all(text.strip() for text in self.prompts):
-            raise UserError("empty text. Omit the text to sample without condition")
+            raise UserError("empty text. Omit the text to sample without a condition")
 
         copies = self.samples * self.candidates
         if len(self.prompts) * copies > MAX_SAMPLES:
             key = "samples" if self.candidates == 1 else "samples times candidates"
             raise UserError(
-                f"{key}={copies} of each text: at most {MAX_SAMPLES:,} motions per request"
+                f"{key}={copies} for each text: a request may have at most {MAX_SAMPLES:,} motions"
             )
         _ = self.parts  # raises if a part is invalid
 
     def _check_lengths(self) -> None:
         if self.seconds is not None and self.frames is not None:
-            raise UserError("give seconds or frames, not both")
+            raise UserError("seconds and frames exclude each other. Use one of them")
         name = "frames" if self.seconds is None else "seconds"
         value: Any = getattr(self, name)
         if value is None:
@@ -319,7 +319,8 @@ class SamplingRequest:
         )
         if isinstance(value, tuple) and len(value) != count:
             raise UserError(
-                f"{shown}: lengths: {len(value)}, prompts: {count}. Give one length, or one per prompt"
+                f"{shown}: the number of lengths is {len(value)}, but the number of prompts is {count}. Use one "
+                "length, or one per prompt"
             )
         for length in value if isinstance(value, tuple) else (value,):
             if (
@@ -330,7 +331,7 @@ class SamplingRequest:
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self, varies: bool) -> None:
-        """Checks a request to edit a motion, or to vary all of it.
+        """Checks a request to edit part of a motion or, if `varies`, to vary the entire motion.
 
         Raises:
             UserError: If the request contains options that do not apply to edits or variations.
@@ -378,7 +379,7 @@ class SamplingRequest:
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
-        """Returns the length of each prompt in frames, not rounded; None = not stated."""
+        """Returns the requested length of each prompt in frames, not rounded; None if none is set."""
         value: Any = self.frames if self.seconds is None else self.seconds
         lengths = value if isinstance(value, tuple) else [value] * len(self.prompts)
         return [
@@ -399,12 +400,12 @@ def check_length(text: str) -> None:
     """Raises `UserError` if a text has too many characters."""
     if len(text) > MAX_TEXT_LENGTH:
         raise UserError(
-            f"{shortened(text, 60)}: {len(text):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
+            f"{shortened(text, 60)}: {len(text):,} characters are too many. Use at most {MAX_TEXT_LENGTH:,}"
         )
 
 
 def is_timed(parts: Sequence[Part]) -> bool:
-    """Returns whether a prompt has several parts, or states seconds."""
+    """Returns whether a prompt has several parts, or a part with a stated duration."""
     return len(parts) > 1 or parts[0][1] is not None
 
 
@@ -412,7 +413,7 @@ def read_parts(text: str) -> list[Part]:
     """Splits "walks @3 | sits down" into parts, [("walks", 3.0), ("sits down", None)].
 
     Raises:
-        UserError: If a part is empty, or its seconds are not a number above 0.
+        UserError: If a part is empty, or its duration is not a number of seconds above 0.
     """
     parts: list[Part] = []
     for part in text.split("|"):
@@ -428,7 +429,7 @@ def read_parts(text: str) -> list[Part]:
             )
         if not words.strip():
             raise UserError(
-                f"'{text}': part {len(parts) + 1} is empty. Say what happens in each: 'walks | sits'"
+                f"'{text}': part {len(parts) + 1} is empty. Say what happens in each part, as in 'walks | sits'"
             )
         parts.append((words.strip(), seconds))
     return parts
@@ -453,7 +454,7 @@ def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
         points = ()
     if not points:
         shown = shortened(one_line(str(path)[:500]), 60)
-        raise UserError(f"path={shown}: give waypoints as x,z in meters, such as 0,1 0.5,2")
+        raise UserError(f"path={shown}: expected waypoints as x,z in meters, such as 0,1 0.5,2")
     return points
 
 

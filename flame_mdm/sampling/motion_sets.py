@@ -42,7 +42,7 @@ from flame_mdm.visualize import contact_sheet, write_player
 from flame_mdm.visualize.body import Mesh
 
 SETS = Path(__file__).parent / "sets"
-# Suffix of the names of files without a path
+# Suffix of the names of files without a root trajectory
 IN_PLACE = "_InPlace"
 # Seconds that are inserted between clips while the rotations of all clips are computed
 SEPARATION = 1.0
@@ -117,14 +117,14 @@ def read_set(source: str) -> MotionSet:
     for name, motion in content.motions.items():
         if motion.kind == "turn" and not motion.degrees:
             raise UserError(
-                f"{path}: motions.{name} is a turn without degrees. Give degrees; 90 is to the left"
+                f"{path}: motions.{name} is a turn without degrees. Set degrees; 90 is a turn to the left"
             )
     _check_rig(content, f"{path}: rig: ")
     return content
 
 
 def changed(content: MotionSet, **values: Any) -> MotionSet:
-    """Returns a set with other values of `rig`, `format` or `fps`.
+    """Returns a set with other values for `rig`, `format` or `fps`.
 
     Raises:
         UserError: If a value is invalid.
@@ -275,7 +275,7 @@ def motion_of(clip: Clip) -> Motion:
 
 
 def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
-    """Returns clips in place on one skeleton, with one skin.
+    """Returns in-place clips on one skeleton, with one skin.
 
     The rotations of all clips are computed together. Programs apply all animations of a set to the
     skeleton of the first file, so all clips must have the same rest pose.
@@ -360,7 +360,7 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
 
 
 def closure(clip: RiggedClip) -> tuple[float, float]:
-    """Returns the differences between the first and the last pose of a clip in place.
+    """Returns the differences between the first and the last pose of an in-place clip.
 
     The first difference is a distance in meters, the second one an angle of local rotations in
     degrees.

@@ -30,7 +30,7 @@ def refuse_no_condition(model: MotionGenerator) -> None:
     )
     shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
     key = TRAINED_ON[model.conditioned_on][1]
-    raise UserError(f"say what to sample: {key}" + (f". Examples: {shown}" if shown else ""))
+    raise UserError(f"nothing to sample. Set {key}" + (f". Examples: {shown}" if shown else ""))
 
 
 def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:

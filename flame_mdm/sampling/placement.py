@@ -51,7 +51,7 @@ class Placement:
         return rotate_y(joints.double(), turn) + self.shift.view(-1, *ones, 3)
 
     def undo(self, points: Tensor) -> Tensor:
-        """Moves points (B, ..., 3) in the world back: the inverse of `apply`."""
+        """Moves points (B, ..., 3) from the world to body coordinates; the inverse of `apply`."""
         ones = (1,) * (points.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(points.shape[:-1])
         return rotate_y(points.double() - self.shift.view(-1, *ones, 3), -turn)

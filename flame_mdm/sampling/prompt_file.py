@@ -56,7 +56,7 @@ class PromptFile:
         }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
-        """Refuses prompts. `errors` contains their errors by position among the accepted prompts."""
+        """Refuses prompts. The keys of `errors` are their positions among the accepted prompts."""
         numbers = list(self.accepted)
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 
@@ -68,8 +68,10 @@ class PromptFile:
         if not isinstance(lengths, Sequence):
             return lengths
         if len(lengths) != len(self.lines):
-            counts = f"lengths: {len(lengths)}, prompts: {len(self.lines)}"
-            raise UserError(f"{key}={list(lengths)}: {counts}. Give one length, or one per prompt")
+            raise UserError(
+                f"{key}={list(lengths)}: the number of lengths is {len(lengths)}, but the number of prompts is "
+                f"{len(self.lines)}. Use one length, or one per prompt"
+            )
         return [
             length
             for number, length in zip(self.lines, lengths, strict=True)

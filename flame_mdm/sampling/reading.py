@@ -44,7 +44,7 @@ def read_motion(
         source: a motion file, or `dataset:id`, a clip of a prepared data set.
         fps, unit, up, animation: descriptions of the file, as in
             `flame_mdm.formats.readers.read`.
-        cut: begin and end in seconds of the part to use. Default: the entire motion.
+        cut: the part to use, as [begin, end] in seconds. Default: the entire motion.
         data_root: folder of the prepared data sets.
 
     Raises:
@@ -60,7 +60,7 @@ def read_motion(
         store = Store(Path(data_root) / f"{dataset}-{representation.name}")
         if (rate := store.info["fps"]) != representation.fps:
             raise UserError(
-                f"{store.folder}: prepared at {rate:g} fps, but the model has {representation.fps:g}"
+                f"{store.folder}: prepared at {rate:g} fps, but the model has {representation.fps:g} fps"
             )
         clips = {clip.id: clip for clip in store.clips}
         if clip_id not in clips:
@@ -71,7 +71,7 @@ def read_motion(
         motion = decoded(representation, torch.from_numpy(features), next(iter(captions), ""), name)
     else:
         raise UserError(
-            f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip"
+            f"{name}: not a motion. Use a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip"
         )
     return motion if cut is None else part_of(representation, motion, cut)
 
@@ -85,7 +85,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
         UserError: If [begin, end] is not a range of the motion.
     """
     if not is_range(cut):
-        raise UserError(f"cut={cut}: write [begin, end], in seconds")
+        raise UserError(f"cut={cut}: expected [begin, end], in seconds")
     begin, end = (round(second * representation.fps) for second in cut)
     if not 0 <= begin < end <= len(motion.features):
         seconds, name = len(motion.features) / representation.fps, motion.id or "the motion"
@@ -129,7 +129,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
 
 
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
-    """Returns the motion of features (F, D) in the data's units."""
+    """Decodes features (F, D), in the data's units, to a motion."""
     joints, fps, skeleton = (
         representation.decode(features).cpu().numpy(),
         representation.fps,

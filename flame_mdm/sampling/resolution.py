@@ -34,7 +34,7 @@ class ResolvedPrompt:
 
     Attributes:
         text: the prompt. A sentence with several actions becomes a sequence, "walks | sits".
-        is_split: whether the original prompt was such a sentence.
+        is_split: whether the original prompt was a sentence with several actions.
         conditions: caption or action of each part, for the model.
         texts: the words of the prompt that belong to each part.
         frames: number of frames of each part. In a continued motion, the first part includes the
@@ -163,7 +163,7 @@ def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[No
 
 
 def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks the conditions of all prompts: kind of condition, streams, and windows."""
+    """Checks what concerns all prompts: the kind of condition, streams, and windows."""
     if model.denoiser.context_frames:
         check_streams(model)
         if request.loop:
@@ -173,7 +173,7 @@ def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
         raise UserError(
-            f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}"
+            f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Use {instead}"
         )
     if request.loop or request.after is not None:
         _check_windows(model)
@@ -220,8 +220,8 @@ def _read(
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
     """Returns warnings about prompts.
 
-    They concern prompts that are sampled differently from their text, and words that are unknown or
-    not read.
+    A warning is about a difference between a text and what is sampled, or about words that the
+    model does not know or read.
     """
     lines = []
     for prompt in prompts:
@@ -241,11 +241,9 @@ def _continued(
 ) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
     """Returns the features (F, D) of the motion to continue, the edit, and the motion's notes.
 
-    The edit keeps the end of the motion.
-
-    The last frames are generated again, so that they connect to the new frames. A model that
-    continues frames reads these frames and needs no edit. The notes of a motion in memory are left
-    out, because they were already shown when the motion was read.
+    The edit keeps the end of the motion. The last frames are generated again so that they connect
+    to the new frames. A model that continues frames reads these frames and needs no edit. The notes
+    of a motion in memory are left out because they were already shown when the motion was read.
     """
     if request.after is None:
         return None, None, ()
@@ -260,7 +258,7 @@ def _continued(
     least = shared or model.denoiser.context_frames
     if len(before) < least:
         raise UserError(
-            f"after={motion.id}: {len(before)} frames are too short. Give at least {least}"
+            f"after={motion.id}: the motion has {len(before)} frames. Use a motion of at least {least} frames"
         )
     if not shared:
         return before, None, notes
@@ -276,7 +274,7 @@ def _targets(
         lengths = {sum(prompt.frames) for prompt in prompts}
         if len(lengths) > 1:
             raise UserError(
-                f"path={request.path}: motions of different lengths cannot share a path. Give one length"
+                f"path={request.path}: motions of different lengths cannot share a path. Use one length"
             )
         seconds = lengths.pop() / model.representation.fps
         return read_targets(model.representation, path_targets(read_path(request.path), seconds))

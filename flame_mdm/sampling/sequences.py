@@ -40,9 +40,9 @@ def part_frames(
     Args:
         model: the model that samples the motion.
         text: the prompt, for messages.
-        parts: its parts, with their seconds if the prompt states them.
-        usual: frames of a part that states no seconds, not rounded. Default: 3 seconds, or as many
-            frames as fit into one window.
+        parts: its parts, with their durations in seconds if the prompt states them.
+        usual: number of frames, not rounded, of a part without a stated duration. Default: 3
+            seconds, or as many frames as fit into one window if that is less.
         is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
         loop: whether the last frame leads to the first one.
 
@@ -56,11 +56,12 @@ def part_frames(
     length = min(round(3 * fps), longest) if usual is None else round(usual)
     shown = f"{length / fps:g} seconds ({length} frames)"
     if length < 2:
-        raise UserError(f"{shown} are too short: give at least {2 / fps:g} seconds")
+        raise UserError(f"{shown} are too short. Use at least {2 / fps:g} seconds")
     if length > longest:
         raise UserError(
             f"{shown} cannot be sampled: the model was trained on motions of up to {longest / fps:g} seconds. "
-            f"Overlapping windows make longer ones: write the seconds in the text, 'walks @{length / fps:g}'"
+            "To generate a longer motion in overlapping windows, state the seconds in the text: "
+            f"'walks @{length / fps:g}'"
         )
     return [length]
 
@@ -76,16 +77,16 @@ def _sequence_frames(
     for (name, _), length in zip(parts, lengths, strict=True):
         if length < 1:
             raise UserError(
-                f"'{name}': {length / fps:g} seconds are too short. Give at least {1 / fps:g}"
+                f"'{name}': {length / fps:g} seconds are too short. Use at least {1 / fps:g} seconds"
             )
         if length < shared:
-            short = f"a part of {length / fps:g} seconds is too short"
             raise UserError(
-                f"'{name}': {short}. Give at least {shared / fps:g}, as many as it shares with its neighbors"
+                f"'{name}': a part of {length / fps:g} seconds is too short. Use at least {shared / fps:g} seconds, "
+                "which neighboring windows share"
             )
     if sum(lengths) > MAX_SECONDS * fps:
         raise UserError(
-            f"'{text}': {sum(lengths) / fps:g} seconds are too long. Give at most {MAX_SECONDS}"
+            f"'{text}': {sum(lengths) / fps:g} seconds are too long. Use at most {MAX_SECONDS} seconds"
         )
     return lengths
 

@@ -140,7 +140,7 @@ class Stream(Iterator[Motion]):
         if frame < self.frames:
             now = self.frames / fps
             raise UserError(
-                f"at={at:g}: the stream is at {now:g} seconds already. Give a later time, or omit it"
+                f"at={at:g}: the stream is already at {now:g} seconds. Set at to a later time, or omit it"
             )
         condition = read_text(self._streams.model, text)
         self._streams.texts[condition] = text
@@ -157,7 +157,7 @@ class Stream(Iterator[Motion]):
                 waypoints. Empty = no waypoints.
 
         Raises:
-            UserError: If a waypoint is not two finite numbers, or the representation is not
+            UserError: If a waypoint is not two finite numbers or is too far away, or the representation is not
                 `HumanML`.
         """
         self._streams.lead(Route(waypoints))
@@ -168,11 +168,12 @@ class Stream(Iterator[Motion]):
         return list(self._streams.waypoints.reached)
 
     def go_back(self, at: float) -> None:
-        """Drops frames after a given time that were not used yet. The next block continues there.
+        """Drops the frames after a given time, so that the next block continues from there.
 
-        A new text is then visible at once, even if blocks were computed ahead. The result is the
-        same as if the text had been changed at that time. Later changes of the text are also
-        dropped. Waypoints that were reached later are ahead again.
+        Call it before the dropped frames are used. A new text is then visible at once, even if
+        blocks were computed ahead. The result is the same as if the text had been changed at that
+        time. Changes of the text after that time are also dropped, and waypoints that were reached
+        after it are ahead again.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
@@ -282,7 +283,7 @@ class Schedule:
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames from a frame to the next change; None without a change."""
+        """Returns the number of frames from a frame to the next change; None if no change follows."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 
@@ -332,7 +333,7 @@ class Streams(Iterator[list[Motion]]):
         self.block = longest if block is None else block
         if type(self.block) is not int or not 1 <= self.block <= longest:
             raise UserError(
-                f"block={block}: this model predicts {longest} frames at once. Give 1 to {longest}"
+                f"block={block}: this model predicts {longest} frames at once. Use 1 to {longest} frames"
             )
         options = options.over(model.sampler_options)
         model.process.find_sampler(options)
@@ -372,7 +373,7 @@ class Streams(Iterator[list[Motion]]):
         if waypoints.points and not isinstance(representation, HumanML):
             raise UserError(
                 f"representation {representation.name} has no column for the turn of the root, "
-                "which waypoints need. Use humanml3d"
+                "which waypoints need. Use a model with humanml3d features"
             )
         self.waypoints = waypoints
 
@@ -389,7 +390,7 @@ class Streams(Iterator[list[Motion]]):
         blocks = [block for block in self._past if block.begin < frame]
         if not blocks or frame > self.frames[0]:
             raise UserError(
-                f"frame {frame} is not in the last {HELD} blocks, which end at {self.frames[0]}. Give a later time"
+                f"frame {frame} is not in the last {HELD} blocks, which end at frame {self.frames[0]}. Use a later time"
             )
         self._past = deque(blocks, maxlen=HELD)
         block = blocks[-1]
@@ -481,7 +482,7 @@ class Streams(Iterator[list[Motion]]):
         return cond, edit
 
     def _led(self) -> Edit | None:
-        """Returns the edit that leads the next block to the waypoints; None without waypoints."""
+        """Returns the edit that leads the next block to the waypoints; None if there are no waypoints."""
         representation, points = self.model.representation, self.waypoints.left
         if not points or not isinstance(representation, HumanML):
             return None
@@ -554,12 +555,13 @@ def check_streams(model: MotionGenerator) -> None:
     """Raises `UserError` if a model cannot stream."""
     if not model.denoiser.context_frames:
         raise UserError(
-            "this model does not continue frames, so it has no streams. Train one, such as bandai/dip"
+            "this model does not continue frames, so it cannot stream. Train a model that does, such as bandai/dip"
         )
     if not model.representation.relative:
         name = model.representation.name
         raise UserError(
-            f"representation {name} has positions in the world, which a stream would leave. Use humanml3d"
+            f"representation {name} has positions in the world, which a stream would leave. Use a "
+            "model with humanml3d features"
         )
 
 
@@ -574,7 +576,7 @@ def read_text(model: MotionGenerator, text: str) -> str:
     """
     if not isinstance(text, str) or not text.strip():
         raise UserError(
-            f"text={text!r}: give a text that says what happens, such as 'a person walks'"
+            f"text={text!r}: the text is empty. Say what happens, as in 'a person walks'"
         )
     check_length(text)
     if model.conditioned_on != "text":
@@ -604,7 +606,7 @@ def starting_point(
     if len(motion.features) < context:
         name = motion.id or "the motion"
         raise UserError(
-            f"start={name}: {len(motion.features)} frames are too short. Give at least {context}"
+            f"start={name}: the motion has {len(motion.features)} frames. Use a motion of at least {context} frames"
         )
     features = torch.from_numpy(motion.features[-context:]).to(model.device)
     last = torch.from_numpy(motion.joints[-1:]).to(model.device)

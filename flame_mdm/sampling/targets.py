@@ -24,8 +24,8 @@ from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 SMOOTHNESS = 0.2
 # Maximum speed, in meters per second, that waypoints may require
 MAX_SPEED = 8.0
-# Maximum height of a joint above the floor, and maximum distance from the body's position on the
-# floor, in meters
+# Maximum height of a joint above the floor, and maximum horizontal distance of a joint from the
+# body, in meters
 REACH = 2.5
 # Maximum number of coordinates; every step solves for all of them together
 MAX_COORDINATES = 600
@@ -55,7 +55,7 @@ class JointTarget(Timed):
 
 
 class PoseTarget(Timed):
-    """A frame of a motion, at a given position or anywhere. `heading` is in degrees."""
+    """A pose from a frame of a motion file, at a given position or anywhere. `heading` is in degrees."""
 
     position: OnFloor | None = None
     file: str
@@ -126,7 +126,7 @@ class Targets:
         if last >= frames:
             raise UserError(
                 f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
-                f"{(frames - 1) / fps:g} seconds. Give an earlier time, or more seconds"
+                f"{(frames - 1) / fps:g} seconds. Use an earlier time, or a longer motion"
             )
 
     def window(self, begin: int, frames: int, here: Sequence[float]) -> "Targets":
@@ -205,7 +205,7 @@ class Targets:
 
 
 def errors(motion: Motion, targets: Targets) -> np.ndarray:
-    """Returns the distance in meters of a motion from each target position.
+    """Returns the distance in meters between a motion and each target position.
 
     Free coordinates are ignored.
     """
@@ -259,7 +259,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
     numbers, axes = np.nonzero(~np.isnan(positions))
     if len(numbers) > MAX_COORDINATES:
         raise UserError(
-            f"{name}: {len(numbers)} coordinates are too many. Give at most {MAX_COORDINATES}"
+            f"{name}: {len(numbers)} coordinates are too many. Use at most {MAX_COORDINATES}"
         )
     frames, joints = (
         np.array([(goal.frame, goal.joint) for goal in goals], dtype=int).reshape(-1, 2)[numbers].T
@@ -298,14 +298,14 @@ def _check_reach(goals: list[Goal], fps: float) -> None:
         height, floor = goal.position[1], goal.position[[0, 2]]
         if not (np.isnan(height) or -0.1 <= height <= REACH):
             raise UserError(
-                f"{goal.source}: height {height:g} m is impossible. Give 0 to {REACH:g} m above the floor"
+                f"{goal.source}: a height of {height:g} m is out of reach. Use 0 to {REACH:g} m above the floor"
             )
         if np.isnan(floor).any():
             continue
         distance, seconds = float(np.linalg.norm(floor - start)), (goal.frame - begin) / fps
         if distance > MAX_SPEED * seconds + REACH:
             raise UserError(
-                f"{goal.source}: {distance:.1f} m from {before} in {seconds:g} seconds is impossible. Give more time, "
+                f"{goal.source}: {distance:.1f} m from {before} in {seconds:g} seconds is too far. Use a later time "
                 "or a nearer position"
             )
         before, start, begin = goal.source, floor, goal.frame

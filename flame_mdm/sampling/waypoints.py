@@ -27,8 +27,8 @@ NEAR = 0.3
 FASTEST = 1.3
 # Minimum radius of a bend in meters. It keeps a standing person from turning.
 TIGHTEST = 0.7
-# Size of the circle within which waypoints are too near, relative to the narrowest circle that
-# the person can walk. With 1, a runner would circle around a waypoint, because a bend begins
+# Radius of the circle within which waypoints are too near, relative to the smallest circle that
+# the person can walk. With 1, a runner would circle around a waypoint because a bend begins
 # slowly.
 ROOM = 1.2
 PATIENCE = 0.4  # time constant in seconds with which deviations disappear
@@ -147,10 +147,11 @@ class Route:
 
     Attributes:
         points: all waypoints in order.
-        reached: numbers of the frames of the stream in which the first waypoints were reached.
+        reached: for each waypoint that was reached, the number of the stream's frame in which it was
+            reached.
 
     Raises:
-        UserError: If a point is not two finite numbers, or is too far away.
+        UserError: If a point is not two numbers from -`FARTHEST` to `FARTHEST`.
     """
 
     def __init__(self, points: Sequence[Sequence[float]] = ()):
@@ -158,7 +159,7 @@ class Route:
             numbers = [x for x in point if isinstance(x, float | int) and not isinstance(x, bool)]
             if len(point) != 2 or len(numbers) != 2 or not all(abs(x) <= FARTHEST for x in numbers):
                 raise UserError(
-                    f"waypoint {point}: give x and z in meters, within {FARTHEST:g} of the start"
+                    f"waypoint {point}: expected x and z in meters, each from {-FARTHEST:,.0f} to {FARTHEST:,.0f}"
                 )
         self.points: list[Point] = [(float(x), float(z)) for x, z in points]
         self.reached: list[int] = []
@@ -169,7 +170,7 @@ class Route:
         return self.points[len(self.reached) :]
 
     def follow(self, begin: int, roots: np.ndarray) -> None:
-        """Records which waypoints the root (F, 3) reaches; its first frame has the number `begin`."""
+        """Records which waypoints the root (F, 3) reaches; `begin` is the number of its first frame."""
         for frame, (x, _, z) in enumerate(roots, begin):
             while self.left and math.dist(self.left[0], (x, z)) < NEAR:
                 self.reached.append(frame)

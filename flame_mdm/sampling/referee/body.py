@@ -15,12 +15,12 @@ RATE = 30.0
 SMOOTHING = 0.05
 # Length of the legs from hip to ankle, in meters, to which bodies are scaled
 LEG = 0.8
-# Seconds around a frame in which the lowest foot is on the floor; a jump is shorter
+# Seconds around a frame within which the lowest foot must touch the floor; a jump is shorter
 FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the left and the right joint of a name: "wrist" stands for left_wrist and right_wrist."""
+    """Returns the left and the right joint for a name: "wrist" stands for left_wrist and right_wrist."""
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 
@@ -48,7 +48,7 @@ class Body:
         joints = np.asarray(joints, np.float64)
         if joints.ndim != 3 or joints.shape[1:] != (22, 3) or not len(joints):
             raise UserError(
-                f"joints have shape {joints.shape}. The referee needs (frames, 22, 3), SMPL's joints"
+                f"joints have shape {joints.shape}. The referee needs SMPL's joints, (frames, 22, 3)"
             )
         if not np.isfinite(joints).all():
             raise UserError("joints contain NaN or infinity. Did the model diverge?")

@@ -23,15 +23,15 @@ class Claim:
     Attributes:
         kind: what is claimed, a key of `flame_mdm.sampling.referee.kinds.KINDS`.
         words: the part of the sentence that states the claim.
-        side: "left", "right" or "both" limbs; "" = any.
+        side: "left", "right" or "both", the side of the limbs; "" = any side.
         direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" =
-            any.
-        speed: "slow" or "fast"; "" = any.
+            any direction.
+        speed: "slow" or "fast"; "" = any speed.
         amount: number of repetitions or steps, or angle of a turn in degrees; None = not stated.
         when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
             time.
         seconds: claimed duration; None = not stated.
-        parts: the two claims of an order, the earlier one first.
+        parts: for an order, its two claims, the earlier one first.
     """
 
     kind: str

@@ -19,7 +19,7 @@ from flame_mdm.sampling.referee.sentences import read_claims
 Answer = Literal["yes", "no", "cannot tell"]
 # Minimum duration of a motion that is judged, in seconds
 SHORTEST = 0.4
-# Seconds at the start and at the end of a motion in which a posture is measured
+# Seconds at the start and at the end of a motion in which its posture there is measured
 END = 0.6
 # Seconds for which the posture must be held in this time
 HELD = 0.2
@@ -123,7 +123,7 @@ def judge(
 
     Raises:
         UserError: If the motion has another skeleton, is shorter than 0.4 seconds, or is not
-            finite. Also if there is no text, or if joints are given without `fps`.
+            finite; if there is no text; or if joints are passed without `fps`.
     """
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
@@ -135,18 +135,18 @@ def judge(
     else:
         joints = motion
     if fps is None:
-        raise UserError("fps is missing: joints have no frame rate. Give fps=20 or another rate")
+        raise UserError("fps is missing: joints have no frame rate. Pass it, for example fps=20")
     if not text or not text.strip():
         raise UserError(
-            "text is missing: the motion has none. Give the sentence by which to judge it"
+            "text is missing: the motion has none. Pass the sentence to judge the motion by"
         )
     return Judgment(text, tuple(verdicts(joints, fps, read_claims(text))))
 
 
 def try_judge(motion: Motion) -> Judgment | None:
-    """Returns the judgment of a motion by its own text.
+    """Judges a motion by its own text.
 
-    Returns None if the motion cannot be judged, or its text has no claim.
+    Returns None if the motion cannot be judged, or if its text has no claim.
     """
     is_long = len(motion.joints) > (SHORTEST + 0.1) * motion.fps
     if motion.skeleton != SMPL22 or not motion.text.strip() or not is_long:
@@ -165,9 +165,9 @@ def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
 
 
 def claim_score(motions: Sequence[Motion]) -> list[float]:
-    """Returns the number of true claims minus the number of false claims of each motion's own text.
+    """Returns, for each motion, the number of true claims minus the number of false claims.
 
-    The score of a text without claims is 0.
+    The claims are read from the motion's own text. The score of a text without claims is 0.
     """
     judged = [try_judge(motion) for motion in motions]
     return [0.0 if one is None else float(2 * one.true - one.decided) for one in judged]
@@ -205,10 +205,10 @@ def decide(body: Body, claim: Claim) -> Verdict:
 
 
 def _order(body: Body, claim: Claim) -> Reading:
-    """Measures how many seconds the second part of an order begins after the first part.
+    """Measures how many seconds after the first part of an order the second part begins.
 
     If a part happens several times, the pair of times with the largest difference counts. An order
-    is undecided if a part is not true, or if the reverse order also happens.
+    is undecided if one of its parts is not answered with "yes", or if the reverse order also happens.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]
@@ -227,9 +227,9 @@ def _order(body: Body, claim: Claim) -> Reading:
 def _at_an_end(body: Body, claim: Claim) -> Reading:
     """Measures a claim at the start or at the end.
 
-    Postures and contacts are measured in `END` seconds, movements in half the motion. The claim
-    is unclear if the other end shows the same posture or movement. Standing is an exception, because
-    it is usual at both ends.
+    Postures and contacts are measured in the first or last `END` seconds, and movements in the
+    first or second half of the motion. The claim is unclear if the other end shows the same posture
+    or movement. Standing is an exception because it is usual at both ends.
     """
     kind = KINDS[claim.kind]
     reading = kind.measure(body, replace(claim, when=""))
@@ -253,8 +253,8 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 def _duration(body: Body, claim: Claim) -> Reading:
     """Measures how long a claim is true, with interruptions of at most `BREAK` seconds.
 
-    The score is the negative absolute binary logarithm of the ratio between measured and claimed
-    seconds. It is undecided if the claim without its duration is not true.
+    The score is -|log2(measured / claimed)|. The claim is undecided if it is not true without its
+    duration.
     """
     verdict = decide(body, replace(claim, seconds=None))
     reading = verdict.reading

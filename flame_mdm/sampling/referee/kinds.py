@@ -33,7 +33,8 @@ GROUPS = (
     "end",
 )
 ORDER = "order"
-DURATION = (-0.7, -0.4)  # a duration is off by at least 0.7 doublings: false; by at most 0.4: true
+# In binary logarithms: a duration that is off by at least 0.7 is false, by at most 0.4 true
+DURATION = (-0.7, -0.4)
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ def group_of(claim: Claim) -> str:
 
 
 def threshold_key(claim: Claim) -> str:
-    """Returns the name of the thresholds of a claim.
+    """Returns the name of the thresholds for a claim.
 
     The name consists of the kind and the stated speed. Without a speed, it states whether the claim
     has a side or a direction.
@@ -164,7 +165,7 @@ def thresholds() -> dict[str, Any]:
 def band(claim: Claim) -> tuple[float, float]:
     """Returns two scores: a claim is false up to the first one, and true from the second one on.
 
-    A claim about a start or an end has the same band as the kind at any time.
+    A claim about a start or an end has the same band as a claim of the same kind about any time.
     """
     if claim.seconds is not None:
         return DURATION

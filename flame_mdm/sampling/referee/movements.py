@@ -35,7 +35,7 @@ SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backwa
 
 
 def travel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled in a direction relative to the body; default: any direction."""
+    """Measures the distance traveled in the claimed direction, relative to the body, or in any direction."""
     speed = body.speed
     if claim.direction:
         toward = body.velocity @ np.array(SEEN[claim.direction])
@@ -81,7 +81,7 @@ def turn(body: Body, claim: Claim) -> Reading:
     """Measures the largest turn in degrees, in the claimed direction if there is one.
 
     With a claimed direction, the reading is unclear if the largest turn in the other direction
-    exceeds 60 % of the turn.
+    exceeds 60 % of the turn in the claimed direction.
     """
     left, right = _turn(body.yaw, "left"), _turn(-body.yaw, "right")
     if not claim.direction:
@@ -166,7 +166,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures how much slower the travel is in the last 0.3 seconds than at its fastest, as a fraction."""
+    """Measures how much slower the body travels in the last 0.3 seconds than at its fastest, as a fraction."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan
@@ -231,7 +231,7 @@ def count_jacks(body: Body, claim: Claim) -> Reading:
 
 
 def jacks(body: Body, claim: Claim) -> Reading:
-    """Measures the height of both hands above the shoulders while the feet are apart."""
+    """Measures the height of the hands above the shoulders while the feet are apart."""
     apart = np.linalg.norm(
         (body.joints[:, ANKLES[0]] - body.joints[:, ANKLES[1]])[:, [0, 2]], axis=-1
     )
@@ -283,7 +283,7 @@ def count_raises(body: Body, claim: Claim) -> Reading:
 
 
 def count_spins(body: Body, claim: Claim) -> Reading:
-    """Counts the full turns of the largest turn, in either direction."""
+    """Counts the full turns in the largest rotation of the body, in either direction."""
     reading = turn(body, claim)
     turns = reading.number / 360
     claimed = claim.amount or 1

@@ -126,7 +126,7 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 
 
 def return_pose(body: Body, claim: Claim) -> Reading:
-    """Measures how far a joint moves between start and end, in body coordinates.
+    """Measures the distance of each joint between the first and the last pose, in body coordinates.
 
     The joint with the largest distance counts.
     """
@@ -151,7 +151,7 @@ def return_place(body: Body, claim: Claim) -> Reading:
 
 
 def last_part(body: Body) -> tuple[float, float]:
-    """Returns the first and last second of the final part of a motion."""
+    """Returns the times in seconds at which the final part of a motion begins and ends."""
     return max(0.0, body.seconds - 0.3), body.seconds
 
 

@@ -22,7 +22,7 @@ class Reading:
             claim. NaN = undecided.
         number, unit: the measured value, in a readable unit.
         joint: joint or part of the body.
-        spans: first and last second of each time span in which the claim is true, or nearly true.
+        spans: begin and end in seconds of each time span in which the claim is true, or nearly true.
         unclear: reason why a high score does not make the claim true; "" = none.
         signal: values (F,) that show for each frame whether the claim is true; None if single
             frames do not show it.
@@ -41,9 +41,9 @@ class Reading:
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
-    """Returns the first and last second of each run of true frames (F,).
+    """Returns the begin and the end, in seconds, of each run of true frames (F,).
 
-    Runs shorter than `shortest` are left out.
+    Runs shorter than `shortest` seconds are left out.
     """
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0])).reshape(-1, 2)
     return tuple(
@@ -62,7 +62,7 @@ def held(signal: np.ndarray, seconds: float) -> float:
 def existence(
     signal: np.ndarray, unit: str, joint: str, seconds: float = 0.1, share: float = 0.5
 ) -> Reading:
-    """Returns a reading of the value that a signal (F,) reaches for `seconds`.
+    """Returns a reading of the value that a signal (F,) reaches for `seconds` seconds.
 
     The spans are the frames above a level. The level lies between the median and the highest value,
     at the fraction `share`. For a short signal, the lowest value replaces the median.

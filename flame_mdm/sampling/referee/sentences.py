@@ -172,13 +172,13 @@ def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
     return [replace(claim, when=when) for claim in claims]
 
 
-def _has(text: str, words: str) -> bool:
-    """Returns whether a clause contains words of the entry `ends` in `sentences.yaml`."""
-    return re.search(rf"\b(?:{_content()['ends'][words]})\b", text) is not None
+def _has(text: str, key: str) -> bool:
+    """Returns whether a clause matches the pattern `key` under `ends` in `sentences.yaml`."""
+    return re.search(rf"\b(?:{_content()['ends'][key]})\b", text) is not None
 
 
 def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims of a clause with its duration, as in "stands still for three seconds"."""
+    """Adds the duration that a clause states to its claims, as in "stands still for three seconds"."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)
@@ -190,7 +190,7 @@ def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
 
 
 def _claims(pattern: Pattern, text: str) -> list[Claim]:
-    """Returns the claims of a pattern that matches a clause."""
+    """Returns the claims that a matching pattern reads from a clause."""
     claim = Claim(pattern.kind, text)
     side = _side(text, "legs" if "side of a leg" in " ".join(pattern.take) else "hands")
     if any("side of a" in take for take in pattern.take):
@@ -215,7 +215,7 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
 
 
 def _further(take: str, claim: Claim, text: str) -> list[Claim]:
-    """Returns further claims of a clause, in addition to the claim of its pattern."""
+    """Returns the additional claims of a clause, besides the claim of its pattern."""
     if take == "travel" or take == "jumped":
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"
@@ -232,7 +232,7 @@ def _further(take: str, claim: Claim, text: str) -> list[Claim]:
 
 
 def _turns(claim: Claim, text: str) -> list[Claim]:
-    """Returns the claims of a turn: its existence, its direction and its angle."""
+    """Returns the claims about a turn: its existence, its direction and its angle."""
     direction = _way(text) or ""
     angle = re.search(r"\b(45|90|180|270|360)\b", text)
     claims = [replace(claim, direction=direction)]
@@ -266,7 +266,7 @@ def _way(text: str) -> str | None:
 def _direction(text: str) -> str:
     """Returns forward or backward as a direction of travel.
 
-    Returns "" if there is no direction, if there are both, or if it is diagonal.
+    Returns "" if no direction is stated, if both are stated, or if the direction is diagonal.
     """
     if re.search(r"\b(?:diagonal|diagonally|sideways|backandforth|zig ?zag)\b", text):
         return ""
@@ -300,7 +300,7 @@ def _side(text: str, limb: str) -> str | None:
 
 
 def _amount(text: str, kind: str) -> int | None:
-    """Returns the number of repetitions that a clause states for a kind; None = not stated."""
+    """Returns the number of repetitions that a clause states for a kind; None if it states none."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     nouns = COUNT_NOUNS[kind]
@@ -372,7 +372,7 @@ def _content() -> dict[str, Any]:
 
 @cache
 def _sided_words() -> str:
-    """Returns a pattern with the words that have a side, as in "left hand"."""
+    """Returns a pattern of words that can have a side, as in "left hand"."""
     return "|".join(phrases()["sides_of"].split())
 
 

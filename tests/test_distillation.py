@@ -205,7 +205,7 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
         UserError, match="guidance_scale=2: the guidance is built into this distilled model"
     ):
         flame_mdm.generate(model, guidance_scale=2, **text)
-    with pytest.raises(UserError, match="needs a text"):
+    with pytest.raises(UserError, match="Pass a text"):
         flame_mdm.generate(model)
 
 

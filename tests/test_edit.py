@@ -257,11 +257,11 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
             {"region": [5, 5]},
             r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec",
         ),
-        (diffusion, {"region": [[1, 2], 3]}, r"write \[begin, end\], or sev"),
+        (diffusion, {"region": [[1, 2], 3]}, r"expected \[begin, end\], or sev"),
         (
             diffusion,
             {"region": [1, 2], "region_seconds": [1, 2]},
-            "give region or region_seconds, not both",
+            "region and region_seconds exclude each other",
         ),
         (
             diffusion,
@@ -284,7 +284,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
             "method=repaint is unknown. Use mdm, flame, flame_code",
         ),
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
-        (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion: omit seconds"),
+        (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion. Omit seconds"),
         (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),
         (
             diffusion,
@@ -294,11 +294,11 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
         (
             diffusion,
             {"strength": 0.5, "texts": "walks @1.5 | jumps @1"},
-            "not as long .*, which has 2 seconds",
+            "not as long .*, which lasts 2 seconds",
         ),
         (diffusion, {"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
         *(
-            (diffusion, {"strength": value}, "strength=.*: give a number above 0, up to 1")
+            (diffusion, {"strength": value}, "strength=.*: expected a number above 0 and at most 1")
             for value in (0.0, np.nan)
         ),
         (
@@ -309,7 +309,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
         (
             short,
             suffix,
-            r"walk: 40 frames, but .* at most 36 \(1.8 seconds\): select a part with cut=",
+            r"walk: 40 frames, but .* at most 36 \(1.8 seconds\)\. Select a part with cut=",
         ),
     ]
     for model, options, message in cases:
@@ -339,7 +339,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, su
         ),
         (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
         ("kit:1", {}, "no prepared data set"),
-        ("walk", {}, r"Give a \.npz, \.bvh, .* file, or dataset:id"),
+        ("walk", {}, r"Use a \.npz, \.bvh, .* file, or dataset:id"),
         (CLIP[:-2] + "3", {}, r"has no clip .*\. Did you mean synthetic_0_000003"),
         (CLIP, {"cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
     ]

@@ -78,7 +78,7 @@ def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were
 def test_a_text_that_is_refused_leaves_the_stream_as_it_was(model):
     live = LiveStreams(model)
     name = live.block("", WALK, 0)["stream"]
-    with pytest.raises(UserError, match="give a text that says what happens"):
+    with pytest.raises(UserError, match="expected a text that says what happens"):
         live.block(name, " ", 20)
     assert live.block(name, WALK, 30)["from"] == 30
 
@@ -118,7 +118,7 @@ def test_a_block_leads_along_waypoints_and_says_when_they_are_reached(model):
     assert block["reached"] == [30]
     assert live.block(name, WALK, 60, [(50.0, 50.0)])["reached"] == []
     assert live.block(name, WALK, 45, [root(block, 14)])["reached"] == [45]
-    with pytest.raises(UserError, match="give x and z in meters"):
+    with pytest.raises(UserError, match="expected x and z in meters"):
         live.block(name, WALK, 75, [(float("nan"), 0.0)])
     assert live.block(name, WALK, 75)["from"] == 75
 

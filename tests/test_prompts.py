@@ -102,7 +102,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
         (
             b"walks\njumps",
             ["seconds=[1,2,3]"],
-            "seconds=[1, 2, 3]: lengths: 3, prompts: 2. Give one length, or one",
+            "seconds=[1, 2, 3]: the number of lengths is 3, but the number of prompts is 2",
         ),
         (
             b"walks | | sits\n\n" + b"a" * 3000,
@@ -171,8 +171,8 @@ def test_each_prompt_has_a_length_of_its_own(trained, subtests):
         motions[2].joints, flame_mdm.generate(model, PROMPTS[1], **numpy)[0].joints, atol=1e-4
     )
     for seconds, message in (
-        ([1, 2], r"seconds=\[1, 2\]: lengths: 2, prompts: 1\. Give one length, or one per prompt"),
-        ([], "lengths: 0, prompts: 1"),
+        ([1, 2], r"seconds=\[1, 2\]: the number of lengths is 2, but the number of prompts is 1\. Use one length, or one per prompt"),
+        ([], "lengths is 0, but the number of prompts is 1"),
         *(
             (value, "is not a valid length")
             for value in ([[1]], ["x"], [float("nan")], 10**400, "3")

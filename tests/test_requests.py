@@ -179,11 +179,11 @@ def test_a_faultless_candidate_is_kept_even_if_a_faulty_one_has_a_higher_score()
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"candidates": 0}, "candidates=0: give 1 to"),
+        ({"candidates": 0}, "candidates=0: expected a whole number from 1 to"),
         ({"candidates": 2, "stages": []}, "single motion"),
         (
             {"samples": 5_000, "candidates": 3},
-            "samples times candidates=15000 of each text: at most 10,000 motions",
+            "samples times candidates=15000 for each text: a request may have at most 10,000 motions",
         ),
     ],
     ids=str,
@@ -240,7 +240,7 @@ def test_edit_takes_a_part_of_any_motion(model, tmp_path, subtests):
     for source, file_options in sources:
         with subtests.test(source=type(source).__name__):
             with pytest.raises(
-                UserError, match=r"at most 60 \(3 seconds\): select a part with cut=\[begin, end\]"
+                UserError, match=r"at most 60 \(3 seconds\)\. Select a part with cut=\[begin, end\]"
             ):
                 flame_mdm.edit(model, source, TEXT, **options, **file_options)
             edited = flame_mdm.edit(model, source, TEXT, cut=[1, 2.5], **options, **file_options)[0]

@@ -150,14 +150,14 @@ def test_bad_requests_give_one_clear_line(model, subtests):
             {"after": "walk.npz", "targets": "path.json"},
             r"^after=walk\.npz: .* cannot have targets\.",
         ),
-        ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Give a \.npz"),
-        ("walks", {"seed": 0.5}, "seed=0.5: give a whole number"),
-        ("walks", {"actions": "walk"}, "texts or actions, not both"),
+        ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Use a \.npz"),
+        ("walks", {"seed": 0.5}, "seed=0.5: expected a whole number"),
+        ("walks", {"actions": "walk"}, "texts and actions exclude each other"),
         ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),
         (None, {"actions": "walk"}, "action=walk: this model was trained on captions"),
         (" ", {}, "empty text"),
         ([], {}, "empty text"),  # is not an unconditioned motion
-        (["walk", 3], {}, r"^text=3 is not a string\. Give a string"),
+        (["walk", 3], {}, r"^text=3 is not a string\. Pass a string"),
     ]
     for text, options, message in cases:
         with subtests.test(message=message), one_line_error(message):
@@ -238,7 +238,7 @@ def test_bad_targets_give_one_clear_line(model, tmp_path, subtests):
         ({"root": [{"time": 1, "position": [1]}]}, r"root.0.position is \[1\], not a longer list"),
         (
             {"root": [{"time": 1, "position": [0, 30]}]},
-            "30.0 m from the start in 1 seconds is impossible",
+            "30.0 m from the start in 1 seconds is too far",
         ),
         (
             {"root": [{"time": 9, "position": [0, 1]}]},
@@ -250,7 +250,7 @@ def test_bad_targets_give_one_clear_line(model, tmp_path, subtests):
         ),
         (
             {"joints": [{"time": 1, "joint": "head", "position": [0, 9, 0]}]},
-            "height 9 m is impossible",
+            "height of 9 m is out of reach",
         ),
         ({"poses": [{"time": 1, "file": "no.npz"}]}, "no.npz"),
         ("{", r"t.json: .*; see docs/targets.md"),
@@ -270,10 +270,10 @@ def test_the_command_prints_the_distance_and_bad_words_are_one_line(
     assert "distance from the targets: mean " in capsys.readouterr().out
     (tmp_path / "t.json").write_text("{}")
     for options, message in (
-        ([], "say what to sample: text="),
+        ([], "nothing to sample. Set text="),
         (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),
-        (["text=walks", "path=0,1 2"], "path=0,1 2: give waypoints as x,z in meters"),
-        (["text=walks", "path=0,1", "targets=t.json"], "targets cannot be given with a path"),
+        (["text=walks", "path=0,1 2"], "path=0,1 2: expected waypoints as x,z in meters"),
+        (["text=walks", "path=0,1", "targets=t.json"], "path and targets exclude each other"),
     ):
         with subtests.test(options=options, message=message):
             assert message in error_of(capsys, "sample", "quickstart", *options)

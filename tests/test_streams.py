@@ -232,7 +232,7 @@ def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
     assert [len(block.joints) for block in blocks] == [30, 15, 25, 30]
     assert np.array_equal(joints(islice(early, 4)), joints(blocks))
     with pytest.raises(
-        UserError, match=r"at=1: the stream is at 5 seconds already\. Give a later time"
+        UserError, match=r"at=1: the stream is already at 5 seconds\. Set at to a later time"
     ):
         late.change("a person jumps", at=1)
 
@@ -251,7 +251,7 @@ def test_frames_that_were_not_used_can_be_replaced(model, subtests):
     for at in (0, 30):
         with (
             subtests.test(at=at),
-            pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at 135\."),
+            pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at frame 135\."),
         ):
             late.go_back(at)
     with pytest.raises(
@@ -410,29 +410,29 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
     for call, message in (
         (
             lambda: stream(ordinary, "a person walks"),
-            "does not continue frames, so it has no streams",
+            "does not continue frames, so it cannot stream",
         ),
         (
             lambda: stream(model, "a person walks", short),
-            "start=short: 4 frames are too short. Give at least 10",
+            "start=short: the motion has 4 frames. Use a motion of at least 10 frames",
         ),
         (lambda: stream(model, "a person walks", "nowhere.bvh"), "nowhere.bvh"),
         (
             lambda: stream(model, "a person walks", block=31),
             "block=31: this model predicts 30 frames at once",
         ),
-        (lambda: stream(model, " "), "give a text that says what happens"),
+        (lambda: stream(model, " "), "expected a text that says what happens"),
         (
             lambda: generate(model, "a person walks", loop=True),
             "loop=true: this model continues frames",
         ),
         (
             lambda: generate(model, "a person walks", stages=[]),
-            "trajectory: this model continues frames",
+            "trajectory: not supported by models that continue frames",
         ),
         (
             lambda: generate(model, "a person walks", after=short),
-            "after=short: 4 frames are too short",
+            "after=short: the motion has 4 frames",
         ),
         (
             lambda: edit(model, walk, region="in_between"),
@@ -440,7 +440,7 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
         ),
         (
             lambda: generate(model, "a person walks", seconds=601),
-            "601 seconds are too long. Give at most 600",
+            "601 seconds are too long. Use at most 600",
         ),
         (lambda: generate(model, "a person walks", seconds=0), "0 seconds are too short"),
     ):
@@ -541,7 +541,7 @@ def test_waypoints_change_later_blocks_alone_and_are_ahead_again_after_going_bac
 )
 def test_waypoints_are_two_numbers(walking, point):
     running = stream(walking, "a person walks")
-    with pytest.raises(UserError, match=r"waypoint .*: give x and z in meters"):
+    with pytest.raises(UserError, match=r"waypoint .*: expected x and z in meters"):
         running.lead([point])
 
 

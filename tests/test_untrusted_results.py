@@ -171,7 +171,7 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
         f"text={'a person walks ' * 66_667}",
         says=" characters are too many",
     )
-    with pytest.raises(UserError, match=r"samples=2 of each text: at most 10,000 motions"):
+    with pytest.raises(UserError, match=r"samples=2 for each text: a request may have at most 10,000 motions"):
         flame_mdm.generate(
             flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2
         )

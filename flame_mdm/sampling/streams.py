@@ -576,7 +576,7 @@ def read_text(model: MotionGenerator, text: str) -> str:
     """
     if not isinstance(text, str) or not text.strip():
         raise UserError(
-            f"text={text!r}: the text is empty. Say what happens, as in 'a person walks'"
+            f"text={text!r}: expected a text that says what happens, such as 'a person walks'"
         )
     check_length(text)
     if model.conditioned_on != "text":

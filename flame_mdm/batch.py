@@ -191,8 +191,8 @@ class Edit:
         guide: for "x0", a goal that is imposed on the clean estimate at each step, before the kept
             part overwrites it. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
-            with the noise of the first of these steps (SDEdit). MDM's code gives the number of
-            skipped steps instead: of N steps, `skip_timesteps` = (1 - strength) N. None: sampling
+            with the noise of the first of these steps (SDEdit). MDM's code sets the number of
+            skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. None: sampling
             starts from pure noise.
 
     Example:
@@ -212,9 +212,9 @@ class Edit:
     guide: Guide | None = None
 
     def impose(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D) with the kept features replaced by the known ones.
+        """Returns the clean estimate (B, F, D) with the kept features replaced by the known features.
 
-        This is mode "x0".
+        This implements mode "x0".
         """
         x0_hat = x0_hat if self.guide is None else self.guide.reach(x0_hat)
         return torch.where(self.keep, self.known, x0_hat)
@@ -231,7 +231,7 @@ Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
 """
 
 Noise = Callable[[int], Tensor]
-"""Function that returns draw number 0, 1, 2, ... of the noise of a sampling run, each (B, F, D).
+"""Function that maps a draw's number 0, 1, 2, ... to the noise (B, F, D) for a sampling run.
 
 Sampling starts from draw 0.
 """
@@ -244,9 +244,9 @@ def pad_to(x: Tensor, size: int) -> Tensor:
 
 
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
-    """Returns the mask (B, F) bool of lengths (B,).
+    """Returns the mask (B, F) bool for lengths (B,).
 
-    `frames` is F. The default is the maximum length.
+    `frames` is F. Default: the maximum of the lengths.
 
     Example:
         >>> length_mask(torch.tensor([1, 2])).tolist()
@@ -278,7 +278,7 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 class Constant:
     """Constant numbers, stored as one tensor per device.
 
-    They are not a buffer of a module. Casting a model, or building it without values, therefore
+    They are not a module's buffer. Casting a model, or building it on the meta device, therefore
     does not change them.
 
     Example:
@@ -294,7 +294,7 @@ class Constant:
     def on(self, device: torch.device) -> Tensor:
         """Returns the tensor on a device. Only the first call for a device waits for a copy."""
         if device not in self.tensors:
-            # The first call may be in a validation, whose tensors cannot be used in training.
+            # The first call may happen in validation, whose inference tensors cannot be used in training.
             with torch.inference_mode(False):
                 self.tensors[device] = torch.tensor(self.values, device=device)
         return self.tensors[device]
@@ -307,8 +307,8 @@ def collate(
 
     Args:
         samples: id, normalized features (F, D), caption and action of each motion.
-        multiple: number of frames; the length of the longest sample is rounded up to a multiple
-            of it.
+        multiple: the batch has the length of the longest sample, rounded up to a multiple of this
+            number of frames.
         most: maximum number of frames after rounding. A longer sample is never cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)

@@ -55,8 +55,8 @@ Paths = str | Path | Sequence[str | Path]  # one file or several files
 class About(TypedDict):
     """Description of an adapter.
 
-    The adapter changes `rows` of the word table, one per word. `base` is the hash of the base
-    model's weights.
+    `rows` are the rows of the word table that the adapter changes, one per word. `base` is the hash
+    of the base model's weights.
     """
 
     name: str
@@ -71,7 +71,7 @@ class About(TypedDict):
 class Change(nn.Module):
     """A change to a weight during training; see `changed`.
 
-    Adapter files contain the change only if `kept` is True.
+    Adapter files contain the change only if `is_kept` is True.
     """
 
     def __init__(self, rows: Sequence[int] = (), *, is_kept: bool = True, **parts: Tensor):
@@ -80,7 +80,7 @@ class Change(nn.Module):
         self.dropped = nn.ParameterDict({} if is_kept else parts)
 
     def forward(self, weight: Tensor) -> Tensor:
-        """Returns `weight` with all changes added."""
+        """Returns `weight` with the change added."""
         return changed(weight, dict((*self.kept.items(), *self.dropped.items())), self.rows)
 
 
@@ -96,7 +96,7 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns one of the two table rows of each word, if possible a row that no vocabulary word uses."""
+    """Returns one of each word's two table rows, if possible a row that no vocabulary word uses."""
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]
@@ -111,7 +111,7 @@ def attach(model: MotionGenerator, about: About) -> None:
     layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]
     if not layers:
         raise UserError(
-            f"{model.describe()} has no attention, which adapters change. Train all weights: full=true"
+            f"{model.describe()} has no attention layers for an adapter to change. Train all weights with full=true"
         )
     for number, layer in enumerate(layers):
         is_kept = about["action"] or number >= len(layers) // 2
@@ -164,7 +164,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
     ]
     if not fitting:
         raise UserError(
-            f"initial_weights={source}: no weight has the name and the shape of a weight of this recipe. Name a model "
+            f"initial_weights={source}: no weight has the name and the shape of a weight in this recipe. Use a model "
             "with the same network and width"
         )
     with torch.no_grad():
@@ -191,7 +191,7 @@ def read_merged(
     strengths = [strength] * len(paths) if isinstance(strength, int | float) else list(strength)
     if len(strengths) != len(paths) or not all(math.isfinite(value) for value in strengths):
         raise UserError(
-            f"adapter strength {strength}: give one number, or one number for each of the "
+            f"adapter strength {strength}: expected one number, or one number for each of the "
             f"{len(paths)} adapters"
         )
     checkpoint = read_checkpoint(path)
@@ -210,12 +210,12 @@ def read_merged(
         about, changes = _read(Path(file))
         if about["base"] != base:
             raise UserError(
-                f"adapter={file}: made for the weights {about['base'][:12]}, not {base[:12]}. "
-                f"Give the model that it was made for"
+                f"adapter={file}: trained for a model whose weights have the hash {about['base'][:12]}, not "
+                f"{base[:12]}. Use the model that it was trained for"
             )
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):
-            if key in facts and weight:  # the base ignores words that it does not know
+            if key in facts and weight:  # the base model ignores words that it does not know
                 facts[key] = list(dict.fromkeys([*more, *facts[key]]))
     return checkpoint | {"state_dict": plain, "config": config, "facts": facts}
 
@@ -250,7 +250,7 @@ def _read(path: Path) -> tuple[About, dict[str, Tensor]]:
     regular_file(path)
     metadata, changes = read_safetensors(path)
     if ADAPTER not in metadata:
-        raise UserError(f"adapter={path}: not an adapter. Give a file that `flame-mdm adapt` wrote")
+        raise UserError(f"adapter={path}: not an adapter. Use a file that `flame-mdm adapt` wrote")
     check_weights(changes, path)
     try:
         return check_shape(parse_json(metadata[ADAPTER]), About), changes

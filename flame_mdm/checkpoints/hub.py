@@ -27,11 +27,11 @@ from flame_mdm.safe_io import (
 CARD = Path(__file__).with_name("card.md")
 MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
-"""Files that `push` writes next to the model, each with a text by which `push` recognizes it.
+"""Files that `push` writes next to the model, each with a text by which `push` recognizes its own files.
 
 The model card also contains the hash of the model file.
 """
-OTHERS = "not overwritten, since it was not written by push. Choose another folder with out=..."
+OTHERS = "not overwritten because push did not write it. Choose another folder with out=..."
 
 
 def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
@@ -45,7 +45,7 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
             precision.
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
-    Raises the errors of `flame_mdm.load`.
+    Raises the same errors as `flame_mdm.load`.
     """
     source = find(source)
     checkpoint = read_merged(source, **adapted)
@@ -72,7 +72,7 @@ def push(
     See `export` for the arguments.
     """
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repository):
-        raise UserError(f"{repository}: not a repository name. Write user/name")
+        raise UserError(f"{repository}: not a repository name. Use user/name")
     folder = Path(folder)
     _check_written(folder)
     with atomic_folder(folder) as temporary:

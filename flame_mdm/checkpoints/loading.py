@@ -43,7 +43,7 @@ NO_GPU = (
     if torch.version.cuda or torch.version.hip
     else "this PyTorch was built without CUDA"
 )
-"""The reason why no GPU can be used, for machines on which PyTorch has no GPU."""
+"""The reason why PyTorch can use no GPU, on machines where this is the case."""
 
 
 def load(
@@ -62,7 +62,7 @@ def load(
     Args:
         source: a run directory; a .ckpt or .safetensors file; a folder with one .safetensors file; the name of a model
             in this package, such as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path
-            comes first.
+            takes precedence.
         device: device of the weights, such as "cuda".
         which: the checkpoint of a run directory, "last" or "best". For files, this argument has
             no effect.
@@ -72,7 +72,7 @@ def load(
             adapter; 1 = the model as it was adapted.
 
     Returns:
-        The model, an argument of `flame_mdm.generate`, `edit` and `stream`.
+        The model, to be passed to `flame_mdm.generate`, `edit` or `stream`.
 
     Raises:
         FileNotFoundError: If there is no such file or checkpoint.
@@ -139,8 +139,8 @@ def check_device(device: str | torch.device) -> None:
         gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
         names = ", ".join(["cpu", *gpus]) + f" ({NO_GPU})" * (not gpus)
         raise UserError(
-            f"device={device}: this machine only has {names}. Remove device=, or give another "
-            f"device"
+            f"device={device}: this machine only has {names}. Omit device=, or choose one of "
+            f"these devices"
         ) from error
 
 
@@ -163,7 +163,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
         model_class = getattr(model_class, "kind", model_class)
     if not issubclass(model_class, kind):
         noun = getattr(model_class, "noun", model_class.__name__)
-        raise UserError(f"holds {noun}, not {kind.noun}. Give another checkpoint")
+        raise UserError(f"contains {noun}, not {kind.noun}. Use another checkpoint")
     is_builtin = all(target.startswith(("flame_mdm.", "evaluators.")) for target in targets)
     with ExitStack() as stack:
         if is_builtin:

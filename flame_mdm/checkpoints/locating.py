@@ -39,7 +39,7 @@ def find(source: str | Path, which: Which = "last") -> Path:
         neighbors = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         near = did_you_mean(path.name, [*neighbors, *SHIPPED])
         raise FileNotFoundError(
-            f"{path}: no such checkpoint.{near or ' Give a run, or a .ckpt or .safetensors file'}"
+            f"{path}: no such checkpoint.{near or ' Use a run directory, or a .ckpt or .safetensors file'}"
         )
     from huggingface_hub import hf_hub_download, logging
 
@@ -71,12 +71,12 @@ def _find_in_folder(folder: Path, which: Which) -> Path:
     if len(weights) != 1:
         if runs := [run for run in sorted(folder.iterdir()) if (run / "checkpoints").is_dir()]:
             raise UserError(
-                f"{folder}: not a run, but it contains runs. Give one of them: "
+                f"{folder}: not a run directory, but it contains some. Use one of them: "
                 f"{', '.join(map(str, runs))}"
             )
         names = ", ".join(file.name for file in weights) or "no .safetensors file"
         raise UserError(
-            f"{folder}: this folder holds {names}. Name the file of the model, or a run directory"
+            f"{folder}: this folder contains {names}. Use the path of a model file or a run directory"
         )
     regular_file(weights[0])
     return weights[0]

@@ -34,8 +34,8 @@ FORMAT_KEY = "flame_mdm_format"
 KEY = "flame_mdm"
 ADAPTER = "flame_mdm_adapter"
 FILE = "model.safetensors"
-# Maximum number of frames that a model file may declare: more than an hour at 20 frames per
-# second
+# Maximum number of frames that a model file may declare as the length of a motion: more than an
+# hour at 20 frames per second
 MOST_FRAMES = 100_000
 
 
@@ -48,11 +48,11 @@ def read_model_file(path: Path) -> dict[str, Any]:
     text = metadata.get(KEY)
     if ADAPTER in metadata:
         raise UserError(
-            f"{path} is an adapter, which needs a model. Give the model first: MODEL adapter={path}"
+            f"{path} is an adapter, not a model. Name the model first, then the adapter: MODEL adapter={path}"
         )
     if text is None:
         raise UserError(
-            f"{path} holds weights without a recipe. Import released weights with `flame-mdm "
+            f"{path} contains weights without a recipe. Import released weights with `flame-mdm "
             "import`"
         )
     try:
@@ -88,12 +88,12 @@ def check_format(path: Path, number: Any) -> None:
     """
     if number in (1, None):
         raise UserError(
-            f"{path}: written by version 0.1 of flame_mdm, whose files this version does not read. Train or import "
-            "the model again, or use it with version 0.1"
+            f"{path}: written by flame_mdm 0.1, whose files this version cannot read. Train or import "
+            "the model again, or use flame_mdm 0.1"
         )
     if number != FORMAT:
         raise UserError(
-            f"{path}: has format {str(number)[:40]}, but this version reads {FORMAT}. Update flame_mdm"
+            f"{path}: has format {str(number)[:40]}, but this version reads format {FORMAT}. Update flame_mdm"
         )
 
 
@@ -162,8 +162,8 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
     """
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
-            f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
-            "`flame-mdm import`"
+            f"{path}: not a checkpoint of this framework, because it contains no recipe. Import released "
+            "checkpoints with `flame-mdm import`"
         )
     metadata = {
         name: content[name]
@@ -197,7 +197,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
             raise UserError(
                 f"{path} is damaged: its weights are not dense tensors of real numbers by name: {shown}"
             )
-    # The factor 2 allows for tensors that two names share, because the file contains them only once.
+    # The factor 2 allows for tensors with two names, which the file contains only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())
     if size > 2 * path.stat().st_size:
         raise UserError(f"{path} is damaged: its weights are declared to be larger than the file")
@@ -232,7 +232,7 @@ def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
-    """Returns a hash of the names, types, shapes and values of tensors, sorted by name."""
+    """Returns a hash of the names, types, shapes and values of tensors, taken in the order of their names."""
     import torch
 
     digest = hashlib.sha256()

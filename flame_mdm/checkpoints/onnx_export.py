@@ -44,7 +44,7 @@ FIXED_LENGTH = (
     MDMGRU,
     MDMUNet,
 )
-TINY = 1e-6  # an input of `to_x0` that is too small for clipping of the clean estimate
+TINY = 1e-6  # an input of `to_x0` that is so small that the clean estimate is not clipped
 
 
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
@@ -60,22 +60,22 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if the outputs of a
-            graph differ from the outputs of PyTorch.
+        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if a graph's outputs
+            differ from PyTorch's.
     """
     try:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise UserError(
-            f"format=onnx needs the package {error.name}: pip install flame-mdm[onnx]"
+            f'format=onnx needs the package {error.name}. Run pip install "flame-mdm[onnx]"'
         ) from error
     write_folder(load(source, **adapted), out, half=half)
     return Path(out)
 
 
 def write_folder(model: MotionGenerator, out: str | Path, *, half: bool = False) -> None:
-    """Writes the folder of `export_onnx` for a loaded model."""
+    """Writes a loaded model as the folder that `export_onnx` describes."""
     content = description(model)
     with atomic_folder(out) as folder, torch.no_grad():
         for graph in ProgressBar(graphs(model), desc="graphs", unit="graph"):
@@ -140,7 +140,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     ]
     if wrong:
         raise UserError(
-            f"{wrong[0]}: not within the limits of an exported model, which docs/export.md lists"
+            f"{wrong[0]}: outside the limits for exported models, which docs/export.md lists"
         )
     return content | {"sha256": {}}
 
@@ -162,8 +162,8 @@ def root_units(representation: HumanML) -> list[list[float]]:
 class Probe:
     """Records how a sampler combines noise and clean estimates.
 
-    The probe replaces the denoiser, the noise and the `Guide`. `variance` is the
-    network's output for a learned variance.
+    The probe replaces the denoiser, the noise and the `Guide`. `variance` is the constant that it
+    returns in the channels of a learned variance.
     """
 
     # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
@@ -420,7 +420,7 @@ def graphs(model: MotionGenerator) -> list[Graph]:
 
 
 def traced(graph: Graph) -> torch.export.ExportedProgram:
-    """Returns the traced operations of a graph's module, for inputs of any size along the named axes."""
+    """Traces a graph's module for inputs of any size along the named axes, and returns its operations."""
     dimensions = [graph.dimensions.get(name) for name in graph.examples]
     return torch.export.export(
         graph.module.eval(),
@@ -477,7 +477,7 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
             )
             if not difference <= (100 * TOLERANCE if half else TOLERANCE):
                 raise UserError(
-                    f"the {graph.name} of onnxruntime and PyTorch differ by {difference:.2g}"
+                    f"the outputs of the {graph.name} in onnxruntime and PyTorch differ by {difference:.2g}"
                 )
 
 

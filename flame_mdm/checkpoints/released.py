@@ -113,8 +113,7 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
             options["input_token"] = "time" if time_token or distilbert else "condition"
     if (args.lambda_target_loc or args.multi_target_cond) and "target_encoder" not in options:
         raise ValueError(
-            "released weights: embed_target_cond is missing, but the options name an encoder of "
-            "targets"
+            "released weights: embed_target_cond is missing, but the options name a target encoder"
         )
     return Released(
         network, (in_features, out_features, cond_features), options, ours, embedding
@@ -329,7 +328,7 @@ def _model(
     stats: str | Path | None,
     extra: dict[str, Any],
 ) -> MotionGenerator:
-    """Builds a model from a recipe, its weights and the statistics in a folder.
+    """Builds a model from a recipe, its weights, and the statistics in the folder `stats`.
 
     `extra` contains the weights of all parts except the network.
     """
@@ -339,9 +338,9 @@ def _model(
     dataset = facts["dataset"]
     if representation.features != width:
         expected = f"{representation.features} of {representation.name}, the representation of data set {dataset}"
-        raise ValueError(f"released weights: have {width} features, but not the {expected}")
+        raise ValueError(f"released weights: expected {expected}, but they have {width} features")
     if (stats is not None) != (dataset in NORMALIZED):
-        state, advice = ("normalized", "Give") if stats is None else ("not normalized", "Leave out")
+        state, advice = ("normalized", "Set") if stats is None else ("not normalized", "Leave out")
         raise ValueError(
             f"features of {dataset} are {state}. {advice} stats=FOLDER with Mean.npy and Std.npy"
         )
@@ -355,7 +354,8 @@ def _model(
         )
         if not numbers or (name == "std" and (value <= 0).any()):
             raise ValueError(
-                f"{file}: shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
+                f"{file}: has shape {tuple(value.shape)}; expected ({width},) and finite numbers, which "
+                "are positive in Std.npy"
             )
         extra[f"representation.{name}"] = torch.from_numpy(value).float()
     model = MotionGenerator.build(config, representation, actions=facts["actions"], facts=facts)

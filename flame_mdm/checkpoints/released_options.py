@@ -21,19 +21,19 @@ from flame_mdm.schemas import Number, Schema, check_shape
 # JSON is read as YAML 1.1, in which 2e-2 is text
 YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
 
-# The value of an option may be the name of an enumeration's value, in upper or lower case.
+# The value of an option may be the name of an enum member, in upper or lower case.
 LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)
 
 
 class Solver(Schema):
-    """Options `ode_kwargs` of MFM's solver."""
+    """Options of MFM's solver, called `ode_kwargs` there."""
 
     method: str = "euler"
     step_size: Annotated[YamlNumber, Field(ge=1 / MAX_STEPS, le=1)] = 0.01
 
 
 class Options(Schema):
-    """The options of a released model that the import reads, with the authors' defaults."""
+    """The options that the import of a released model reads, with the authors' defaults."""
 
     arch: Literal["trans_enc", "trans_dec", "gru"] = "trans_enc"
     dataset: Literal["humanml", "kit", "humanact12", "uestc"] = "humanml"
@@ -115,7 +115,7 @@ def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
 
 
 def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: str = "") -> None:
-    """Raises `ValueError` for an unknown option, or for an option whose effect the project's model lacks."""
+    """Raises `ValueError` for an unknown option, or for an option with an effect that cannot be imported."""
     for name, value in options.items():
         shown = f"{prefix}{shortened(str(name), 40)}={shortened(str(value), 40)}"
         if name in table["neutral"]:

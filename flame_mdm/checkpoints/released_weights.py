@@ -24,8 +24,8 @@ def read_released(
 ) -> Mapping[str, Any]:
     """Reads a released file. With `run_code`, pickles of other objects are also read, which runs any code in them.
 
-    Raises `UserError` if the file is damaged, or if it contains such objects. `advice` is the end
-    of the error message.
+    Raises `UserError` if the file is damaged or, without `run_code`, if it contains such objects.
+    `advice` is the end of the error message.
     """
     try:
         check_torch(path)
@@ -45,12 +45,12 @@ def read_released(
                 f"{path} is damaged, or is not a PyTorch file. Download it again"
             ) from error
         raise UserError(
-            f"{path}: holds Python objects ({unsafe[1]}) in addition to the weights, and "
+            f"{path}: contains Python objects ({unsafe[1]}) in addition to the weights, and "
             f"reading them can run any code. {advice}"
         ) from error
     if not isinstance(content, Mapping):
         raise UserError(
-            f"{path}: holds a {type(content).__name__}, not the weights of a released model"
+            f"{path}: contains a {type(content).__name__}, not the weights of a released model"
         )
     return content
 

@@ -1,4 +1,6 @@
-"""Samples from a folder of `flame-mdm export CKPT OUT format=onnx`, with only numpy and onnxruntime.
+"""Samples motions from a model that was exported to ONNX. Requires only numpy and onnxruntime.
+
+`flame-mdm export CKPT FOLDER format=onnx` writes the folder of the model.
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
@@ -172,7 +174,7 @@ def check(content: Any) -> None:
     if not isinstance(content, dict):
         raise ValueError("model.json is damaged")
     if content.get("format") != FORMAT:
-        raise ValueError(f"model.json is not of format {FORMAT}")
+        raise ValueError(f"model.json does not have format {FORMAT}")
     if content.get("digest") != digest(content):
         raise ValueError("model.json has changed since it was exported")
 
@@ -192,7 +194,7 @@ def check(content: Any) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Returns the content of a regular file of up to `most` bytes; otherwise raises `ValueError` or `OSError`."""
+    """Returns the content of a regular file with at most `most` bytes; otherwise raises `ValueError` or `OSError`."""
     if path.exists() and not path.is_file():
         raise ValueError(f"{path.name} is a folder, a pipe or a device")
     with path.open("rb") as file:
@@ -215,7 +217,10 @@ class Sampler:
     """
 
     def __init__(self, folder: str | Path, threads: int = 1):
-        """Opens a folder. Raises `ValueError` if a file is missing, damaged, too large or of another version."""
+        """Opens a folder.
+
+        Raises `ValueError` if a file is missing, damaged, too large or from another version.
+        """
         self.folder = Path(folder)
         try:
             self.content = self._description()
@@ -280,8 +285,9 @@ class Sampler:
     ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action.
 
-        For an unconditional model, the prompt is "". `sample` is the number of the motion among the
-        motions for one text. `seconds` is 3 by default, or less if the model's maximum is lower.
+        For an unconditional model, the prompt is "". `sample` is the sample number, which
+        distinguishes several motions for one text. `seconds` is 3 by default, or the model's
+        maximum if that is lower.
         For a model that continues frames, the maximum is 600. Raises `ValueError` for an invalid
         length or an unknown action, or if the result is not finite.
         """
@@ -293,7 +299,9 @@ class Sampler:
         else:
             frames = round(min(seconds * fps, longest + 1)) if seconds > 0 else 0
         if not 2 <= frames <= longest:
-            raise ValueError(f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds")
+            raise ValueError(
+                f"seconds={seconds}: expected {2 / fps:g} to {longest / fps:g} seconds"
+            )
 
         condition, name = self._condition(prompt), f"{prompt}#{sample}"
         if "start" not in content:
@@ -342,9 +350,9 @@ class Sampler:
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rest pose and the local rotations. Only for SMPL's 22 joints.
+        """Returns the offsets in the rest pose and the local rotations. Only for SMPL's 22 joints.
 
-        Offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
+        The offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
         are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y, z); the quaternion of
         the root is in the world.
         """
@@ -475,8 +483,8 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
 def write(path: str | Path, **arrays: Any) -> None:
     """Writes an .npz file under a temporary name, and renames it at the end.
 
-    A failure leaves no files behind. A link at `path` is replaced; the file to which it leads
-    does not change. Raises `ValueError` if `path` is a folder, a pipe or a device, and `OSError`
+    A failure leaves no files behind. A link at `path` is replaced, and the target of the link does
+    not change. Raises `ValueError` if `path` is a folder, a pipe or a device, and `OSError`
     if the file cannot be written.
     """
     path = Path(path)
@@ -503,7 +511,7 @@ def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
         return kind(options[key])
     except ValueError as error:
         raise ValueError(
-            f"{key}={options[key][:40]}: give a {'whole ' if kind is int else ''}number"
+            f"{key}={options[key][:40]}: expected a {'whole ' if kind is int else ''}number"
         ) from error
 
 
@@ -530,7 +538,7 @@ def main(arguments: Sequence[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(
-        f"{out}: {len(joints)} frames at {sampler.content['fps']:g} per second, joints in meters, y up"
+        f"{out}: {len(joints)} frames at {sampler.content['fps']:g} frames per second, joints in meters, y up"
     )
     return 0
 

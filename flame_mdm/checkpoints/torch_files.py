@@ -1,4 +1,4 @@
-"""Reads files of `torch.save` after checking their sizes, checksums and keys."""
+"""Reads files from `torch.save` after checking their sizes, checksums and keys."""
 
 import io
 import pickle
@@ -11,15 +11,15 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import ZIP_ERRORS, naming, opened_zip, regular_file
 
 LARGEST_KEY = 2**60
-"""Integer keys must be smaller than this. Any number of larger integers may share one hash."""
-# files of PyTorch before 1.6, which are not archives, begin with this number of pickles
+"""Integer keys must be smaller than this, because arbitrarily many larger integers may share one hash."""
+# Files from PyTorch before 1.6, which are not archives, begin with this number of pickles
 LEGACY_PICKLES = 5
 # Names of the codec with which PyTorch writes bytes. Other codecs may take quadratic time.
 CODECS = ("latin1", "latin-1")
 
 
 def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file of `torch.save`, without executing code in the file."""
+    """Returns the plain values and tensors in a file from `torch.save`, without executing code in the file."""
     import torch
 
     check_torch(path)
@@ -29,7 +29,7 @@ def read_torch(path: Path) -> Any:
 
 
 def check_torch(path: Path) -> None:
-    """Checks the sizes and checksums of an archive of `torch.save`, which `torch.load` does not check."""
+    """Checks the sizes and checksums in an archive from `torch.save`, which `torch.load` does not do."""
     size = regular_file(path)
     if not _is_archive(path):
         return
@@ -43,7 +43,7 @@ def check_torch(path: Path) -> None:
             or sum(m.file_size for m in members) > size
         ):
             raise UserError(
-                "damaged: its parts are compressed or overlap, but torch.save does neither"
+                "damaged: its parts are compressed or overlap, unlike in files from torch.save"
             )
         if (spoiled := archive.testzip()) is not None:
             raise UserError(f"damaged: the checksum of {spoiled} is wrong")
@@ -52,8 +52,8 @@ def check_torch(path: Path) -> None:
 def check_keys(path: Path) -> None:
     """Raises `UserError` if keys in a file may share one hash.
 
-    A dictionary of such keys takes quadratic time in `torch.load(weights_only=True)`: hours for a
-    file of one megabyte. Text has random hashes, and small integers have different hashes. If the
+    A dictionary with such keys takes quadratic time in `torch.load(weights_only=True)`: hours for a
+    file of one megabyte. Strings have random hashes, and small integers have different hashes. If the
     pickle names an object that PyTorch refuses, the check stops there without an error, because
     PyTorch stops at the same place and names the object.
     """

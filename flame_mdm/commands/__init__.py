@@ -58,7 +58,7 @@ def motion_file(key: str, source: str) -> None:
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """Prints the errors of files that failed, and exits with code 1 if there are any.
+    """Prints the errors of the files that failed, if any, and then exits with code 1.
 
     `done` is the verb for the message, such as "converted".
     """
@@ -89,7 +89,7 @@ def device_name(key: str, device: str) -> None:
     """Raises `UserError` if `device` is not a name such as cpu or cuda:1."""
     if not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
         near = did_you_mean(device, ["cpu", "cuda"])
-        raise UserError(f"{key}={device}: unknown.{near} Give cpu, cuda or cuda:NUMBER")
+        raise UserError(f"{key}={device}: unknown.{near} Use cpu, cuda or cuda:NUMBER")
 
 
 def video(key: str, requested: bool) -> None:
@@ -129,8 +129,7 @@ class AdaptedSettings(ModelSettings):
     )
     adapter_strength: float | Sequence[float] = option(
         1.0,
-        "strength of all adapters, or a list with one number per adapter; 0 = the model "
-        "without adapters",
+        "strength of all adapters, or a list with one number per adapter; 0 = no effect",
     )
 
     def adapters(self) -> dict[str, Any]:
@@ -162,7 +161,7 @@ def read_motions(
 ) -> tuple[str, int, Iterator[Motion]]:
     """Returns the name of a file or folder, the number of its motions, and the motions.
 
-    Errors of files in a folder are added to `failures`.
+    If files in a folder cannot be read, their errors are added to `failures`.
     """
     from flame_mdm.formats.readers import read
 
@@ -229,7 +228,7 @@ class WritingSettings:
     def read_character(self) -> Character | BvhCharacter | None:
         """Reads `character`.
 
-        If it contains joints with unknown names, prints a file that the user can complete.
+        If it has joints with unknown names, prints the content of a file that the user can complete.
         """
         from flame_mdm.formats import characters
 
@@ -252,7 +251,7 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model for sampling, and the body to draw; None = the mannequin."""
+    """A model for sampling, and the body to draw. A body of None is the mannequin."""
 
     model: MotionGenerator
     body: Mesh | None
@@ -286,7 +285,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         Raises `UserError` if more than one condition is requested, or if a value is invalid.
         """
         if len(conditions := self.conditions()) > 1:
-            raise UserError(f"{' and '.join(conditions)} exclude each other. Give only one of them")
+            raise UserError(f"{' and '.join(conditions)} exclude each other. Use only one of them")
         keywords: dict[str, Any] = {
             **self._fields(SamplingRequest),
             "texts": self.text,

@@ -12,9 +12,9 @@ class AdaptSettings(ModelSettings):
     """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
 
     Teaches a trained model the motions in a folder; the model keeps its other abilities. Prompts
-    that end with "in limp style" then request such motions. Writes the adapter
+    that end with "in limp style" then request motions in this style. Writes the adapter
     OUT/limp.safetensors, for `sample` and `load`, and a page that compares motions before and
-    after training. Run the same command to resume. docs/own-motion.md explains the steps.
+    after training. Run the same command again to resume. docs/own-motion.md explains the steps.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

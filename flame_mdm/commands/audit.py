@@ -17,10 +17,10 @@ class AuditSettings(DataSettings):
     ...] flame-mdm audit cards="A.json B.json"
 
     Perturbs the real motions of a data set at graded strengths, measures them like generated
-    motions, and writes a card. The card shows which perturbations each metric notices, from which
-    strength, and which it does not notice. extractor=none audits the metrics of joint positions.
-    If interrupted, the same command continues where it stopped. cards= renders one card again, or
-    two cards side by side.
+    motions, and writes a card. The card shows which perturbations each metric detects, from which
+    strength on, and which it does not detect. extractor=none audits the metrics of joint positions.
+    After an interruption, the same command continues where it stopped. cards= renders one card
+    again, or two cards side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
@@ -59,7 +59,7 @@ def main(settings: AuditSettings) -> None:
     if settings.cards is not None:
         if len(settings.cards) > 2:
             raise UserError(
-                f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Give one or two"
+                f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Pass one or two"
             )
         paths = [Path(card) for card in settings.cards]
         name = "-and-".join(path.stem for path in paths)
@@ -67,11 +67,11 @@ def main(settings: AuditSettings) -> None:
         return
     if settings.data is None or settings.extractor is None:
         raise UserError(
-            "give a data set and an extractor: data=NAME extractor=FILE, or extractor=none"
+            "an audit needs a data set and an extractor: data=NAME extractor=FILE, or extractor=none"
         )
     if settings.resamples < 100 or (settings.samples or 64) < 8:
         raise UserError(
-            f"resamples={settings.resamples}, samples={settings.samples}: too few. Give at "
+            f"resamples={settings.resamples}, samples={settings.samples}: too few. Use at "
             f"least resamples=100 and samples=8"
         )
     from evaluators.audit import audit as measure

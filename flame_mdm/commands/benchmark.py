@@ -21,18 +21,19 @@ class BenchmarkSettings:
     """usage: flame-mdm benchmark NAME [out=FOLDER] [jobs=N]
 
     Trains a motion-CLIP and a model of each kind, evaluates them, writes a table, and compares
-    its values with the expected ranges. If interrupted, the same command continues where it
+    its values with the expected ranges. After an interruption, the same command continues where it
     stopped.
 
-    NAME is a file in experiments/benchmark: synthetic and synthetic_medium need no
-    download; there are also bandai, few_steps and bandai_full, which is for one GPU.
+    NAME is a file in experiments/benchmark: synthetic, synthetic_medium, bandai, few_steps or
+    bandai_full. The first two need no download, and bandai_full is for one GPU.
     """
 
     OBJECTS: ClassVar = ("exp",)
     exp: str = required("a file in experiments/benchmark")
     out: str | None = option(None, "folder; default: runs/benchmark/<exp>")
     jobs: int = option(
-        1, "trainings at the same time; they share the cores, and need about 2 GiB of memory each"
+        1,
+        "number of models to train at the same time; they share the cores, and each needs about 2 GiB of memory",
     )
     device: str | None = option(
         None, "device of the evaluations, such as cpu or cuda; default: cuda if available"
@@ -49,7 +50,9 @@ def main(settings: BenchmarkSettings) -> None:
     if settings.exp not in names:
         raise UserError(f"no benchmark is called '{settings.exp}'. Available: {', '.join(names)}")
     if settings.jobs < 1:
-        raise UserError(f"jobs={settings.jobs}: give the number of trainings at the same time")
+        raise UserError(
+            f"jobs={settings.jobs}: must be at least 1. Set it to the number of models to train at the same time"
+        )
     described = read_package_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
     out = Path(settings.out or Path("runs") / "benchmark" / settings.exp)
     out.mkdir(parents=True, exist_ok=True)  # reports an error before hours of work, not after

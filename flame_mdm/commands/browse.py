@@ -16,11 +16,11 @@ class BrowseSettings(BodySettings, DataSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
            flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
-    NAME is a data set, as in `prepare`; for your own motions, give data=folder data.name=NAME.
+    NAME is a data set, as in `prepare`; for your own motions, use data=folder data.name=NAME.
     Writes a single web page that opens from disk. It shows clips of the data set with their
     captions, and mirrored copies next to their originals. It also has a search field, a choice of
-    splits, and statistics. motions=FOLDER also writes the shown clips as motion files, to compare
-    generated motions with them.
+    splits, and statistics. motions=FOLDER also writes the shown clips as motion files, so that you
+    can compare generated motions with them.
     """
 
     OBJECTS: ClassVar = ("data", "out")

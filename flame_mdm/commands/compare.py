@@ -38,11 +38,11 @@ class CompareSettings(BodySettings):
            flame-mdm compare ratings="ann.json bob.json" out=ratings.json
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and
-    motions for the same prompts. If the runs have results of the same protocol, data and
-    extractor, prints the difference of each metric with its 95 % interval, and whether the
-    interval contains 0. Instead of a run, a FOLDER of motion files may be given, such as real
-    motions (`browse motions=FOLDER`) or motions of another program. The runs are then sampled for
-    the captions and lengths of these motions. rate=true writes a blind user study instead: a page
+    motions for the same prompts. If the runs have results for the same protocol, data and
+    extractor, prints the difference in each metric with its 95 % interval, and whether the
+    interval contains 0. A FOLDER of motion files can take the place of a run, such as real motions
+    (`browse motions=FOLDER`) or motions from another program. The runs are then sampled for the
+    captions and lengths of these motions. rate=true writes a blind user study instead: a page
     that asks which of two motions fits a text better. ratings= counts the answers.
     """
 
@@ -78,7 +78,7 @@ def main(settings: CompareSettings) -> None:
     """Writes a page that compares runs, or counts the ratings of a user study."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError(
-            'give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings'
+            'use either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings'
         )
     if settings.ratings is not None:
         _count([Path(file) for file in settings.ratings], settings.out or "runs/ratings.json")
@@ -162,7 +162,7 @@ def _motions(
 
 
 def _texts(prompts: PromptFile) -> list[str]:
-    """Returns the prompts of a file. Raises the error of the first prompt that no model can sample."""
+    """Returns the prompts in a file. Raises the error for the first prompt that no model can sample."""
     for number in sorted(prompts.refused):
         raise prompts.refused[number]
     return list(prompts.lines.values())
@@ -175,8 +175,8 @@ def _sampled(
 
     Args:
         entry: the run.
-        prompts: the prompts, with the length of each motion in seconds. Lengths are given either
-            for all motions or for none; None = the default length. Lengths above the model's
+        prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
+            numbers, or all are None, which means the default length. Lengths above the model's
             maximum are shortened.
         seed: seed of the noise. If a prompt is listed twice, its motions have different noise.
     """

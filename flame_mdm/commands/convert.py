@@ -85,13 +85,13 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
     )
     if ending is None:
         raise UserError(
-            f"{folder} is a folder. Give the format of the files, too, such as format=glb"
+            f"{folder} is a folder. Also set the format of the files, for example format=glb"
         )
     files = motion_files(folder)
     targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
     if double := [file for file in files if file not in targets.values()]:
         raise UserError(
-            f"{double[0]}: another motion has the same name, so both would be written to one "
+            f"{double[0]}: another motion has the same name, so both would be written to the same "
             f"file. Rename one of them"
         )
     return targets

@@ -41,7 +41,9 @@ class DemoSettings:
 def main(settings: DemoSettings) -> None:
     """Serves the demo page until the command is stopped."""
     if not 0 <= settings.port <= 65535:
-        raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 = any free port")
+        raise UserError(
+            f"port={settings.port}: expected a number from 0 to 65535; 0 = any free port"
+        )
     if find_spec("gradio") is None:
         raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"')
 

@@ -70,7 +70,7 @@ def student_recipe(settings: DistillSettings) -> Config:
     recipe: Any = teacher.config
     if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
         raise UserError(
-            f"{settings.ckpt}: was not trained by this framework, so its data and training "
+            f"{settings.ckpt}: not trained by this framework, so its data and number of training "
             f"steps are unknown"
         )
     name = f"{recipe['experiment']}_distilled"

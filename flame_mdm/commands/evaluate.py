@@ -18,10 +18,10 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
            flame-mdm evaluate ckpt=FILE extractor=FILE guidance_scale=1,2.5,4 --multirun
 
     Evaluates generated and real motions under a protocol, and writes a JSON file with all values and their provenance.
-    If interrupted, the same command continues where it stopped. quick=true checks within a minute that everything
-    works. Protocols: experiments/evaluation
-    --multirun evaluates once per combination of values, and launch=slurm or launch=local starts a job for each:
-    docs/clusters.md
+    After an interruption, the same command continues where it stopped. quick=true checks within a minute that
+    everything works. experiments/evaluation contains the protocols.
+    --multirun evaluates once per combination of values, and launch=slurm or launch=local starts a job for each
+    combination; see docs/clusters.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

@@ -13,8 +13,8 @@ class ExportSettings(AdaptedSettings):
     """usage: flame-mdm export CKPT OUT [half=true] [format=onnx] [adapter=limp.safetensors]
 
     Writes one .safetensors file with the averaged weights of a checkpoint, its recipe and the
-    metadata of its data set. Adapters are merged into the weights. format=onnx writes a folder
-    for sampling without PyTorch instead. See docs/export.md.
+    metadata of its data set. Adapters are merged into the weights. With format=onnx, writes a
+    folder for sampling without PyTorch instead. See docs/export.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

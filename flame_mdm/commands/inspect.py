@@ -38,8 +38,8 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     of a folder, or in a prepared data set. docs/motion-faults.md lists the limits.
 
     Prints the faults per frame and joint, and writes a player with marks on its time line. For a
-    data set or a large folder, the player shows the worst motions, at most `clips`. Exits with
-    code 3 if there are faults.
+    data set or a large folder, the player shows the worst `clips` motions. Exits with code 3 if
+    there are faults.
     """
 
     OBJECTS: ClassVar = ("motion", "out")
@@ -57,7 +57,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
         name = self.motion
         if not (
             Path(name).suffix or Path(name).exists() or "/" in name
-        ):  # not a file, so the name of a data set
+        ):  # the name of a data set, because there is no such file
             is_prepared = any(Path(self.data_root).glob(f"{escape(name)}-*/{STORE}"))
             # If no recipe has this name, the data set was prepared from the user's folder.
             if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():
@@ -103,7 +103,7 @@ def main(settings: InspectSettings) -> None:
                 f"{motion.id}: {len(faults)} faults",
                 *(f"  {fault}" for fault in faults[:MOST_LINES]),
             )
-    say(f"{name}: {faulty} of {count} motions with faults")
+    say(f"{name}: {faulty} of {count} motions have faults")
     say(
         *(
             f"  {kind:12} {kinds[kind]:6} ({kinds[kind] / count:.1%}): {LIMITS[kind][2]}"

@@ -29,9 +29,10 @@ class JudgeSettings(BodySettings, FileSettings):
            flame-mdm judge FOLDER [OUT.html] [clips=24]
 
     Reads the claims of a sentence, such as side, count, direction, posture and order, and
-    measures each claim on the motion. The verdict is yes, no or cannot tell, with joint, number
-    and time. Without text, motions are judged by their own texts. Writes a player whose time line
-    marks the evidence. Exits with code 3 if a claim is false. See docs/referee.md.
+    measures each claim on the motion. The verdict is yes, no or cannot tell, with the joint, the
+    measured number and the time. Without text=, motions are judged by their own texts. Writes a
+    player whose time line marks the evidence. Exits with code 3 if a claim is false. See
+    docs/referee.md.
     """
 
     OBJECTS: ClassVar = ("motion", "out")

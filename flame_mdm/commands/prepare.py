@@ -13,8 +13,8 @@ from flame_mdm.errors import say
 class PrepareSettings(DataSettings):
     """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
-    Converts a data set from the files of its owners into a packed store in data/. `check=true`
-    only lists the existing and the missing files. `verify=true` checks an existing store.
+    Converts the original files of a data set into a packed store in data/. `check=true` only lists
+    the existing and the missing files. `verify=true` checks an existing store.
     `force=true` rewrites the store.
     """
 

@@ -51,9 +51,9 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT unconditioned=true
 
     Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has
-    one prompt per line. Each prompt gets its own folder, and one page shows all motions. Prompts
-    that cannot be sampled are named at the end, and the exit code is 1. A set is a folder of
-    clips that fit together, for game engines: loops, starts, stops and turns. If OUT is a file
+    one prompt per line. Each prompt gets its own folder, and one page shows the first motion of
+    each prompt. Prompts that cannot be sampled are listed at the end, and the exit code is 1. A
+    set is a folder of clips that fit together, for game engines: loops, starts, stops and turns. If OUT is a file
     (.fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif), only this file is written.
     """
 
@@ -123,7 +123,7 @@ class SampleSettings(OutputSettings, WritingSettings):
                         f"cut. Omit {entry.name}"
                     )
             if self.file is not None:
-                raise UserError(f"out={self.out}: a set has several files. Give a folder")
+                raise UserError(f"out={self.out}: a set has several files. Use a folder")
             return
         if self.format is not None:
             raise UserError(
@@ -141,7 +141,7 @@ class SampleSettings(OutputSettings, WritingSettings):
             return
         for key in ("prompts", "mp4", "trajectory"):
             if value := getattr(self, key):
-                advice = "Give a folder, or omit out"
+                advice = "Use a folder, or omit out"
                 raise UserError(
                     f"{key}={str(value).lower()}: {self.out} is a single motion file. {advice}"
                 )
@@ -169,8 +169,8 @@ class SampleSettings(OutputSettings, WritingSettings):
         else:
             if self.path is not None:
                 raise UserError(
-                    f"path={self.path}: a path cannot be combined with a file of prompts. Give "
-                    "text and seconds"
+                    f"path={self.path}: a path cannot be combined with a file of prompts. Use "
+                    "text and seconds instead"
                 )
             request = self.request(
                 samples=samples,
@@ -180,7 +180,7 @@ class SampleSettings(OutputSettings, WritingSettings):
             )
         if self.scorer is not None and (request.kind != "text" or self.candidates == 1):
             raise UserError(
-                f"scorer={self.scorer} chooses among motions for a text. Give text=... and "
+                f"scorer={self.scorer} chooses among motions for a text. Add text=... and "
                 f"candidates=8"
             )
         return request
@@ -288,7 +288,7 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
     facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.model.sha256}
     write_set(folder, clips, content, facts, loaded.body)
     say(
-        f"{len(clips.clips)} clips, each with its path and in place: {folder / 'player.html'}, set.png, set.json"
+        f"{len(clips.clips)} clips, each with root motion and in place: {folder / 'player.html'}, set.png, set.json"
     )
 
 
@@ -300,7 +300,7 @@ def _write_files(
     body: Mesh | None,
     facts: dict[str, Any],
 ) -> None:
-    """Writes the first motion as `file`, and further motions with numbers: walk_2.fbx, walk_3.fbx."""
+    """Writes the first motion as `file`, and the other motions with numbers: walk_2.fbx, walk_3.fbx."""
     for number, motion in enumerate(motions, 1):
         path = file if number == 1 else file.with_stem(f"{file.stem}_{number}")
         written = settings.at_rate(motion)
@@ -335,8 +335,8 @@ def claims_score(model: MotionGenerator) -> Score:
     skeleton = model.representation.skeleton
     if skeleton != SMPL22:
         raise UserError(
-            f"scorer={CLAIMS}: the model's motions are on {skeleton.name}, and the referee needs {SMPL22.name}. "
-            "Give a motion-CLIP"
+            f"scorer={CLAIMS}: the model's motions have the skeleton {skeleton.name}, but the referee needs "
+            f"{SMPL22.name}. Use a motion-CLIP"
         )
     return claim_score
 
@@ -389,4 +389,4 @@ def _gallery(prompts: PromptFile, folders: Mapping[Path, list[Motion]], body: Me
     page = next(iter(folders)).with_name(f"{Path(prompts.path).stem}.html")
     first = [replace(motions[0], id=folder.name) for folder, motions in folders.items()][:GALLERY]
     write_player(page, first, f"{len(folders)} prompts", body=body)
-    return f"{sum(map(len, folders.values()))} motions for {len(folders)} prompts, a folder for each: {page}"
+    return f"{sum(map(len, folders.values()))} motions for {len(folders)} prompts, one folder per prompt: {page}"

@@ -135,7 +135,7 @@ def evaluate_missing(
 
 
 def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
-    """Whether `values` need several motions per prompt, which take most of the evaluation time."""
+    """Whether some of `values` need several motions per prompt, which take most of the evaluation time."""
     from evaluators.protocol import protocol_config
 
     several = protocol_config(evaluation.keys["protocol"]).get("multimodality") or {"metrics": {}}
@@ -185,7 +185,7 @@ def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None
     data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))
     if not (data.folder / "store.json").exists():
         say(
-            f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}"
+            f"{dataset}: not prepared, so its motion lengths are omitted. Run make prepare DATA={dataset}"
         )
         return
     store = data.open()

@@ -1,4 +1,4 @@
-"""Trainings of a benchmark, each in its own process, sequentially or in parallel."""
+"""Training runs of a benchmark, each in its own process, one after the other or in parallel."""
 
 import os
 import subprocess
@@ -15,19 +15,19 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import open_in_place
 
 GIB_PER_JOB = 2.0
-"""Free memory in GiB that is required to start another training in parallel."""
+"""Free memory in GiB that is required to start another training run in parallel."""
 POLL = 0.2
-"""Seconds between two checks of running trainings."""
+"""Seconds between two checks on the running processes."""
 
 
 @dataclass
 class Training:
-    """A training of a benchmark.
+    """A training run of a benchmark.
 
     Attributes:
         words: arguments of `flame-mdm train`.
         folder: the run directory.
-        needs: numbers of the trainings whose runs this training reads.
+        needs: numbers of the earlier training runs whose files this run reads.
     """
 
     words: Sequence[str]
@@ -41,7 +41,10 @@ class Training:
 
 
 def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
-    """Returns the trainings of a benchmark. A training that names an earlier run depends on that run."""
+    """Returns the training runs of a benchmark.
+
+    A run depends on an earlier run if its configuration contains a path in the earlier run's directory.
+    """
     root = [f"data_root={data_root}"] if data_root else []
     trainings: list[Training] = []
     for name, *overrides in entries:
@@ -59,15 +62,15 @@ def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
 
 
 def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
-    """Runs trainings, up to `jobs` at the same time.
+    """Trains the models of a benchmark, up to `jobs` at the same time.
 
-    With several jobs, each training gets an equal share of the cores and writes its output to a
-    file in `logs`. Another training starts in parallel only if `GIB_PER_JOB` of memory is free. The
-    batches and random draws of a training do not depend on other trainings.
+    With several jobs, each run gets an equal share of the cores and writes its output to a file in
+    `logs`. Another run starts in parallel only if `GIB_PER_JOB` GiB of memory are free. The batches
+    and random draws of a run do not depend on other runs.
 
     Raises:
-        UserError: If a training failed. The other trainings are stopped and can be resumed.
-        SystemExit: If a training was interrupted.
+        UserError: If a run failed. The other runs are stopped and can be resumed.
+        SystemExit: If a run was interrupted.
     """
     environment = dict(os.environ)
     if jobs > 1:
@@ -118,5 +121,5 @@ def _check(training: Training, code: int) -> None:
         raise SystemExit(code if code > 0 else 128 - code)
     if code:
         raise UserError(
-            f"training {training.title} failed (see its output). Run the benchmark again to continue"
+            f"training of {training.title} failed (see its output). Run the benchmark again to continue"
         )

@@ -627,7 +627,7 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
             "mdm",
             {"dataset": "humanml"},
             [],
-            "150 features, but not the 263 of humanml-legacy-smpl22",
+            "expected 263 of humanml-legacy-smpl22",
         ),
         (
             "mdm",
@@ -663,9 +663,9 @@ def test_statistics_have_to_fit(refused, bad):
     )
     refused("import", *words, says="Mean.npy: no such file")
     for name, value, says in (
-        ("Mean.npy", np.zeros(251), "Mean.npy: shape (251,), expected (263,) finite numbers"),
-        ("Mean.npy", np.zeros(263, "c8"), "Mean.npy: shape (263,), expected (263,) finite numbers"),
-        ("Std.npy", np.zeros(263), "expected (263,) finite numbers, positive in Std.npy"),
+        ("Mean.npy", np.zeros(251), "Mean.npy: has shape (251,); expected (263,) and finite numbers"),
+        ("Mean.npy", np.zeros(263, "c8"), "Mean.npy: has shape (263,); expected (263,) and finite numbers"),
+        ("Std.npy", np.zeros(263), "expected (263,) and finite numbers, which are positive in Std.npy"),
     ):
         statistics_folder(bad, 263)
         np.save(bad / name, value)
@@ -680,7 +680,7 @@ def test_statistics_have_to_fit(refused, bad):
 def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
     state = {"state_dict": small_state(150), "hyper": argparse.Namespace(a=1)}
     words = ["mdm", *released_file(bad, state, {"dataset": "uestc"})]
-    refused("import", *words, says="holds Python objects (argparse.Namespace)")
+    refused("import", *words, says="contains Python objects (argparse.Namespace)")
     refused("import", *words, says="run_code=true")
     assert main(["import", *words, "run_code=true"]) == 0
     for content in (b"not a checkpoint", (bad / "model.pt").read_bytes()[:-500]):
@@ -742,11 +742,11 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtes
         ),
         (
             whole.replace(b'\\"format\\": 2', b'\\"format\\": 3'),
-            "has format 3, but this version reads 2",
+            "has format 3, but this version reads format 2",
         ),
         (
             whole.replace(b'\\"format\\": 2', b'\\"format\\": 1'),
-            "written by version 0.1 of flame_mdm",
+            "written by flame_mdm 0.1",
         ),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
@@ -760,8 +760,8 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtes
     (tmp_path / "empty").mkdir()
     for name, message in (
         (tmp_path / "a.safetensors", r"weights without a recipe\. Import released weights"),
-        (tmp_path / "empty", r"this folder holds no \.safetensors file"),
-        (tmp_path, r"holds a\.safetensors, b\.safetensors\. Name the file"),
+        (tmp_path / "empty", r"this folder contains no \.safetensors file"),
+        (tmp_path, r"contains a\.safetensors, b\.safetensors\. Use the path"),
         ("nobody/model.ckpt", "no such checkpoint"),
         (
             "nobody/model@v1",
@@ -824,6 +824,6 @@ def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
 def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):
     (tmp_path / "x" / "default" / "checkpoints").mkdir(parents=True)
     with pytest.raises(
-        UserError, match=r"x: not a run, but it contains runs\. Give one of them: .*x/default$"
+        UserError, match=r"x: not a run directory, but it contains some\. Use one of them: .*x/default$"
     ):
         find(tmp_path / "x")

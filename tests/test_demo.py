@@ -190,7 +190,7 @@ def test_an_invalid_origin_is_refused(subtests):
 def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
     assert error_of(capsys, "demo", "port=99999").startswith(
-        "error: port=99999: give a number from 0 to 65535"
+        "error: port=99999: expected a number from 0 to 65535"
     )
     assert (
         error_of(capsys, "demo")

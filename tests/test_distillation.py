@@ -300,7 +300,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
         (["runs/no/model"], "runs/no/model: no such checkpoint"),
         ([student], f"a distilled model. Give its teacher, {trained}"),
         (["process.ckpt"], "predicts noise, so computing the clean estimate divides"),
-        (["untrained.ckpt"], "was not trained by this framework"),
+        (["untrained.ckpt"], "not trained by this framework"),
         (
             [*own, "distillation.teacher=representation.ckpt"],
             "has representation.fps=30, but the student has 20. Both",
@@ -436,7 +436,7 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
     with safe_open(taught / "limp.safetensors", "pt") as file:
         about = json.loads(file.metadata()["flame_mdm_adapter"])
     for change, message in (
-        ({"base": "0" * 64}, "made for the weights 000000000000"),
+        ({"base": "0" * 64}, "a model whose weights have the hash 000000000000"),
         ({"rank": "2"}, "rank"),
         ({"rows": [10**6]}, "does not fit the weights"),
         (None, "not an adapter"),
@@ -447,12 +447,12 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
             with pytest.raises(UserError, match=message):
                 flame_mdm.load(taught / "base.safetensors", adapter=tmp_path / "x.safetensors")
     with pytest.raises(
-        UserError, match="give one number, or one number for each of the 1 adapters"
+        UserError, match="expected one number, or one number for each of the 1 adapters"
     ):
         flame_mdm.load(
             taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2]
         )
-    with pytest.raises(UserError, match="an adapter, which needs a model"):
+    with pytest.raises(UserError, match="an adapter, not a model"):
         flame_mdm.load(taught / "limp.safetensors")
     model = build()
     model.denoiser = torch.nn.Linear(1, 1)  # type: ignore[assignment]

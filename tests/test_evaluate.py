@@ -674,7 +674,7 @@ def test_what_does_not_fit_is_refused(runs, tmp_path, subtests):
     for message, keys in (
         ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
-        ("holds a motion generator, not a motion-CLIP", {"extractor": str(runs.model)}),
+        ("contains a motion generator, not a motion-CLIP", {"extractor": str(runs.model)}),
         ("Did you mean synthetic", {"protocol": "synthetical"}),
         ("condition text", {"protocol": "action_to_motion"}),
         ("does not edit motions", {"method": "mdm"}),

@@ -470,7 +470,7 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind, subtest
             rf"not the weights of {make.__name__}: Missing key.*{name}",
         ),
         ({**state, "extra": torch.zeros(1)}, "Unexpected key.*extra"),
-        ({**state, "extra": _Runs()}, r"holds Python objects \(_pytest"),
+        ({**state, "extra": _Runs()}, r"contains Python objects \(_pytest"),
     ):
         with subtests.test(content=content, message=message):
             write(content)

@@ -106,11 +106,11 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
     sink(joints)
     Motion(joints, FPS).save("motions/walks-after=good.npz/bad.npz")  # samples are in such folders
     assert main(["inspect", "motions/good.npz"]) == 0
-    assert "good: 0 of 1 motions with faults" in capsys.readouterr().out
+    assert "good: 0 of 1 motions have faults" in capsys.readouterr().out
     assert main(["inspect", "motions", "both.html"]) == 3
     printed = capsys.readouterr().out
     assert "penetration: left_foot, frames 30 to 39, 0.06 m (limit 0.05)" in printed
-    assert "motions: 1 of 2 motions with faults" in printed
+    assert "motions: 1 of 2 motions have faults" in printed
     shown = Page(tmp_path / "both.html").motions
     assert [motion["id"] for motion in shown] == ["walks-after=good.npz/bad", "good"], (
         "the worst first"
@@ -137,7 +137,7 @@ def test_the_worst_clips_of_a_data_set_are_shown(tmp_path, capsys):
     capsys.readouterr()
     assert main(["inspect", "synthetic", str(tmp_path / "page.html"), "clips=3", *data]) == 0
     printed = capsys.readouterr().out
-    assert "0 of 40 motions with faults" in printed
+    assert "0 of 40 motions have faults" in printed
     assert "the 3 worst motions" in printed
     assert len(Page(tmp_path / "page.html").motions) == 3
 

@@ -267,7 +267,7 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
     capfd.readouterr()
     for name, content, says in (
         ("model.json", description[:-9], "not an exported model"),
-        ("model.json", description.replace(b'"format": 1', b'"format": 2'), "not of format 1"),
+        ("model.json", description.replace(b'"format": 1', b'"format": 2'), "does not have format 1"),
         (
             "model.json",
             description.replace(b'"fps": 20', b'"fps": 0'),
@@ -325,7 +325,7 @@ def test_a_model_beyond_the_limits_of_the_runner_is_not_exported() -> None:
     model = tiny("mdm_encoder_small", "learned")
     assert onnx.description(model)["max_frames"] == 20
     model.facts |= {"max_frames": 20_000}
-    with pytest.raises(UserError, match="max_frames: not within the limits of an exported model"):
+    with pytest.raises(UserError, match="max_frames: outside the limits for exported models"):
         onnx.description(model)
 
 

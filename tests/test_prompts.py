@@ -42,7 +42,7 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     )
     assert main(["sample", str(trained), "prompts=p.txt", "seconds=[0.5,1,0.5]", "samples=2"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    page = lines[-1].removeprefix("6 motions for 3 prompts, a folder for each: ")
+    page = lines[-1].removeprefix("6 motions for 3 prompts, one folder per prompt: ")
     assert page == "samples/quickstart/p.html"
     assert all(
         json.dumps(text, ensure_ascii=True)[1:-1] in Path(page).read_text() for text in PROMPTS
@@ -98,7 +98,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
             ["mp4=true"],
             'mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"',
         ),
-        (b"walks", ["text=jumps"], "text and prompts exclude each other. Give only one of them"),
+        (b"walks", ["text=jumps"], "text and prompts exclude each other. Use only one of them"),
         (
             b"walks\njumps",
             ["seconds=[1,2,3]"],
@@ -136,7 +136,7 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
     words = ["prompts=p.txt", "seconds=[1,1,1,30,1,1.5]", "samples=1", "num_inference_steps=2"]
     assert main(["sample", str(trained), *words]) == 1
     printed = capsys.readouterr()
-    assert "2 motions for 2 prompts, a folder for each: samples/quickstart/p.html" in printed.out
+    assert "2 motions for 2 prompts, one folder per prompt: samples/quickstart/p.html" in printed.out
     *errors, total = printed.err.splitlines()[-5:]
     assert total == "error: p.txt: 4 of 6 prompts cannot be sampled. Correct the lines above"
     for line, number, message in zip(

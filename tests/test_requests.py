@@ -218,10 +218,10 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys, sub
     for options, message in (
         (
             ["scorer=quickstart"],
-            "scorer=quickstart chooses among motions for a text. Give text=... and candidates=8",
+            "scorer=quickstart chooses among motions for a text. Add text=... and candidates=8",
         ),
         (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
-        (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
+        (["scorer=quickstart", "candidates=2"], "contains a motion generator, not a motion-CLIP"),
     ):
         with subtests.test(options=options, message=message):
             assert message in error_of(capsys, "sample", "quickstart", *words, *options)

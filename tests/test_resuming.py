@@ -154,11 +154,11 @@ def test_files_of_version_0_1_are_one_line(best, tmp_path):
     content, file = best[0], tmp_path / "old.ckpt"
     torch.save({key: value for key, value in content.items() if key != FORMAT_KEY}, file)
     with pytest.raises(
-        UserError, match=r"old\.ckpt: written by version 0\.1 of flame_mdm, .* Train or import the"
+        UserError, match=r"old\.ckpt: written by flame_mdm 0\.1, .* Train or import the"
     ):
         load(file)
     torch.save(content | {FORMAT_KEY: 3}, file)
-    with pytest.raises(UserError, match="has format 3, but this version reads 2"):
+    with pytest.raises(UserError, match="has format 3, but this version reads format 2"):
         load(file)
 
 

@@ -341,7 +341,7 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
         torch.save(whole | {part: lacking}, bad / "bad.ckpt")
         refuses(bad / "bad.ckpt", f"bad.ckpt is damaged: {part} has no {name}")
     torch.save({"state_dict": {}}, bad / "bad.ckpt")
-    refuses(bad / "bad.ckpt", "holds no recipe")
+    refuses(bad / "bad.ckpt", "contains no recipe")
     says = "the weights do not match the recipe saved with them: size mismatch"
     refuses(changed(config__denoiser__latent_dim=32), says)
     attacked("export", str(changed(config__denoiser={})), "out=x", says="damaged: config.denoiser")

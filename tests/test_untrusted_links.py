@@ -500,7 +500,7 @@ def test_push_overwrites_the_model_file_that_it_wrote_only(tmp_path, trained):
     for _ in range(2):
         hub.push(trained, "me/walker", tmp_path, upload=False, private=False)
     model.write_bytes(b"of somebody else")
-    with one_line_error("not written by push"):
+    with one_line_error("push did not write it"):
         hub.push(trained, "me/walker", tmp_path, upload=False, private=False)
     assert model.read_bytes() == b"of somebody else"
 

@@ -409,10 +409,10 @@ def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, 
             str(trained),
             name,
             "dry_run=true",
-            says="not a repository name. Write user/name",
+            says="not a repository name. Use user/name",
         )
     (bad / "config.yaml").write_text("mine")
-    attacked("push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="not written by push")
+    attacked("push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="push did not write it")
     assert [path.read_text() for path in bad.iterdir()] == ["mine"]
     for _ in range(2):
         assert main(["push", str(trained), "a/x.safetensors", "dry_run=true"]) == 0

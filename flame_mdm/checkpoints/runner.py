@@ -300,7 +300,7 @@ class Sampler:
             frames = round(min(seconds * fps, longest + 1)) if seconds > 0 else 0
         if not 2 <= frames <= longest:
             raise ValueError(
-                f"seconds={seconds}: expected {2 / fps:g} to {longest / fps:g} seconds"
+                f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds"
             )
 
         condition, name = self._condition(prompt), f"{prompt}#{sample}"
@@ -511,7 +511,7 @@ def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
         return kind(options[key])
     except ValueError as error:
         raise ValueError(
-            f"{key}={options[key][:40]}: expected a {'whole ' if kind is int else ''}number"
+            f"{key}={options[key][:40]}: give a {'whole ' if kind is int else ''}number"
         ) from error
 
 

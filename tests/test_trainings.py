@@ -102,7 +102,7 @@ def test_a_training_needs_the_earlier_ones_whose_runs_it_names():
 
 def test_the_number_of_trainings_at_once_is_checked(tmp_path):
     settings = BenchmarkSettings(exp="synthetic", out=str(tmp_path), jobs=0)
-    with pytest.raises(UserError, match=r"^jobs=0: must be at least 1\. Set it to the number of models to train at the same time$"):
+    with pytest.raises(UserError, match=r"^jobs=0: must be at least 1\. Set it"):
         main(settings)
 
 

@@ -299,9 +299,7 @@ class Sampler:
         else:
             frames = round(min(seconds * fps, longest + 1)) if seconds > 0 else 0
         if not 2 <= frames <= longest:
-            raise ValueError(
-                f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds"
-            )
+            raise ValueError(f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds")
 
         condition, name = self._condition(prompt), f"{prompt}#{sample}"
         if "start" not in content:

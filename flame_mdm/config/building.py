@@ -38,9 +38,9 @@ RENAMED = {
 }
 """Names of classes in configurations of version 0.2, and their current names."""
 ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
-"""Tasks of adaptations, whose configurations have a key `base`, in version 0.2 and currently."""
+"""Names of the task that adapts models, whose configuration has a key `base`: in version 0.2, and now."""
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
-"""Limits of a configuration file: number of values, and depth of nested mappings and lists."""
+"""Limits for a configuration file: number of values, and depth of nested mappings and lists."""
 RUN_DIR = "${run.dir}"
 """Placeholder for the run directory in a saved `config.yaml`.
 
@@ -52,8 +52,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     """Checks that the content of the untrusted file `where` has only plain values and no interpolations.
 
     Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any
-    environment variable. The interpolation `but` is allowed at the beginning of a text. Raises
-    `UserError` if the check fails, or if the content is nested too deeply or contains itself.
+    environment variable. Only the interpolation `but` is allowed, at the beginning of a text. Raises
+    `UserError` if the check fails, or if the content is too large, nested too deeply or contains
+    itself.
     """
     count = 0
 
@@ -70,8 +71,8 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
                 check_value(name, path)
         elif isinstance(value, str) and "${" in value.removeprefix(but):
             raise UserError(
-                f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, "
-                f"{shortened(value, 60)}. Write the value itself: this file may only hold plain "
+                f"{where}: {'.'.join(path) or 'a key'} contains the interpolation "
+                f"{shortened(value, 60)}. Replace it with its value: this file may only contain plain "
                 f"values"
             )
         elif not isinstance(value, str | int | float | None):
@@ -83,7 +84,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Returns a configuration with the current names of its classes. It may be of an earlier version."""
+    """Returns a configuration, which may be from an earlier version, with the current names of its classes."""
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config
@@ -198,8 +199,8 @@ def trust(config: Config) -> None:
         package = str(target).partition(".")[0]
         if package not in added:
             raise UserError(
-                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is only run if "
-                f"you trust it: set FLAME_MDM_TRUST={package}"
+                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is run only if "
+                f"you trust it. To trust it, set FLAME_MDM_TRUST={package}"
             )
     check(config)
 

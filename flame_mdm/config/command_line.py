@@ -93,7 +93,7 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     for entry in fields(kind):  # type: ignore[arg-type]
         if entry.default is entry.default_factory is MISSING and entry.name not in values:
             usage = cleandoc(kind.__doc__ or "").splitlines()[0].removeprefix("usage: ")
-            raise UserError(f"no {entry.name} given. Write {usage}")
+            raise UserError(f"{entry.name} is missing. Usage: {usage}")
     return kind(**values, **({"composed": tuple(composed)} if composed else {}))
 
 
@@ -121,18 +121,19 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
             ) from error
         if not names or not all(names):
             raise UserError(
-                f"{key}={text}: no name given. Give at least one name; separate several names "
-                f"with spaces"
+                f"{key}={text}: the list is empty. Set it to one or more names, separated by spaces"
             )
         return names
     override = parse([f"{key}={text}"])[0]
     if override.is_sweep_override() and sweeps:
         raise UserError(
             f"{key}={text}: several values make a sweep with one job per value. Add --multirun, "
-            f"or give one value"
+            f"or use a single value"
         )
     if override.is_sweep_override():
-        raise UserError(f"{key}={text}: several values. Give one value, or a list: {key}=[{text}]")
+        raise UserError(
+            f"{key}={text}: several values. Use a single value, or a list: {key}=[{text}]"
+        )
     value = override.value()
     check_kind(key, value, annotation)
     return value
@@ -159,7 +160,7 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
             raise UserError(
                 f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
             )
-    # Surplus words remain unchanged, and are refused later because they have no key
+    # Additional words remain unchanged, and are refused later because they have no key
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
     return keyed + leading[len(objects) :] + rest
 
@@ -220,7 +221,7 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code.
 
-    A signal of `signums` ends the action after it has cleaned up. An error that the user can fix is
+    A signal in `signums` ends the action after it has cleaned up. An error that the user can fix is
     printed as one line, and 1 is returned. FLAME_MDM_TRACEBACK=1 prints the traceback first. Any
     other exception is a bug: the traceback is printed with a request to report it, and `BUG` is
     returned.
@@ -236,7 +237,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except Exception as error:
         verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
         if isinstance(error, MemoryError) and not verbose:
-            # frees the variables of the frames, because printing a line also takes memory
+            # Frees the variables of the stack frames, because printing a line also takes memory
             error.__traceback__ = None
         line = explanation(error)
         if line is None or verbose:
@@ -255,7 +256,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 def explanation(error: Exception) -> str | None:
     """Returns the line for an error that the user can fix; None for a bug.
 
-    Such errors are a `UserError`, an error of a file, and a lack of memory.
+    The user can fix a `UserError`, a file error, and a lack of memory.
     """
     if isinstance(error, UserError):
         return first_line(error)

@@ -31,9 +31,9 @@ LAUNCH = "launch"  # folder of `experiments/` with launchers, which start jobs o
 
 
 def groups() -> list[str]:
-    """Returns the replaceable parts of a recipe.
+    """Returns the names of the parts that can be replaced in a recipe.
 
-    They are the folders of `experiments/` whose files are options instead of recipes.
+    They are the folders of `experiments/` whose files are options for a part instead of recipes.
     """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
@@ -111,7 +111,7 @@ def prepare_overrides(
 
 
 def first_choice(override: Override) -> str:
-    """Returns the override. The override of a sweep is reduced to its first value."""
+    """Returns the override. If it sweeps over several values, only its first value is kept."""
     if override.is_sweep_override():
         return f"{override.get_key_element()}={choices(override)[0]}"
     return str(override.input_line)
@@ -130,20 +130,21 @@ def _options(group: str) -> list[str]:
 
 
 def find_recipe(name: str) -> ConfigSource:
-    """Returns the location of an experiment's recipe: a .yaml file, or a name such as `humanml3d/mdm`.
+    """Returns the location of an experiment's recipe.
 
-    Raises `UserError` for a name or file that does not exist.
+    `name` is the path of a .yaml file, or a name in `experiments/` such as `humanml3d/mdm`. Raises
+    `UserError` if there is no such file or experiment.
     """
     if name.endswith((".yaml", ".yml")):
         path = Path(name).resolve()
         if not path.is_file():
             raise UserError(
-                f"{name}: no such file. Give EXP an experiment or the path of a config.yaml"
+                f"{name}: no such file. Use the name of an experiment, or the path of a config.yaml"
             )
         content = read_yaml(path)
         if not isinstance(content, dict):
             raise UserError(
-                f"{name}: not a recipe: it has no keys. Begin with `defaults:` and another recipe"
+                f"{name}: not a recipe, because it has no keys. Begin it with `defaults:` and another recipe"
             )
         saved = "defaults" not in content
         if saved:
@@ -200,7 +201,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
                 )
         if group == LAUNCH and source_file("submitit") is None:
             raise UserError(
-                f"{override.input_line} needs hydra-submitit-launcher: pip install flame-mdm[slurm]"
+                f'{override.input_line} needs hydra-submitit-launcher. Run pip install "flame-mdm[slurm]"'
             )
 
 
@@ -218,7 +219,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 
 
 def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
-    """Composes a configuration with prepared overrides. Raises `UserError` for errors of Hydra."""
+    """Composes a configuration with prepared overrides. Converts Hydra's errors to `UserError`."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):

@@ -56,7 +56,7 @@ def _serve(
     jobs = [checked_settings(kind, list(combination)) for combination in combinations]
     out = vars(jobs[0]).get("out")
     if len(jobs) > 1 and out is not None:
-        raise UserError(f"out={out}: {len(jobs)} jobs would write to it. Remove out=")
+        raise UserError(f"out={out}: {len(jobs)} jobs would write to this path. Remove out=")
 
     starts = [partial(guarded, partial(command, job), STOP) for job in jobs]
     if launcher:

@@ -71,9 +71,9 @@ ARGUMENTS = {
     "losses": "flame_mdm.losses.MotionLosses",
     "ema": "flame_mdm.training.averaging.MovingAverage",
 }
-"""Keys of a recipe whose mapping contains the arguments of a class -> this class."""
+"""Class whose arguments a mapping in a recipe contains, by the key of the mapping."""
 
-DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes must not set
+DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes cannot set
 
 
 def check_top_level(config: Config) -> None:
@@ -207,7 +207,7 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
         key = f"{path}{name}"
         if name not in config:
             if "_target_" not in base and path != "callbacks.":
-                raise UserError(f"{key} cannot be removed. Give it another value")
+                raise UserError(f"{key} cannot be removed. Set it to another value")
         elif isinstance(value, Mapping):
             if isinstance(config[name], Mapping):
                 check_same_kinds(
@@ -263,7 +263,7 @@ def parameters(target: str) -> frozenset[str]:
 
 @functools.cache
 def _signature(target: str) -> dict[str, str]:
-    """Returns the names of the arguments of a class or function, with their annotations ("" = none)."""
+    """Returns the argument names of a class or function, with their annotations ("" = no annotation)."""
     module, _, name = target.rpartition(".")
     node = definition(module, name)
     if node is None:

@@ -49,7 +49,9 @@ def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str
 def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[int]) -> None:
     name, *words = words
     if name.startswith("-") or "=" in name:
-        raise UserError(f"the first word must name an experiment, such as quickstart, not '{name}'")
+        raise UserError(
+            f"the first word is '{name}', but it must name an experiment, such as quickstart"
+        )
     recipe = composition.find_recipe(name)
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in SWEEP]:
@@ -66,7 +68,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     if lists and not sweep:
         raise UserError(
             f"{lists[0]}: several values make a sweep with one run per value. Add --multirun, "
-            f"or give one value"
+            f"or use a single value"
         )
     config = composition.resolve(
         recipe, [composition.first_choice(o) for o in parsed] if sweep else overrides, base
@@ -78,7 +80,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         )
 
     def start(config: Config, task: Sequence[str]) -> int:
-        # Lightning starts further processes with these command-line arguments.
+        # Lightning starts additional processes with these command-line arguments.
         sys.argv = [sys.argv[0], "train", name, *task, quoted(f"run.dir={config['run']['dir']}")]
         codes.append(guarded(lambda: command(config), INTERRUPT))
         return codes[-1]
@@ -122,7 +124,7 @@ def check_launcher(launchers: Sequence[str]) -> None:
     """Raises `UserError` if a launcher cannot start jobs on this machine."""
     if "slurm" in launchers and shutil.which("srun") is None:
         raise UserError(
-            "launch=slurm: srun is not on this machine. Run the command where SLURM is, or use launch=local"
+            "launch=slurm: this machine has no srun. Run the command on a SLURM cluster, or use launch=local"
         )
 
 
@@ -147,7 +149,7 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe lacks a part, or has a value that training would refuse only later."""
+    """Raises `UserError` if a recipe lacks a part, or has an invalid value that would only be noticed later."""
     plain(config, name)  # otherwise, the checkpoints of the run would be refused
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]
@@ -161,8 +163,8 @@ def _check_whole(config: Config, name: str) -> None:
         lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
     if lacking:
         raise UserError(
-            f"{name}: {lacking[0]} is missing. Set it, or begin with the defaults of another "
-            f"recipe, or with /base"
+            f"{name}: {lacking[0]} is missing. Set it, or begin with `defaults:` and another recipe, "
+            f"or /base"
         )
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:

@@ -37,7 +37,7 @@ class Denoiser(nn.Module, ABC):
     """
 
     #: Whether padding has no influence on real frames. If False, the network attends to padding,
-    #: and sampling uses the padded length of the training.
+    #: and sampling uses the padded length of the training batches.
     mask_padding: bool = True
 
     #: Number of clean frames before the motion that the network reads in `Condition.prefix`.

@@ -33,8 +33,8 @@ class FLAME(Denoiser):
             first two rows).
         condition_frames: also add TS and CLS to every frame. A small network then learns to
             follow the text in fewer steps.
-        length_unit: unit of the windows in training, in frames. ML embeds the length rounded down
-            to a multiple of this unit.
+        length_unit: number of frames of which the lengths of the training windows are multiples. ML
+            embeds the length rounded down to such a multiple.
 
     Example:
         >>> denoiser = FLAME(
@@ -64,7 +64,7 @@ class FLAME(Denoiser):
     ):
         super().__init__()
         if type(length_unit) is not int or length_unit < 1:
-            raise UserError(f"length_unit is {length_unit}: choose a number of frames, 1 or more")
+            raise UserError(f"length_unit={length_unit}: expected a number of frames, at least 1")
         self.max_frames, self.condition_frames, self.length_unit = (
             max_frames,
             condition_frames,
@@ -91,8 +91,8 @@ class FLAME(Denoiser):
             lengths = mask.sum(1)
             if x_t.shape[1] > self.max_frames and lengths.max() > self.max_frames:
                 raise UserError(
-                    f"a motion of {int(lengths.max())} frames is too long for the length token: "
-                    f"increase denoiser.max_frames ({self.max_frames})"
+                    f"a motion of {int(lengths.max())} frames is too long for the length token. "
+                    f"Increase denoiser.max_frames ({self.max_frames})"
                 )
             lengths = (lengths // self.length_unit * self.length_unit).clamp(min=self.length_unit)
             prefix.insert(0, self.length_embedding(lengths % self.max_frames))
@@ -123,7 +123,7 @@ class FLAME(Denoiser):
 def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
     """Embeds positions or times (N,) as (N, features) float32.
 
-    The first half of the features are cosines, the second half sines.
+    The first half of the features are cosines, and the second half are sines.
     """
     half = features // 2
     frequency = torch.exp(

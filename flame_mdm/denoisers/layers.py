@@ -11,10 +11,10 @@ from flame_mdm.errors import UserError
 
 
 def sinusoid(position: Tensor, features: int) -> Tensor:
-    """Returns the sinusoids (N, features) of positions (Vaswani et al. 2017, section 3.5).
+    """Returns sinusoidal embeddings (N, features) for positions (N,) (Vaswani et al. 2017, section 3.5).
 
-    Even channels are sines, odd channels are cosines. They are computed in float32, regardless of
-    the precision of the network, as in the training of the released weights.
+    Even channels are sines, and odd channels are cosines. They are computed in float32, regardless
+    of the precision of the network, as when the released weights were trained.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
@@ -50,8 +50,8 @@ class Attention(nn.Module):
 
         Args:
             x: (B, N, C), the queries.
-            mask: (B, S) bool, True = real entry; None = all are real.
-            memory: (B, S, C).
+            mask: (B, S) bool, True = real entry; None = all entries are real.
+            memory: (B, S, C), the keys and values. Default: x.
         """
 
         def heads(y: Tensor, parts: int) -> Tensor:
@@ -160,7 +160,7 @@ class Transformer(nn.Module):
 
 
 class TimeAndCondition(nn.Module):
-    """z_tk of MDM (Tevet et al. 2023, section 3).
+    """The token z_tk of MDM (Tevet et al. 2023, section 3).
 
     It is the sinusoid of the time after two linear layers, plus the projected condition. The null
     condition is a zero vector *before* the projection, so that only the bias of the projection
@@ -190,7 +190,7 @@ class TimeAndCondition(nn.Module):
     def forward(self, t: Tensor, condition: Tensor) -> Tensor:
         """Embeds times (B,) and a condition (B, C) as (B, features).
 
-        A condition (B, S, C) gives (B, S, features).
+        For a condition (B, S, C), the result is (B, S, features).
         """
         return self.add(self.time(t), condition)
 

@@ -79,7 +79,8 @@ class MDMEncoder(Denoiser):
             tokens, token_mask = condition_tokens(cond)
             if tokens.shape[1] > self.max_tokens:
                 raise UserError(
-                    f"denoiser.max_tokens={self.max_tokens}: give at least {tokens.shape[1]}"
+                    f"denoiser.max_tokens={self.max_tokens}: captions have {tokens.shape[1]} tokens. Set it "
+                    f"to at least {tokens.shape[1]}"
                 )
             prefix = torch.cat(
                 [self.condition.time(t)[:, None], self.condition.projection(tokens)], 1
@@ -168,12 +169,12 @@ class MDMDecoder(Denoiser):
         self.condition_frames = condition_frames
         if memory == "concat" and not token_memory:
             raise UserError(
-                "denoiser.memory=concat: the token of the time is added to the condition tokens, "
-                "which are not in the memory. Set token_memory=true"
+                "denoiser.memory=concat: the time token would precede the condition tokens, "
+                "but they are not in the memory. Set token_memory=true"
             )
         if type(context_frames) is not int or context_frames < 0:
             raise UserError(
-                f"denoiser.context_frames={context_frames}: give the number of frames, 0 or more"
+                f"denoiser.context_frames={context_frames}: expected a number of frames, at least 0"
             )
         self.input_token, self.mask_padding, self.context_frames = (
             input_token,
@@ -253,6 +254,6 @@ def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
     """Returns the tokens (B, S, C) and their mask (B, S). Raises `UserError` if there are no tokens."""
     if cond.token_mask is None or not cond.tokens.shape[1]:
         raise UserError(
-            "this denoiser needs condition tokens, but the condition encoder has none: choose another one"
+            "this denoiser needs condition tokens, but the condition encoder has none. Choose another encoder"
         )
     return cond.tokens, cond.token_mask

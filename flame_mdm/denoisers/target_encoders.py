@@ -105,6 +105,6 @@ TARGET_ENCODERS: dict[str, type[TargetEncoder]] = {
 def perceptron(in_features: int, features: int, layers: int) -> nn.Sequential:
     """Returns a network with `layers` hidden layers of width `features`."""
     if layers < 1:
-        raise UserError(f"denoiser.target_layers={layers}: give 1 or more")
+        raise UserError(f"denoiser.target_layers={layers}: must be at least 1")
     hidden = [layer for _ in range(layers) for layer in (nn.SiLU(), nn.Linear(features, features))]
     return nn.Sequential(nn.Linear(in_features, features), *hidden)

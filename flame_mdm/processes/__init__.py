@@ -15,12 +15,12 @@ from flame_mdm.sampler_options import SamplerOptions
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """Signature of additional losses: (x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> losses by name.
 
-Each loss (B,) of the clean estimate x0_hat is weighted, with one value per sample.
+Each loss (B,) is already weighted and has one value per sample.
 """
 
 
 class Process(nn.Module, ABC):
-    """Base class of generative processes: paths between noise and data.
+    """Base class for generative processes: paths between noise and data.
 
     Subclasses are Gaussian diffusion and flow matching. A process corrupts motions in training,
     defines what the denoiser predicts, and samples motions from noise. Only the process interprets
@@ -42,7 +42,7 @@ class Process(nn.Module, ABC):
     #: What the denoiser returns: "x0" (the clean motion), "epsilon" (the noise) or "velocity".
     prediction: str
 
-    #: Modes of `Edit` that sampling supports. The first mode is the authors' mode.
+    #: Modes of `Edit` that sampling supports. The first one is the mode that the authors use.
     edit_modes: Sequence[str] = ()
 
     #: Samplers by name.
@@ -75,7 +75,7 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D).
+        """Returns the clean estimate (B, F, D), given the denoiser's output for the noisy motion x_t.
 
         If the output is target(x, noise, t) and the noisy motion is corrupt(x, noise, t), the
         clean estimate is x.
@@ -190,14 +190,14 @@ class Process(nn.Module, ABC):
         name = options.sampler
         if name is None or name not in self.samplers:
             raise UserError(
-                f"unknown sampler '{name}': {type(self).__name__} has {', '.join(self.samplers)}"
+                f"unknown sampler '{name}'. {type(self).__name__} has {', '.join(self.samplers)}"
             )
         names = ["guidance_scale", "sampler", "num_inference_steps", *self.samplers[name].options]
         for option, value in options.chosen().items():
             if option not in names:
                 has = ", ".join(names)
                 raise UserError(
-                    f"{option}={value}: the sampler {name} has no such option. Omit it, or give {has}"
+                    f"{option}={value}: the sampler {name} has no such option. Omit it, or use {has}"
                 )
         return self.samplers[name]
 
@@ -218,7 +218,7 @@ class Process(nn.Module, ABC):
         if options.sampler not in able:
             edits = " and ".join(sorted(kinds))
             raise UserError(
-                f"{options.sampler} cannot edit with {edits}: choose the sampler from {', '.join(able)}"
+                f"{options.sampler} cannot edit with {edits}. Set the sampler to {', '.join(able)}"
             )
         shapes = [tuple(x.shape) for x in (edit.known, edit.keep, mask)]
         if shapes[0] != shapes[1] or shapes[0][:2] != shapes[2]:

@@ -40,7 +40,7 @@ class GaussianDiffusion(Process):
             in FLAME's code. Short motions then have less weight. The denoiser must return 0 in
             the padding.
         clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
-        timestep_sampling: how training steps are drawn (FLAME, tables 6 and 7).
+        timestep_sampling: distribution of the training steps (FLAME, tables 6 and 7).
         skip: only for prediction epsilon. The noise is sqrt(1 - ab) x_t + sqrt(ab) times the output
             (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a velocity,
             trained with the error of the noise. The network need not pass its input through, and
@@ -92,7 +92,7 @@ class GaussianDiffusion(Process):
         if prediction != "epsilon" and skip:
             raise UserError("skip=true needs prediction=epsilon")
         if min_snr is not None and not 0 < min_snr < math.inf:
-            raise UserError(f"min_snr={min_snr}: give a number above 0, such as 5, or null")
+            raise UserError(f"min_snr={min_snr}: expected a number above 0, such as 5, or null")
         self.schedule = build_schedule(schedule, num_train_timesteps, noise_scale)
         self.prediction, self.skip, self.min_snr = prediction, skip, min_snr
         self.variance, self.vlb_weight = variance, vlb_weight
@@ -258,7 +258,7 @@ class GaussianDiffusion(Process):
             steps = list(chosen)
             if len(steps) < 2 or steps != sorted(set(steps)) or steps[-1] >= total:
                 raise UserError(
-                    f"num_inference_steps={steps}: give 2 or more increasing steps from 0 to {total - 1}"
+                    f"num_inference_steps={steps}: expected 2 or more increasing steps from 0 to {total - 1}"
                 )
             return steps
         least = 1 if options.sampler == "consistency" else 2

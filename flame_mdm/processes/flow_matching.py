@@ -64,7 +64,7 @@ class FlowMatching(Process):
     ):
         super().__init__()
         if not 0 <= sigma_min < 1:
-            raise UserError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
+            raise UserError(f"sigma_min={sigma_min}: expected a number in [0, 1)")
         self.sigma_min, self.prediction, self.time_distribution = (
             sigma_min,
             prediction,
@@ -137,7 +137,7 @@ class FlowMatching(Process):
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
             raise UserError(
-                f"num_inference_steps={count}: a flow takes equal steps. Give their number"
+                f"num_inference_steps={count}: a flow takes equal steps. Set it to the number of steps"
             )
         if edit is not None:
             self.check_edit(edit, mask, options)

@@ -19,7 +19,7 @@ If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noi
 training. In one experiment, arms became longer by a third.
 """
 CLOSE, MOST_STEPS = 0.005, 8
-"""Limits of the search for a motion that reaches positions.
+"""Limits for the search for a motion that reaches positions.
 
 The search ends when the error is below `CLOSE` meters, or after `MOST_STEPS` steps.
 """
@@ -104,7 +104,7 @@ def steer(
     to_joints: Callable[[Tensor], Tensor],
     positions: Positions,
 ) -> Tensor:
-    """Leads noisy motions toward world positions.
+    """Guides noisy motions toward world positions.
 
     Each step follows the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
     sampling"), so the entire body moves with the joints in a way that is plausible to the

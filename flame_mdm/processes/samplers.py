@@ -1,4 +1,4 @@
-"""Samplers: functions that take one step from noise toward motion, with their capabilities.
+"""Samplers: functions that take one step from noise toward motion, and what they support.
 
 Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they get the
 clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field. Coefficients
@@ -27,7 +27,7 @@ Velocity = Callable[[Tensor, float | Tensor], Tensor]  # (x (B, F, D), time t) -
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler: the function that takes one step, and the capabilities of the sampler.
+    """A sampler: the function that takes one step, and what the sampler supports.
 
     Example:
         >>> DIFFUSION_SAMPLERS["ddim"].options

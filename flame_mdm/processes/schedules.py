@@ -33,7 +33,7 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 
 
 def linear_betas(num_train_timesteps: int) -> Tensor:
-    """Returns the noise variances (T,) float64 of Ho et al. 2020, section 4.
+    """Returns the noise variances (T,) float64 of the linear schedule (Ho et al. 2020, section 4).
 
     The variances increase from 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T,
     so that the final noise is the same, as in guided-diffusion. All variances are clipped at 0.999.
@@ -50,7 +50,7 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
 
 
 def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
-    """Returns noise variances (T,) with more noise.
+    """Returns the noise variances (T,) of a schedule with more noise.
 
     At each step, the noise-to-signal ratio is multiplied by `noise_scale`. This shifts the
     logarithm of the signal-to-noise ratio (Hoogeboom et al. 2023, "simple diffusion", section 2.2).
@@ -170,11 +170,11 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
     """
     if not 2 <= num_train_timesteps <= MAX_STEPS:
         raise UserError(
-            f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps"
+            f"num_train_timesteps={num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps"
         )
     if not 0 < noise_scale < math.inf:
         raise UserError(
-            f"noise_scale={noise_scale}: give a number above 0; 1 = as much noise as usual"
+            f"noise_scale={noise_scale}: expected a number above 0; 1 = the noise of the schedule, unchanged"
         )
     betas = {"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps)
     return Schedule(betas if noise_scale == 1 else with_more_noise(betas, noise_scale))
@@ -205,15 +205,13 @@ def timesteps(
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:
-        raise UserError(
-            f"num_inference_steps is {count}: choose from 1 to num_train_timesteps = {total}"
-        )
+        raise UserError(f"num_inference_steps={count}: expected 1 to num_train_timesteps = {total}")
     if spacing == "stride":
         for steps in (range(0, total, stride) for stride in range(1, total + 1)):
             if len(steps) == count:
                 return list(steps)
         raise UserError(
-            f"no stride gives {count} of {total} steps: choose another number or spacing=linspace"
+            f"no stride selects {count} of {total} steps. Choose another number of steps, or set spacing=linspace"
         )
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
     # This is a running sum instead of i * stride, because its rounding decides ties. The released

@@ -30,10 +30,10 @@ class Windows:
 
 
 def blended(denoise: Denoise, windows: Windows) -> Denoise:
-    """Returns a denoiser of entire motions, which may be longer than the motions in training.
+    """Returns a denoiser for entire motions, which may be longer than the motions in training.
 
     Args:
-        denoise: denoiser of the windows.
+        denoise: denoiser for the windows.
         windows: the windows; see `cover`.
 
     Returns:

@@ -43,7 +43,7 @@ class Frames:
 
 
 class Representation(nn.Module, ABC):
-    """Base class of all representations: conversions of motions to features and back.
+    """Base class for representations, which convert motions to features and back.
 
     Mean and std are buffers, so that sampling needs no data set.
 
@@ -78,7 +78,7 @@ class Representation(nn.Module, ABC):
     #: Name of a longer representation that begins with these features, so that its features can be
     #: cut to them.
     part_of: str = ""
-    #: Whether the root moves by steps between frames. If so, any window of frames is a motion.
+    #: Whether the root is encoded as steps between frames. If so, any window of frames is a motion.
     relative: bool = True
     #: Columns of the features by name.
     slices: Mapping[str, slice] = {}
@@ -88,9 +88,7 @@ class Representation(nn.Module, ABC):
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         super().__init__()
         if not isinstance(fps, int | float) or not 1 <= fps <= 1000:
-            raise UserError(
-                f"representation.fps={fps}: frames per second must be a number from 1 to 1000"
-            )
+            raise UserError(f"representation.fps={fps}: expected frames per second from 1 to 1000")
         self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
         self.pose = slice(0, features)
         self.register_buffer("mean", torch.zeros(features))
@@ -149,7 +147,7 @@ class Representation(nn.Module, ABC):
         return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
-        """Adapts features (..., F, D) of cuts, so that they start like complete motions.
+        """Adapts the features (..., F, D) of clips that were cut, so that they start like complete motions.
 
         By default, the features are returned unchanged.
         """
@@ -175,7 +173,9 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
     """Raises `UserError` if a raw motion (F, ...) contains a number that is not finite."""
     if not motion.isfinite().all():
         frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
-        raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
+        raise UserError(
+            f"{name}: frame {frame} contains numbers that are not finite. Leave the motion out"
+        )
 
 
 # Smallest standard deviation of a group of features that is not constant. Positions in KIT's units

@@ -40,8 +40,9 @@ class HumanML(Representation):
     Motions are first made canonical: the lowest joint is at y = 0, and in the first frame, the
     root is at x = z = 0 and the body faces +z.
 
-    The variant "legacy" equals the published data with all its peculiarities. Its heading subtracts
-    the hips from the shoulders instead of adding them. In the first frame, the heading is 0,
+    The variant "legacy" equals the published data with all its peculiarities. The direction across the
+    body is the direction across the shoulders minus the direction across the hips, instead of their
+    sum. In the first frame, the heading is 0,
     although the smoothed heading is not. `turn` is half the turn to the right, and changes its sign
     where the heading crosses 180 degrees. The root velocity is in the body coordinates of the next
     frame. Rotations are world rotations of the bones relative to the inverse heading, also at the
@@ -60,9 +61,9 @@ class HumanML(Representation):
         skeleton: key in `SKELETONS`.
         variant: "clean" for the intended features, "legacy" for the published features.
         fps: frames per second.
-        bone_lengths: J lengths in the features' unit. Each is the length of the bone that ends in a
-            joint. All motions are retargeted to these lengths. None = each motion keeps its own
-            lengths.
+        bone_lengths: for each of the J joints, the length of the bone that ends there, in the
+            features' unit. All motions are retargeted to these lengths. None = each motion keeps
+            its own lengths.
         units_per_metre: units of the features per meter.
         contact_threshold: squared displacement of a foot per frame, in the features' unit, below
             which the foot is in contact. HumanML3D uses 0.002, KIT 0.05.
@@ -90,7 +91,7 @@ class HumanML(Representation):
         contact_threshold: float = 0.002,
     ):
         if skeleton not in SKELETONS:
-            raise UserError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
+            raise UserError(f"skeleton={skeleton!r}: unknown. Use one of {', '.join(SKELETONS)}")
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
             raise UserError(
@@ -194,7 +195,7 @@ class HumanML(Representation):
                 )
             if len(motion) < 3:
                 raise UserError(
-                    f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out"
+                    f"{name}: {len(motion)} frames, but encoding needs at least 3. Leave the motion out"
                 )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]

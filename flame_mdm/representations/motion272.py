@@ -52,7 +52,7 @@ class Motion272(Representation):
         """Encodes a raw motion (F >= 2, 3 + 3 K) of `smpl.read_pose` as (F, 272) float32."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
-            raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
+            raise UserError("motion: 1 frame, but encoding needs at least 2. Leave the motion out")
         # Z up -> y up
         axes = torch.tensor(
             [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64
@@ -139,9 +139,9 @@ class Motion272(Representation):
         return inverse, torch.cat([velocity[..., :1, :], level], -2).cumsum(-2)
 
     def rebase(self, features: Features) -> Features:
-        """Sets the velocities and the turn in the first frame of cuts (..., F, D).
+        """Resets the velocities and the turn in the first frame of cut clips (..., F, D).
 
-        They are set to the values in the first frame of any motion: zeros and the identity.
+        The velocities are set to zero and the turn to the identity, as in the first frame of any motion.
         """
         cut = deepcopy(features)
         for name in ("root_velocity", "turn", "velocities"):
@@ -159,7 +159,7 @@ class Motion272(Representation):
 
 
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
-    """Turns a motion about y, so that the root faces +z in the first frame.
+    """Turns a motion about y so that the root faces +z in the first frame.
 
     The motion consists of the translation (F, 3) and rotations (F, J, 3, 3).
     """

@@ -43,7 +43,7 @@ class Rot6D(Representation):
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
 
     def rebase(self, features: Features) -> Features:
-        """Makes the root translation of cuts (..., F, D) relative to their first frame."""
+        """Makes the root translation of cut clips (..., F, D) relative to their first frame."""
         moved = deepcopy(features)
         translation = moved[..., 144:147]
         translation -= features[..., :1, 144:147]

@@ -167,7 +167,7 @@ def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
     """
     if sorted(order) != ["X", "Y", "Z"]:
         raise UserError(
-            f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'"
+            f"Euler order {order!r} is not supported. Use the letters X, Y and Z once each, as in 'ZXY'"
         )
     i, j, k = ("XYZ".index(axis) for axis in order)
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
@@ -260,7 +260,7 @@ def between(a: Tensor, b: Tensor) -> Tensor:
 def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
     """Returns a rotation on the shorter arc from `a` to `b` (..., 4).
 
-    `t` in [0, 1] is a number or has the shape (..., 1); 0 gives `a`, and 1 gives `b`.
+    `t` in [0, 1] is a number or has the shape (..., 1). The result is `a` for 0 and `b` for 1.
     """
     dot = (a * b).sum(-1, keepdim=True)
     b = torch.where(dot < 0, -b, b)

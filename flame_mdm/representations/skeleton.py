@@ -203,7 +203,7 @@ SMPL24 = Skeleton(
     leg=SMPL22.leg,
 )
 
-# The order is MMM's: root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH, RK,
+# The joints are in MMM's order: root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH, RK,
 # RA, RMrot, RF. KIT's coordinates are mirrored: the left side of a body that faces +z is at -x.
 # Therefore, the published code calls MMM's leg L the right leg. `facing` and `feet` keep the order
 # of the published code, whereas the names in this table are MMM's.

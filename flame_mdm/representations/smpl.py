@@ -27,9 +27,9 @@ rounded and made symmetric.
 
 
 AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
-"""Number of joints by the size of a frame of axis-angle vectors.
+"""Number of joints, by the number of axis-angle values per frame.
 
-The sizes are for the body alone, SMPL, SMPL+H and SMPL-X.
+The entries are for the body alone, SMPL, SMPL+H and SMPL-X.
 """
 
 

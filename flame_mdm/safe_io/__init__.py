@@ -35,7 +35,7 @@ MEBIBYTE = 2**20
 TEXT_LIMIT = 512 * MEBIBYTE
 """Maximum size of a text or JSON file.
 
-The largest known file, which contains BABEL's annotations, has 175 MiB.
+The largest known file, with BABEL's annotations, has 175 MiB.
 """
 YAML_LIMIT = MEBIBYTE // 4
 """Maximum size of a YAML file, because parsing is slow.
@@ -46,10 +46,10 @@ Recipes, skeletons, protocols and table specs are far smaller.
 YAML_NODES = 100_000
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
-"""Total size that the arrays of a compressed file may always have.
+"""Total size that the arrays in a compressed file may always have.
 
-Larger arrays may have at most `INFLATION` times the size of the file. Motion data is compressed by
-a factor of less than 10.
+Beyond this size, arrays may have at most `INFLATION` times the size of the file. Motion data is
+compressed by a factor of less than 10.
 """
 INFLATION = 20
 # Beginning of a pointer file, which replaces a file in Git LFS
@@ -216,8 +216,8 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
     """Holds a lock file that names the process and the host.
 
     Yields the name of a dead process that left the file behind, or "". If another process holds the
-    lock, `busy` is called with the name of this process. `busy` either raises an error, or returns
-    to wait. `advice` is part of the error message for file systems without locks. The operating
+    lock, `busy` is called with the name of the process that holds it. `busy` either raises an error,
+    or returns to wait. `advice` is part of the warning for file systems without locks. The operating
     system releases the lock when the process ends for any reason. The lock is a POSIX record lock,
     which also works between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has no
     such locks.
@@ -281,7 +281,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         )
     if status.st_size < POINTER_LIMIT and _begins(path, GIT_LFS):
         raise UserError(
-            f"{path}: a Git LFS pointer instead of the file. Run `git lfs pull` in its repository"
+            f"{path}: a Git LFS pointer instead of the file itself. Run `git lfs pull` in its repository"
         )
     return status.st_size
 
@@ -489,8 +489,7 @@ def check_members(count: int) -> None:
     """Raises `UserError` if an archive has too many members."""
     if count > MAX_MEMBERS:
         raise UserError(
-            f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and give the path "
-            f"of the folder instead"
+            f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and use the folder instead"
         )
 
 
@@ -519,14 +518,14 @@ def check_member(member: zipfile.ZipInfo) -> None:
         zipfile.ZIP_DEFLATED,
     ):
         raise UserError(
-            f"{member.filename}: encrypted, or compressed with another method than deflate"
+            f"{member.filename}: encrypted, or compressed with a method other than deflate"
         )
 
 
 def check_expansion(expanded: int, packed: int) -> None:
     """Raises `UserError` if compressed content expands disproportionately."""
     if expanded > max(ARRAYS_LIMIT, INFLATION * packed):
-        raise UserError(f"its {_size(packed)} expand to {_size(expanded)}; motion data does not")
+        raise UserError(f"its {_size(packed)} expand to {_size(expanded)}, unlike motion data")
 
 
 def _size(count: float) -> str:

@@ -40,7 +40,7 @@ def check_within(path: str | Path, root: str | Path) -> None:
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
-            f"{path}: a link leads out of {root}, to {target}. Nothing is written there: remove the link"
+            f"{path}: a link leads out of {root}, to {target}. Remove it, because files are not written through such links"
         )
 
 
@@ -49,7 +49,7 @@ def check_tree(folder: Path) -> None:
 
     Libraries open files in place. Raises `UserError` if the folder contains a link that leads out
     of the folder, a pipe, a device, or a file with a second name (hard link), through which a file
-    elsewhere would be changed.
+    outside the folder would be changed.
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -123,7 +123,8 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
 
     Args:
         folder: folder of the temporary files and folders.
-        path: only temporary files for this file or folder are removed; None = for any.
+        path: the file or folder whose temporary files are removed. None = the temporary files of all
+            files and folders.
         is_locked: whether this process holds the lock that writers of such files need. If it does,
             files of processes on other machines are also removed. Otherwise, these files remain,
             because their processes may be alive.

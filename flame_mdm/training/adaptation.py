@@ -1,5 +1,5 @@
 # pyright: standard
-"""Adaptation of a trained model to a few clips of the user. `docs/own-motion.md` is the guide."""
+"""Adaptation of a trained model to a few of the user's clips. `docs/own-motion.md` is the guide."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -42,7 +42,7 @@ from flame_mdm.visualize import player_page
 SAMPLED = 300
 # Number of clips with which the page compares models
 COMPARED = 32
-# Parts of the recipe that are taken from the base
+# Parts of the recipe that are taken from the base model
 OF_BASE = (
     "task",
     "losses",
@@ -54,7 +54,7 @@ OF_BASE = (
 
 
 class AdaptationTask(GeneratorTask):
-    """Trains a model further on the user's few clips, and on clips of its own data."""
+    """Continues to train a model on the user's few clips and on clips from its own training data."""
 
     def pretrain(self) -> None:
         """Does nothing, because the text encoder is already trained."""
@@ -101,8 +101,8 @@ def adapt(
         force: whether to accept clips that drift upward or float.
         rank: rank of the changes to the weights, 1 or more. Increase it for motions that are very
             different from the model's training data.
-        data_root: folder of the prepared data sets. If it lacks the data set of the base, 300 motions are sampled from
-            the base instead.
+        data_root: folder of the prepared data sets. If it lacks the base model's data set, 300 motions are sampled
+            from the base model instead.
         overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
 
     Returns:
@@ -123,16 +123,18 @@ def adapt(
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):
         raise UserError(
-            f"name={name}: give one word of letters and digits, since prompts contain 'in "
+            f"name={name}: expected one word of letters and digits, because prompts contain 'in "
             f"{name} style'"
         )
     task = load_task(file, GeneratorTask)
     model = task.generator
     if "distillation" in model.config:
-        raise UserError(f"{base}: a distilled model. Adapt its teacher, and distill the result")
+        raise UserError(
+            f"{base}: a distilled model cannot be adapted. Adapt its teacher, and distill the result"
+        )
     if model.conditioned_on != "text":
         raise UserError(
-            f"{base}: conditioned on {model.conditioned_on}. Give a model that is conditioned "
+            f"{base}: conditioned on {model.conditioned_on}. Use a model that is conditioned "
             f"on text"
         )
     captions = sorted({text for note in Folder(str(source)).notes.values() for text in note.texts})
@@ -143,7 +145,7 @@ def adapt(
         )
     if not force:
         check_clips(source, model.representation.fps)
-    check_tree(out)  # `_prior` writes its motions there before the training begins
+    check_tree(out)  # `_prior` writes its motions there before training begins
     config = _recipe(model, captions, name, out, overrides)
     config["base"], config["adapter"] = (
         str(base),
@@ -198,11 +200,11 @@ def _recipe(
 ) -> Config:
     """Returns the recipe of an adaptation.
 
-    Raises `UserError` for overrides of parts that are determined by the base.
+    Raises `UserError` for overrides of parts that the base model determines.
     """
     if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
-            f"{fixed[0]}: an adaptation keeps the {fixed[0].partition('.')[0]} of its base. "
+            f"{fixed[0]}: an adaptation keeps the {fixed[0].partition('.')[0]} of its base model. "
             f"Remove this override"
         )
     recipe = ConfigSource(EXPERIMENTS, "adapt")  # the caller checks the complete recipe
@@ -213,8 +215,8 @@ def _recipe(
     config["experiment"] = f"adapt/{name}"
     config["run"]["name"] = config["data"]["name"] = name
 
-    # Crop, kind of motion and learning rate are taken from the base. A released model has no data,
-    # so its crops are as long as its longest motion, in units of 4 frames.
+    # Crop, kind of motion and learning rate are taken from the base model. A released model has no
+    # data, so its crops are as long as its longest motion, in units of 4 frames.
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
@@ -222,8 +224,8 @@ def _recipe(
     kind = "smpl" if needs_rotations(model.representation) else "joints"
     config["data"]["source"]["motion"] = kind
 
-    # Samples show three captions of the user's clips, and three captions of the base in the new
-    # style.
+    # Samples show three captions of the user's clips, and three captions of the base model in the
+    # new style.
     few = captions[:: ceil_div(len(captions), 3)]
     texts = [*few, *list(model.facts.get("captions", ()))[:3]]
     config["callbacks"]["samples"]["prompts"] = [styled(text, name) for text in texts]
@@ -231,10 +233,10 @@ def _recipe(
 
 
 def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
-    """Returns the folder of the store with data of the base.
+    """Returns the folder of a store with data for the base model.
 
-    If `root` contains the store of the base's training data, this store is returned; otherwise, a
-    store of samples in `out`.
+    If `root` contains the store of the base model's training data, its folder is returned. Otherwise,
+    the folder is a store in `out`, with motions sampled from the base model.
     """
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
@@ -245,8 +247,8 @@ def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str
     folder = out / f"prior-{representation.name}"
     if not (folder / "store.json").exists():
         say(
-            f"the training data of the base is not in {root}: sampling {SAMPLED} motions from "
-            f"the base instead"
+            f"the training data of the base model is not in {root}: sampling {SAMPLED} motions from "
+            f"the base model instead"
         )
         write_store(
             folder,
@@ -283,7 +285,7 @@ class _Samples(MotionSource):
 
 
 def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
-    """Returns the page that compares the base with the adapted model, by their motions and losses."""
+    """Returns the page that compares motions and losses of the base model and the adapted model."""
     data.setup("fit")
     before, after = (task.generator for task in tasks)
     clips = data.train.clips
@@ -305,7 +307,7 @@ def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
     rows: list[list[str]] = []
     for label, chosen in (
         (f"loss on {len(lesson)} of your clips", lesson),
-        (f"loss on {len(kept)} clips it knew", kept),
+        (f"loss on {len(kept)} clips from its own data", kept),
     ):
         batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))
         with torch.no_grad():

@@ -35,7 +35,7 @@ class MovingAverage(WeightAveraging):
         from_initial_weights: bool = False,
     ):
         if not 0 <= decay <= 1:
-            raise UserError(f"ema.decay={decay}: give a number from 0 to 1")
+            raise UserError(f"ema.decay={decay}: expected a number from 0 to 1")
         super().__init__(use_buffers=False)
         self.average = get_ema_multi_avg_fn(decay)
         self.update_every_n_steps = update_every_n_steps
@@ -47,7 +47,7 @@ class MovingAverage(WeightAveraging):
         self.begun = False
 
     def averaged(self) -> Any:
-        """Returns the copy of the task that contains the averages.
+        """Returns the copy of the task that contains the averaged weights.
 
         During validation, this copy contains the trained weights instead.
         """
@@ -55,11 +55,11 @@ class MovingAverage(WeightAveraging):
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of the model and of the average once, because this takes time."""
+        """Collects the parameters of the model and the average once, because collecting them takes time."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
-            # shared buffers, so that both models always have the current buffers
+            # The buffers are shared, so that both models always have the current values
             copy._buffers = module._buffers
         self.updates = self._average_model.n_averaged  # type: ignore[union-attr]
         self.begun = int(self.updates) > 0 or (

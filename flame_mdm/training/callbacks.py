@@ -121,8 +121,8 @@ class Checkpoints(Checkpoint):
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`.
 
-    The values that the task reports are logged with them. Other steps are not slowed down. The norm
-    of all gradients is measured before clipping. Seconds per step do not include validation.
+    The values that the task reports are logged at the same steps. Other steps are not slowed down.
+    The norm of all gradients is measured before clipping. Seconds per step do not include validation.
 
     Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
     `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
@@ -256,7 +256,7 @@ class Report(Callback):
 
 
 def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
-    """Returns the name of the package's extractor for the motions of a model; "" without such an extractor."""
+    """Returns the name of the package's extractor for a model's motions; "" if there is no such extractor."""
     name = f"motion_clip_{facts.get('dataset')}"
     if name not in SHIPPED or "captions" not in facts:
         return ""
@@ -381,7 +381,7 @@ class SampleMotions(Callback):
         if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(
             actions
         ):
-            # A text-to-motion recipe was overridden with condition=action, so its prompts are texts
+            # The prompts are texts if a text-to-motion recipe was overridden with condition=action
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -429,16 +429,15 @@ class SampleMotions(Callback):
             write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
             if are_same(motions):
                 say(
-                    f"warning: step {step}: all {len(motions)} samples are the same motion. The network "
-                    "no longer depends on its input: stop, and train again with a lower optimizer.lr"
+                    f"warning: step {step}: all {len(motions)} samples are the same motion. The network's output "
+                    "no longer depends on its input. Stop, and train again with a lower optimizer.lr"
                 )
             requested = [attributes for _, attributes in self.prompts]
             values = self.measure(
                 [torch.from_numpy(motion.joints) for motion in motions], requested
             )
             for logger in trainer.loggers:
-                # Lightning logs steps from 0: the values of this validation are logged at step -
-                # 1
+                # Lightning counts steps from 0, and therefore logs this validation at `step - 1`.
                 log_video(logger, "samples", folder / "motions.gif", step - 1)
                 logger.log_metrics(
                     {f"samples/{name}": value for name, value in values.items()}, step - 1

@@ -1,7 +1,7 @@
 """Atomic checkpoints, and resuming from them.
 
-A run directory may come from somebody else. Reading a checkpoint neither runs code nor takes more
-memory than the file. Only files in the folder of the checkpoints are removed, even if the state of
+A run directory may come from somebody else. Reading a checkpoint does not run code, and does not take
+more memory than the size of the file. Only files in the folder of the checkpoints are removed, even if the state of
 a callback names other files.
 """
 
@@ -94,7 +94,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
             )
             raise UserError(
                 f"{path}: the checkpoint of step {checkpoint['global_step']} cannot be written ({reason}). Earlier "
-                "checkpoints are intact: free some space, and run the same command to resume"
+                "checkpoints are intact. Free some space, and run the same command again to resume"
             ) from error
 
 
@@ -194,7 +194,7 @@ def _check_version(version: Any, path: Path) -> None:
         supported = False
     if not supported:
         raise UserError(
-            f"{path}: written by Lightning {str(version)[:40]}. Use a checkpoint of {OLDEST_LIGHTNING} or later"
+            f"{path}: written by Lightning {str(version)[:40]}. Use a checkpoint from {OLDEST_LIGHTNING} or later"
         )
 
 

@@ -31,7 +31,7 @@ class DistillationTask(GeneratorTask):
     """
 
     kind = DistilledGenerator
-    grids: dict[int, Constant]  # times of the teacher's steps, by their number
+    grids: dict[int, Constant]  # times of the teacher's steps, by the number of steps
 
     @classmethod
     def build(
@@ -81,7 +81,7 @@ class DistillationTask(GeneratorTask):
         if None not in (before, now) and before != now:
             raise UserError(
                 f"distillation.teacher={name}: trained on data with fingerprint {before}, but {self.facts['dataset']} "
-                f"has {now}. Give the data of the teacher"
+                f"has {now}. Use the teacher's data"
             )
         self.generator.load_state_dict(teacher.state_dict())
         self.facts["teacher"] = weights_sha256(path)

@@ -55,7 +55,7 @@ class BadLoss(Callback):
 
     Args:
         folder: the run directory.
-        factor: maximum ratio of a loss to the usual loss.
+        factor: maximum ratio of a loss to the median of the previous interval.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
@@ -135,7 +135,7 @@ def lost_worker(error: BaseException) -> UserError | None:
     return UserError(
         "a data loading process was killed, perhaps because memory ran out, or ended "
         "unexpectedly. Lower data.num_workers (0 = load in the main process), and run the same "
-        "command to resume from the last checkpoint"
+        "command again to resume from the last checkpoint"
     )
 
 

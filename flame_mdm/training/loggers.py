@@ -137,7 +137,7 @@ def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None
 def log_table(
     logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int
 ) -> None:
-    """Logs a table under a name at a step."""
+    """Logs a table under the given name at a step."""
     if isinstance(logger, TensorBoardLogger):
         lines = [head, ["---"] * len(head), *rows]
         logger.experiment.add_text(
@@ -148,7 +148,7 @@ def log_table(
 
 
 def log_video(logger: Logger, name: str, gif: Path, step: int) -> None:
-    """Logs an animated GIF under a name at a step."""
+    """Logs an animated GIF under the given name at a step."""
     if isinstance(logger, TensorBoardLogger):
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]

@@ -26,7 +26,7 @@ FLOAT = 4
 
 @dataclass(frozen=True)
 class TrainingMemory:
-    """Memory of a training in float32, in bytes per process.
+    """Memory that training needs in float32, in bytes per process.
 
     The text encoder and the data are not included. Frozen encoders run before training, and data
     sets that are too large stay on disk.
@@ -47,7 +47,7 @@ class TrainingMemory:
 
 
 def training_memory(config: Config) -> TrainingMemory:
-    """Returns the memory that the training of a recipe requires.
+    """Returns the memory that training a recipe requires.
 
     The network is built and run on torch's device "meta", whose tensors have no values.
     """

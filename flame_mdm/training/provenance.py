@@ -37,7 +37,7 @@ class WriteProvenance(Callback):
         save(
             movable(self.config),
             folder / "config.yaml",
-            head="A saved run. EXP=path/to/this/file repeats it.",
+            head="The configuration of a run. EXP=path/to/this/file repeats the run.",
         )
         facts = environment() | {
             "device": device_name(trainer),

@@ -32,7 +32,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On a CPU: bfloat16 if the CPU has instructions for its products, `CheapDropout`, and
     `attention`, without dropout of the attention weights. Compilation made no difference on CPUs.
 
-    A precision of the recipe other than 32-true is kept.
+    If the recipe sets a precision other than 32-true, it is kept.
     """
     trainer, supported = config["trainer"], False
     device = trainer["accelerator"]
@@ -52,7 +52,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
                 "takes less time"
             )
             denoiser = task.generator.denoiser
-            # Networks without this attribute would learn from the padding
+            # Networks without this attribute would learn from padding
             if denoiser.mask_padding:
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES

@@ -663,9 +663,21 @@ def test_statistics_have_to_fit(refused, bad):
     )
     refused("import", *words, says="Mean.npy: no such file")
     for name, value, says in (
-        ("Mean.npy", np.zeros(251), "Mean.npy: has shape (251,); expected (263,) and finite numbers"),
-        ("Mean.npy", np.zeros(263, "c8"), "Mean.npy: has shape (263,); expected (263,) and finite numbers"),
-        ("Std.npy", np.zeros(263), "expected (263,) and finite numbers, which are positive in Std.npy"),
+        (
+            "Mean.npy",
+            np.zeros(251),
+            "Mean.npy: has shape (251,); expected (263,) and finite numbers",
+        ),
+        (
+            "Mean.npy",
+            np.zeros(263, "c8"),
+            "Mean.npy: has shape (263,); expected (263,) and finite numbers",
+        ),
+        (
+            "Std.npy",
+            np.zeros(263),
+            "expected (263,) and finite numbers, which are positive in Std.npy",
+        ),
     ):
         statistics_folder(bad, 263)
         np.save(bad / name, value)
@@ -824,6 +836,7 @@ def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
 def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):
     (tmp_path / "x" / "default" / "checkpoints").mkdir(parents=True)
     with pytest.raises(
-        UserError, match=r"x: not a run directory, but it contains some\. Use one of them: .*x/default$"
+        UserError,
+        match=r"x: not a run directory, but it contains some\. Use one of them: .*x/default$",
     ):
         find(tmp_path / "x")

@@ -345,7 +345,7 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
                     subtests.test(part=part),
                     pytest.raises(
                         UserError,
-                        match=rf"names .* at {part}.*\. Its code is only run if you trust it",
+                        match=rf"names .* at {part}.*\. Its code is run only if you trust it",
                     ),
                 ):
                     trust({part: hidden})
@@ -363,7 +363,7 @@ def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch, s
     ):
         with subtests.test(module=module):
             assert source_file(module) is None
-            with pytest.raises(UserError, match="Its code is only run if you"):
+            with pytest.raises(UserError, match="Its code is run only if you"):
                 trust({"denoiser": {"_target_": f"{module}.MDMEncoder"}})
 
 
@@ -423,7 +423,7 @@ def test_wrong_words_are_one_line(capsys, subtests):
         (["steps=1.5"], "steps=1.5: must be a whole number or a list"),
         (["loop=yes"], "loop=yes: must be true or false"),
         (["rate=nan"], "rate=nan: must be a finite number or null"),
-        (["rate=1,2"], "rate=1,2: several values. Give one value, or a list: rate=[1,2]"),
+        (["rate=1,2"], "rate=1,2: several values. Use a single value, or a list: rate=[1,2]"),
         (["which=first"], "which=first: must be one of last, best"),
         (["names='a"], "No closing quotation"),
         (["--fast"], "unknown option --fast"),
@@ -481,9 +481,9 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys, subte
     assert (evaluated[-1].options.guidance_scale, evaluated[-1].seed) == (2.5, 0)
 
     for extra, message in (
-        (["launch=slurm"], "launch=slurm: srun is not on this machine"),
+        (["launch=slurm"], "launch=slurm: this machine has no srun"),
         (["launch=nothing"], "no launch is called 'nothing'"),
-        (["--multirun", "out=a.json"], "out=a.json: 4 jobs would write to it. Remove out="),
+        (["--multirun", "out=a.json"], "out=a.json: 4 jobs would write to this path. Remove out="),
         (["--fast", "--multirun"], "unknown option --fast"),
         (
             [],

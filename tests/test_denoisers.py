@@ -199,7 +199,7 @@ def test_token_positions_do_not_move_the_frames() -> None:
         encoder(x_t, t, mask, Condition(cond.pooled, cond.tokens, two)),
         encoder(x_t, t, mask, fewer),
     )
-    with pytest.raises(UserError, match=r"denoiser\.max_tokens=5: give at least 6"):
+    with pytest.raises(UserError, match=r"denoiser\.max_tokens=5: captions have up to 6 tokens"):
         encoder(*batch(tokens=6))
 
 

@@ -296,7 +296,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
         torch.save(content | {"config": config}, tmp_path / f"{part}.ckpt")
     own = [trained, "out", *SHORT]
     for words, says in (
-        (["trainer.max_steps=4"], "no ckpt given. Write flame-mdm distill CKPT"),
+        (["trainer.max_steps=4"], "ckpt is missing. Usage: flame-mdm distill CKPT"),
         (["runs/no/model"], "runs/no/model: no such checkpoint"),
         ([student], f"a distilled model. Give its teacher, {trained}"),
         (["process.ckpt"], "predicts noise, so computing the clean estimate divides"),
@@ -521,7 +521,7 @@ def test_from_clips_to_a_prompt_and_resumed(
     assert any(value.any() for name, value in whole.items() if name.endswith(".up"))
     page = Path("whole/adaptation.html").read_text()
     assert "hobbles in limp style" in page
-    assert "sampling 10 motions from the base instead" in capsys.readouterr().out
+    assert "sampling 10 motions from the base model instead" in capsys.readouterr().out
     store, base = Store(next(Path("whole/data").glob("limp-*"))), flame_mdm.load(trained)
     np.testing.assert_array_equal(store.mean, base.representation.mean)
     assert {clip.captions[0] for clip in store.clips if not clip.source.startswith("prior/")} == {
@@ -584,9 +584,9 @@ def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(
 
 def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
     for name in ("limp 2", "", "../x"):
-        refused("adapt", str(trained), f"source={clips}", f"name={name}", says="give one word")
+        refused("adapt", str(trained), f"source={clips}", f"name={name}", says="expected one word")
     lesson = ["adapt", str(trained), f"source={clips}", "name=limp"]
-    refused(*lesson[:2], says="no source given")
+    refused(*lesson[:2], says="source is missing")
     refused(*lesson, "rank=0", says="rank=0: must be at least 1")
     refused(*lesson, "losses.velocity=3", says="keeps the losses of its base")
     refused(*lesson[:2], f"source={tmp_path / 'none'}", "name=limp", says="no such folder")

@@ -223,7 +223,7 @@ def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_pat
         path.read_text() for path in (tmp_path / "sweep" / ".submitit").rglob("*log.*")
     )
     assert "seed=1: already trained for 0 steps" in logs
-    assert "seed=2 holds a run with another configuration" in logs
+    assert "seed=2 contains a run with another configuration" in logs
 
 
 @pytest.mark.robustness
@@ -249,7 +249,7 @@ REFUSED = {
     "train quickstart launch=local trainer.devices=2": "launch=local runs each job in one process",
     "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "no logger is called 'nothing'",
     "train quickstart launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
-    "train quickstart launch=slurm": "launch=slurm: srun is not on this machine. Run the command where",
+    "train quickstart launch=slurm": "launch=slurm: this machine has no srun. Run the command on a",
     "train quickstart seed=0,1": "seed=0,1: several values make a sweep with one run per value. Add --multirun",
     "convert a b launch=slurm": "unknown config key 'launch'",
     "convert a b --multirun": "unknown option --multirun",
@@ -272,7 +272,7 @@ def test_launchers_are_found_for_recipes_in_folders_or_named_by_their_extra(monk
         with subtests.test(recipe=recipe, launcher=launcher):
             assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
     monkeypatch.setattr("flame_mdm.config.composition.source_file", lambda module: None)
-    with pytest.raises(UserError, match=r"launch=slurm needs .*: pip install flame-mdm\[slurm\]"):
+    with pytest.raises(UserError, match=r"launch=slurm needs .*\. Run pip install "flame-mdm\[slurm\]""):
         compose("quickstart", ["launch=slurm"])
 
 

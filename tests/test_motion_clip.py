@@ -357,7 +357,9 @@ def test_training_by_recipe_learns_to_retrieve_and_its_checkpoint_is_a_feature_e
     facts = read_checkpoint(trained)["facts"]
     assert facts["dataset"] == "synthetic"
     assert facts["fingerprint"]
-    with pytest.raises(UserError, match=r"last\.ckpt: contains a motion-CLIP, not a motion generator"):
+    with pytest.raises(
+        UserError, match=r"last\.ckpt: contains a motion-CLIP, not a motion generator"
+    ):
         load(trained)
 
     own, exported = (

@@ -267,7 +267,11 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch_and_refus
     capfd.readouterr()
     for name, content, says in (
         ("model.json", description[:-9], "not an exported model"),
-        ("model.json", description.replace(b'"format": 1', b'"format": 2'), "does not have format 1"),
+        (
+            "model.json",
+            description.replace(b'"format": 1', b'"format": 2'),
+            "does not have format 1",
+        ),
         (
             "model.json",
             description.replace(b'"fps": 20', b'"fps": 0'),

@@ -136,7 +136,9 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
     words = ["prompts=p.txt", "seconds=[1,1,1,30,1,1.5]", "samples=1", "num_inference_steps=2"]
     assert main(["sample", str(trained), *words]) == 1
     printed = capsys.readouterr()
-    assert "2 motions for 2 prompts, one folder per prompt: samples/quickstart/p.html" in printed.out
+    assert (
+        "2 motions for 2 prompts, one folder per prompt: samples/quickstart/p.html" in printed.out
+    )
     *errors, total = printed.err.splitlines()[-5:]
     assert total == "error: p.txt: 4 of 6 prompts cannot be sampled. Correct the lines above"
     for line, number, message in zip(
@@ -171,7 +173,10 @@ def test_each_prompt_has_a_length_of_its_own(trained, subtests):
         motions[2].joints, flame_mdm.generate(model, PROMPTS[1], **numpy)[0].joints, atol=1e-4
     )
     for seconds, message in (
-        ([1, 2], r"seconds=\[1, 2\]: the number of lengths is 2, but the number of prompts is 1\. Use one length, or one per prompt"),
+        (
+            [1, 2],
+            r"seconds=\[1, 2\]: the number of lengths is 2, but the number of prompts is 1\. Use one length, or one per prompt",
+        ),
         ([], "lengths is 0, but the number of prompts is 1"),
         *(
             (value, "is not a valid length")

@@ -239,7 +239,7 @@ def test_missing_files_are_named(tmp_path, capsys, subtests):
     (folder / "metrics.jsonl").unlink()
     assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()
     assert read_run(folder).label == "mine"
-    for words, message in (([str(tmp_path)], "contains no config.yaml"), ([], "no runs given")):
+    for words, message in (([str(tmp_path)], "contains no config.yaml"), ([], "runs is missing")):
         with subtests.test(words=words, message=message):
             assert main(["report", *words]) == 1
             assert message in capsys.readouterr().err

@@ -536,7 +536,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": [0, 1.5]}, "give a number of steps, or a list"),
         (
             {"eta": 1.0},
-            "eta=1.0: the sampler ancestral has no such option. Omit it, or give guidance_scale",
+            "eta=1.0: the sampler ancestral has no such option. Omit it, or use guidance_scale",
         ),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: give the name"),
@@ -549,7 +549,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ),
         (
             {"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}},
-            "with resample and x_t: choose",
+            "with resample and x_t\. Set",
         ),
     ],
     FlowMatching: [
@@ -562,7 +562,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"sampler": "euler", "edit": {"mode": "x_t"}}, "trajectory, x0"),
         (
             {"sampler": "dopri5", "edit": {"mode": "x0"}},
-            "dopri5 cannot edit with x0: choose the sampler from euler",
+            "dopri5 cannot edit with x0\. Set the sampler to euler",
         ),
     ],
 }

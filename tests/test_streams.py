@@ -251,7 +251,9 @@ def test_frames_that_were_not_used_can_be_replaced(model, subtests):
     for at in (0, 30):
         with (
             subtests.test(at=at),
-            pytest.raises(UserError, match=r"is not in the last 4 blocks, which end at frame 135\."),
+            pytest.raises(
+                UserError, match=r"is not in the last 4 blocks, which end at frame 135\."
+            ),
         ):
             late.go_back(at)
     with pytest.raises(

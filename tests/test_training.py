@@ -387,5 +387,7 @@ def test_samples_that_do_not_depend_on_the_input_are_reported(
         global_step=5, global_rank=0, world_size=1, is_global_zero=True, loggers=[]
     )
     samples.write(trainer, task)  # type: ignore[arg-type]
-    warning = "warning: step 5: all 3 samples are the same motion. The network no longer depends"
+    warning = (
+        "warning: step 5: all 3 samples are the same motion. The network's output no longer depends"
+    )
     assert (warning in capsys.readouterr().out) == collapsed

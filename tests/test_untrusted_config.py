@@ -82,7 +82,7 @@ def model_file(path: Path, trained: Path, text: str | None = None, **recipe: Any
 
 
 def test_interpolations_in_models_are_refused(attacked, trained, changed, bad, tmp_path):
-    marker, says = tmp_path / "owned", "holds an interpolation"
+    marker, says = tmp_path / "owned", "contains the interpolation"
     for value in (
         exploit(marker),
         [{"a": exploit(marker)}],
@@ -104,7 +104,7 @@ def test_interpolations_in_models_are_refused(attacked, trained, changed, bad, t
 def test_interpolations_in_saved_runs_and_protocols_are_refused(
     attacked, trained, bad, tmp_path, subtests
 ):
-    marker, says = tmp_path / "owned", "holds an interpolation"
+    marker, says = tmp_path / "owned", "contains the interpolation"
     saved, own = (trained.parent.parent / "config.yaml").read_text(), bad / "protocol.yaml"
     assert "${run.dir}" in saved
     protocol = (ROOT / "experiments/evaluation/synthetic.yaml").read_text()

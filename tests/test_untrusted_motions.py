@@ -102,7 +102,7 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     (
         "a.npz",
         zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA),
-        "another method than deflate",
+        "a method other than deflate",
     ),
     ("a.npz", npz(joints=np.array([{}]), fps=20), "Python objects"),
     ("a.npy", header((10**12, 22, 3)), "declares"),
@@ -277,7 +277,7 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield zipped({TAKE: bytes(8 * MEBIBYTE)}), "expand to"
     yield zipped({f"{TAKE}{n}": bytes(3 * MEBIBYTE) for n in range(2)}), "expand to"
     yield encrypted(zipped({TAKE: whole})), "encrypted"
-    yield zipped({TAKE: whole}, zipfile.ZIP_LZMA), "another method than deflate"
+    yield zipped({TAKE: whole}, zipfile.ZIP_LZMA), "a method other than deflate"
     yield zipped({TAKE: whole})[:-30], "damaged archive"
     yield b"PK\3\4", "damaged archive"
     yield (

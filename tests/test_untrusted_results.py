@@ -73,7 +73,7 @@ SPECS = {
     ROWS.format(keys=OPTIONS): "64,000 exceed the limit",
     f"{BOMB}title: t\nparts: {{P: {{lengths: *i}}}}\n": "after its aliases are expanded",
     "title: " + "{a: " * 20_000: "nested too deeply",
-    ROWS.format(keys="note: '${oc.env:HOME}'"): "holds an interpolation",
+    ROWS.format(keys="note: '${oc.env:HOME}'"): "contains the interpolation",
     ROWS.format(keys="data.source._target_: os.system"): "data.source._target_",
     ROWS.format(keys="hydra.searchpath: x"): "only keys of the data",
     f"title: t\nparts: {{P: {{protocol: x, rows: [], columns: {{{COLUMNS}}}}}}}\n": "not a shorter list",
@@ -171,7 +171,9 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
         f"text={'a person walks ' * 66_667}",
         says=" characters are too many",
     )
-    with pytest.raises(UserError, match=r"samples=2 for each text: a request may have at most 10,000 motions"):
+    with pytest.raises(
+        UserError, match=r"samples=2 for each text: a request may have at most 10,000 motions"
+    ):
         flame_mdm.generate(
             flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2
         )
@@ -412,7 +414,9 @@ def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, 
             says="not a repository name. Use user/name",
         )
     (bad / "config.yaml").write_text("mine")
-    attacked("push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="push did not write it")
+    attacked(
+        "push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="push did not write it"
+    )
     assert [path.read_text() for path in bad.iterdir()] == ["mine"]
     for _ in range(2):
         assert main(["push", str(trained), "a/x.safetensors", "dry_run=true"]) == 0

@@ -79,8 +79,8 @@ class MDMEncoder(Denoiser):
             tokens, token_mask = condition_tokens(cond)
             if tokens.shape[1] > self.max_tokens:
                 raise UserError(
-                    f"denoiser.max_tokens={self.max_tokens}: captions have {tokens.shape[1]} tokens. Set it "
-                    f"to at least {tokens.shape[1]}"
+                    f"denoiser.max_tokens={self.max_tokens}: captions have up to {tokens.shape[1]} tokens. "
+                    f"Set it to at least {tokens.shape[1]}"
                 )
             prefix = torch.cat(
                 [self.condition.time(t)[:, None], self.condition.projection(tokens)], 1

@@ -40,7 +40,7 @@ def check_within(path: str | Path, root: str | Path) -> None:
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
-            f"{path}: a link leads out of {root}, to {target}. Remove it, because files are not written through such links"
+            f"{path}: a link leads out of {root}, to {target}. Files are not written there. Remove the link"
         )
 
 

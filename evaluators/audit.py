@@ -52,7 +52,7 @@ AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     """Measures perturbed motions of a split, with intervals from bootstrap resamples; see docs/audit.md.
 
-    A killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if
+    An interrupted audit continues with the metric inputs in the folder `cache`. Raises `UserError` if
     data, protocol and extractor do not match.
     """
     data = open_data(request, None)
@@ -350,7 +350,7 @@ def _agreement(
 
     "auc" is the probability that a pair with every requested attribute has a better score than a
     pair that lacks an attribute. Its pairs are real motions and the strongest perturbations of the
-    meaning. "correlation" is Spearman's rank correlation over these perturbations at all grades.
+    meaning. "correlation" is Spearman's rank correlation, over these perturbations at all grades.
     Returns {} if the exact attributes are unknown.
     """
     truth = measure.truth

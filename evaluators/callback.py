@@ -23,7 +23,7 @@ class Evaluate(Callback):
     """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
     Checkpoints can be selected by these values. Dashboards show each value with its unit, as
-    val/<protocol>/<metric> (<unit>), next to the value of real motions, .../real. With several
+    val/<protocol>/<metric> (<unit>), next to the value of real motions, as .../real. With several
     replications, .../ci is the half width of the 95 % interval.
 
     The evaluation runs at the first validation and then at multiples of `every_n_steps`. It uses
@@ -36,7 +36,7 @@ class Evaluate(Callback):
             "none" = skip metrics that need features.
         samples: motions per replication; None = the protocol's number.
 
-    Raises `UserError` before training begins, if the extractor does not exist.
+    Raises `UserError` before training begins if the extractor does not exist.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Evaluate(Callback):
         self.next = trainer.global_step
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluates the averaged weights, if `every_n_steps` steps have passed since the last evaluation."""
+        """Evaluates the averaged weights if `every_n_steps` steps have passed since the last evaluation."""
         if trainer.global_step < self.next or not hasattr(self, "evaluation"):
             return
         assert isinstance(pl_module, GeneratorTask)
@@ -104,7 +104,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Adds the value by which checkpoints are selected, and the curves of dashboards."""
+        """Adds the value that selects checkpoints, and the curves for dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name
@@ -116,8 +116,8 @@ class Evaluate(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Logs the values of the last evaluation."""
-        # The values were computed at the start of the epoch, because the averaged weights have been
-        # swapped out by now.
+        # The values were computed at the start of the validation epoch, because the averaged weights
+        # have been swapped out by now.
         pl_module.log_dict(self.curves)
         pl_module.log_dict(
             {name: x for name, x in self.values.items() if name not in self.curves}, logger=False

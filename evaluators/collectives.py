@@ -38,7 +38,7 @@ def shared(value: T) -> T:
 
 
 def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
-    """Returns the results for all items in every process. Each of N processes computes every N-th result."""
+    """Returns the results for all items, in every process. Each of the N processes computes every N-th result."""
     count = world_size()
     if count == 1:
         return [function(item) for item in items]

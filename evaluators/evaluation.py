@@ -32,7 +32,7 @@ SKIPPED = {"extractor": "extractor=none: metrics that need features were not com
 
 
 def evaluate(request: EvaluationRequest) -> None:
-    """Evaluates a checkpoint, motion files of another system or a baseline, and writes the result file.
+    """Evaluates a checkpoint, motion files from another system or a baseline, and writes the result file.
 
     Real motions are measured first. If they do not have the values that the protocol expects, the
     data or the extractor is wrong, and nothing is generated. The guide is `docs/evaluation.md`.
@@ -50,7 +50,7 @@ def evaluate(request: EvaluationRequest) -> None:
     """
     if request.out is not None:  # checked before hours of work
         if Path(request.out).is_dir():
-            raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
+            raise UserError(f"out={request.out} is a folder. Set out to the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
     with processes(request.device) as device:
         plan = Plan(request, device)
@@ -97,7 +97,7 @@ class Evaluation:
         force: bool = False,
         resamples: int = 0,
     ) -> Measured:
-        """Evaluates real motions of all replications, and then the motions of the source.
+        """Evaluates the real motions in all replications, and then the motions from the source.
 
         Each rank generates a share of the batches and computes their features. Rank 0 computes the
         metrics, and all ranks return the result. If real motions do not have the expected values,
@@ -305,7 +305,7 @@ class Evaluation:
         if len(set(counts)) > 1:
             numbers = ", ".join(map(str, counts))
             warnings.append(
-                f"replications of {numbers} motions: values that depend on this number are mixed"
+                f"replications have {numbers} motions: values that depend on this number are mixed"
             )
         return Outcome(scores, resampled, warnings, costs)
 
@@ -357,7 +357,7 @@ class Evaluation:
                 width = generated["generated"].shape[1]
                 if min(count, others) < 2 * width:
                     few = f"{min(count, others)} motions are fewer than twice the {width} features"
-                    lines.append(f"{name}: biased upwards: {few}")
+                    lines.append(f"{name}: biased upward, because {few}")
                 if count != others:
                     numbers = f"{count} generated and {others} real motions"
                     lines.append(
@@ -411,6 +411,6 @@ def _refuse(unexpected: Sequence[str]) -> None:
     if not is_first():
         raise SystemExit(1)  # rank 0 prints the reason
     raise UserError(
-        f"nothing was generated, because {'; '.join(unexpected)}. Check the data and the extractor, or give "
-        "force=true: the result is then marked as not valid"
+        f"nothing was generated, because {'; '.join(unexpected)}. Check the data and the extractor, or add "
+        "force=true; the result is then marked as not valid"
     )

@@ -40,8 +40,7 @@ class EvaluationKeys:
     )
     from_samples: str | None = option(
         None,
-        "folder with the motions of another system, which are evaluated instead of "
-        "ckpt; needs data=",
+        "folder with motions from another system, which are evaluated instead of ckpt; needs data=",
     )
     baseline: str | None = option(
         None,
@@ -121,7 +120,7 @@ class EvaluationRequest(EvaluationKeys):
         ]
         if len(subjects) != 1:
             raise UserError(
-                "give exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled"
+                "use exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled"
             )
         if subjects != ["ckpt"] and not self.data:
             raise UserError(
@@ -133,9 +132,9 @@ class EvaluationRequest(EvaluationKeys):
             )
         if subjects == ["from_samples"] and (self.quick or self.samples or self.replications):
             raise UserError(
-                "from_samples evaluates all motions of the files. Remove quick, samples and replications"
+                "from_samples evaluates all motions in the files. Remove quick, samples and replications"
             )
         if self.resamples and self.resamples < MIN_RESAMPLES:
             raise UserError(
-                f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval"
+                f"resamples={self.resamples}: expected 0, or at least {MIN_RESAMPLES} for a 95 % interval"
             )

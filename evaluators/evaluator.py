@@ -38,7 +38,7 @@ PAIRED = {
     "nearest": "real_nearest",
     "references": "references",
 }
-"""Names of the inputs from paired real motions -> names of the same inputs from generated motions."""
+"""Names of the inputs from generated motions, by the names of the same inputs from paired real motions."""
 
 
 @dataclass
@@ -53,7 +53,7 @@ class Motions:
     captions: list[str] | None = None
     # "word/PART" tokens of the captions, if the data has tokens
     tokens: list[list[str] | None] | None = None
-    # Further inputs by their names in `evaluators.metrics`
+    # Additional inputs by their names in `evaluators.metrics`
     inputs: dict[str, Any] = field(default_factory=dict)
     # The parts kept from real motions: arguments `region` and `joints` of `kept_parts`
     edit: Mapping[str, Any] | None = None

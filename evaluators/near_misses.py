@@ -1,5 +1,5 @@
 # pyright: standard
-"""Near misses: captions of a data set that are wrong for a clip in exactly one attribute."""
+"""Near misses: captions in a data set that are wrong for a clip in exactly one attribute."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ ACTION = (
     "action",
     "content",
 )
-# Value that a caption need not mention. Without it, a caption is less exact, but not wrong.
+# Value that a caption need not mention. A caption that omits it is less exact, but not wrong.
 UNSAID = "normal"
 
 _Stated = frozenset[tuple[str, str | int | float]]

@@ -42,7 +42,7 @@ def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
 
 
 def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Joints:
-    """Moves each joint along a line in a random direction, as a 1 Hz sine with this amplitude."""
+    """Moves each joint along a line in a random direction, as a 1 Hz sine with the given amplitude."""
     along = draws.standard_normal(joints.shape[1:])
     phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
     sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
@@ -62,7 +62,7 @@ def lift(joints: Joints, centimeters: float) -> Joints:
 
 
 def resize(joints: Joints, percent: float) -> Joints:
-    """Lengthens all bones by this percentage, without changing the floor or the root's path on it."""
+    """Lengthens all bones by a percentage, without changing the floor or the root's path on it."""
     ground = joints[:, :1] * GROUND
     return ground + (1 + percent / 100) * (joints - ground)
 
@@ -94,24 +94,24 @@ def draw_in(joints: Joints, centimeters: float) -> Joints:
 
 
 def freeze(joints: Joints, percent: float) -> Joints:
-    """Repeats one frame until the end of the motion, for this share of its duration."""
+    """Holds one frame until the end of the motion, for a given share of the duration."""
     moving = max(1, round(len(joints) * (1 - percent / 100)))
     return joints[np.minimum(np.arange(len(joints)), moving - 1)]
 
 
 def play(joints: Joints, factor: float, fps: float) -> Joints:
-    """Plays the motion faster, which shortens it, or slower, which is cut to the original length."""
+    """Plays the motion faster, which shortens it, or slower; a slower motion is cut to the original length."""
     return resample(joints, fps * factor, fps)[: len(joints)]
 
 
 def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
-    """Resamples linearly to another frame rate and back. Frames after the last new frame repeat it."""
+    """Resamples linearly to another frame rate and back. Frames after the last resampled frame repeat that frame."""
     back = resample(resample(joints, fps, rate), rate, fps)
     return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
 
 
 def crop(joints: Joints, percent: float) -> Joints:
-    """Cuts this percentage off the end of the motion. At least three frames remain."""
+    """Cuts a percentage of the motion off at its end. At least three frames remain."""
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 
@@ -150,7 +150,7 @@ def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
 
 
 BASE, STORED, REAL = "decoded and encoded", "as stored", "reference"
-"""Sets of motions in every audit.
+"""Names of the sets of motions in every audit.
 
 All perturbed motions are compared with `BASE`. `STORED` contains the stored features. `REAL` is a
 second draw of real motions, for metrics that compare sets.
@@ -308,7 +308,7 @@ class ReplacedCaptions(Perturbation):
 class DroppedActions(Perturbation):
     """Drops a share of the actions, in percent.
 
-    All other motions are repeated instead, with their texts.
+    The remaining motions are repeated in their place, with their texts.
     """
 
     unit: str = "% of actions"

@@ -204,7 +204,7 @@ class Protocol(ClosedSchema):
         path = path or self.extractor.get("path")
         if path is None:
             raise UserError(
-                f"protocol {self.name} needs a feature extractor. Give extractor=FILE, or extractor=none to skip the "
+                f"protocol {self.name} needs a feature extractor. Add extractor=FILE, or extractor=none to skip the "
                 "metrics that need features"
             )
         extractor: Extractor = instantiate(
@@ -244,7 +244,7 @@ class Protocol(ClosedSchema):
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
             reason = f"the split has no clip with at least {clips.crop.min_frames} frames{only}"
-            raise UserError(f"{reason}. Choose another with split=NAME.{clips.advice}")
+            raise UserError(f"{reason}. Choose another split with split=NAME.{clips.advice}")
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):
@@ -264,10 +264,10 @@ class Protocol(ClosedSchema):
             elif self.context_frames:
                 frames = frames[self.context_frames :]
                 if not len(frames):
-                    length = f"{clip.id}: {len(context)} frames, all of which the model continues"
-                    raise UserError(
-                        f"{length}. Give longer crops, such as data.crop.max_frames=196"
+                    length = (
+                        f"{clip.id}: {len(context)} frames, all of which the model needs as context"
                     )
+                    raise UserError(f"{length}. Use longer crops, such as data.crop.max_frames=196")
             rows.append(DrawnClip(name, clip, frames, caption, name, context))
         return rows
 
@@ -336,7 +336,7 @@ def protocol_config(name: str) -> Config:
         if path.stem in protocols:
             return {"name": path.stem, **protocols[path.stem]}
         if file == path:
-            raise UserError(f"protocol {name}: choose a variant: {', '.join(protocols)}")
+            raise UserError(f"protocol {name} has variants. Choose one of {', '.join(protocols)}")
     names = protocol_names(path.parent)
     raise UserError(
         f"no protocol is called '{name}'.{did_you_mean(path.stem, names)} Available: {', '.join(names) or 'none'}"
@@ -351,7 +351,7 @@ def _protocols(path: Path) -> dict[str, Config]:
         isinstance(variant, dict) for variant in variants.values()
     ):
         raise UserError(
-            f"{path}: not a protocol, which has keys such as condition and metrics; variants "
+            f"{path}: not a protocol. A protocol has keys such as condition and metrics, and its variants "
             f"are mappings"
         )
     protocols = {f"{path.stem}_{name}": content | variant for name, variant in variants.items()}

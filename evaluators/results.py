@@ -153,7 +153,7 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
 
 
 def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
-    """Returns the extractor that the user gave, or the path in the protocol."""
+    """Returns the extractor in the request or, if it has none, the path in the protocol."""
     return request.extractor or str((plan.protocol.extractor or {}).get("path", ""))
 
 
@@ -230,8 +230,8 @@ def show(result: Result, path: Path) -> None:
         say(f"not computed: {name}: {reason}")
     if result.stand_in_skeleton:
         say(
-            "warning: joints were computed with a stand-in skeleton. Give SMPL's model file for "
-            "SMPL's skeleton: smpl=FILE"
+            "warning: joints were computed with a stand-in skeleton. To use "
+            "SMPL's skeleton, pass SMPL's model file with smpl=FILE"
         )
     for reason in result.warnings:
         say(f"warning: {reason}")
@@ -241,7 +241,7 @@ def show(result: Result, path: Path) -> None:
         say(f"audit of this evaluator, on {result.audit_motions} motions: {result.audit}")
     else:
         say(
-            f"not audited: no one has checked which faults this evaluator notices. To do so: "
+            f"not audited: it is unknown which faults this evaluator detects. To audit it, run "
             f"make audit DATA={data.dataset}"
         )
     say(f"written: {path}")
@@ -258,7 +258,7 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
 
 
 def _cell(value: Value | None, usual: str) -> str:
-    """Formats a value with its interval, if any.
+    """Formats a value with its interval, if it has one.
 
     The numbers of motions are added if they differ from the numbers for most values.
     """

@@ -68,7 +68,7 @@ class Scene:
 
     @cached_property
     def wrong(self) -> dict[str, list[Text | None]]:
-        """A wrong text for each motion, by kind; None for motions without such a text.
+        """A wrong text for each motion, by the kind of error; None for motions without such a text.
 
         The kinds are `RANDOM` and `NEAR`. If near misses differ in several attributes, there is
         also a kind "near misses: ATTRIBUTE" for each attribute.

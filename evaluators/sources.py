@@ -1,5 +1,5 @@
 # pyright: standard
-"""Sources of evaluated motions: a model, files of another system, or sanity-check baselines."""
+"""Sources of evaluated motions: a model, files from another system, or sanity-check baselines."""
 
 import hashlib
 import time
@@ -127,7 +127,7 @@ class Generator:
     def _read(self, path: Path, rows: list[DrawnClip]) -> dict[str, np.ndarray]:
         content = read_samples(path)
         if content["ids"].tolist() != [row.id for row in rows]:
-            raise UserError(f"{path}: holds motions of other clips. Delete this file")
+            raise UserError(f"{path}: contains motions of other clips. Delete this file")
         self.bar.update(len(rows))
         return content
 
@@ -212,7 +212,7 @@ class SampleFolder:
     - `lengths` (N,): numbers of frames.
     - `features` (sum of lengths, D) in the data's units, or `joints` (sum of lengths, J, 3) in
       meters, y up, at the data's frame rate.
-    - `captions` (N,): only if the motions were generated for other captions than the captions drawn by the protocol.
+    - `captions` (N,): only if the motions were generated for captions other than those that the protocol draws.
 
     Raises `UserError` if the folder contains no such files, or if a file is damaged, names a clip
     that is not in the split, or repeats a clip.
@@ -242,7 +242,7 @@ class SampleFolder:
             )
         if len(index) < len(ids):
             raise UserError(
-                f"{path}: an id occurs several times. Give each clip of the split at most once"
+                f"{path}: an id occurs several times. List each clip of the split at most once"
             )
         if "joints" in content:
             joints = [
@@ -271,7 +271,7 @@ class Baseline:
     All baselines use real motions:
 
     - "real": other windows of the same clips.
-    - "shuffled": motions of other captions or labels.
+    - "shuffled": motions of clips with other captions or labels.
     - "noisy": motions with Gaussian noise; `NOISE` is its standard deviation in normalized
       features.
     - "static": motions whose first frame is held.
@@ -382,7 +382,7 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
     frames = {name: content[name] for name in ("features", "joints") if name in content}
     if not {"ids", "lengths"} <= content.keys() or not frames:
         raise UserError(
-            f"{path}: needs ids, lengths and features or joints, but holds {[*content]}"
+            f"{path}: needs ids, lengths and features or joints, but contains {[*content]}"
         )
     ids, lengths, captions = (
         content["ids"],

@@ -175,7 +175,7 @@ def test_each_prompt_has_a_length_of_its_own(trained, subtests):
     for seconds, message in (
         (
             [1, 2],
-            r"seconds=\[1, 2\]: the number of lengths is 2, but the number of prompts is 1\. Use one length, or one per prompt",
+            r"seconds=\[1, 2\]: the number of lengths is 2, but the number of prompts is 1\. Use one",
         ),
         ([], "lengths is 0, but the number of prompts is 1"),
         *(

@@ -549,7 +549,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ),
         (
             {"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}},
-            "with resample and x_t\. Set",
+            r"with resample and x_t\. Set",
         ),
     ],
     FlowMatching: [
@@ -562,7 +562,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"sampler": "euler", "edit": {"mode": "x_t"}}, "trajectory, x0"),
         (
             {"sampler": "dopri5", "edit": {"mode": "x0"}},
-            "dopri5 cannot edit with x0\. Set the sampler to euler",
+            r"dopri5 cannot edit with x0\. Set the sampler to euler",
         ),
     ],
 }

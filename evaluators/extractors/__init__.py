@@ -94,8 +94,8 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         if not self.reads(representation) or learned != dataset:
             raise UserError(
                 f"extractor {self.path}: trained on {trained.name} of {learned} at {trained.fps:g} frames per second, "
-                f"but the motions are {representation.name} of {dataset} at {representation.fps:g}. Train one with "
-                f"make train EXP={self.recipes}/..."
+                f"but the motions are {representation.name} of {dataset} at {representation.fps:g}. Train a matching "
+                f"extractor with make train EXP={self.recipes}/..."
             )
 
     def reads(self, other: Representation) -> bool:
@@ -207,7 +207,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
             raise FileNotFoundError(
-                f"{', '.join(missing)}: no such file. Give the path of the authors' release"
+                f"{', '.join(missing)}: no such file. Use the path of the authors' release"
             )
         hashes = [sha256(file) for file in files]
         self.sha256 = (
@@ -296,7 +296,7 @@ humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_
 
 
 class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
-    """A released action classifier (one of `CLASSIFIERS`) of 24 SMPL joints or of their rotations.
+    """A released action classifier (one of `CLASSIFIERS`) that reads 24 SMPL joints or their rotations.
 
     `random_start` is a legacy option, as in Guo et al. 2020 and all later work: the initial state
     of the humanact12 GRU is drawn from a normal distribution, separately for features and scores.
@@ -345,7 +345,7 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
 
 
 class UnconstrainedExtractor(ClassifierExtractor):
-    """The classifier of unconstrained HumanAct12 with its reference motions, from a folder of two files."""
+    """The classifier for unconstrained HumanAct12 with its reference motions, from a folder of two files."""
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
 

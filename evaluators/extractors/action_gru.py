@@ -1,5 +1,5 @@
 # pyright: standard
-"""The action classifier of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
+"""The action classifier for HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
 
 from collections.abc import Sequence
 

@@ -31,7 +31,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
-        """Returns the network of a recipe. Raises `UserError` if the data has fewer than two actions."""
+        """Returns the network that a recipe describes. Raises `UserError` if the data has fewer than two actions."""
         if len(actions) < 2:
             raise UserError(
                 f"a classifier needs a data set with at least two actions, but this one has {len(actions)}"

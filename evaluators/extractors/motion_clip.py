@@ -35,7 +35,7 @@ POOL = 32  # number of pairs in a pool, as in R-precision
 
 
 class MotionCLIP(nn.Module):
-    """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear map of the pooled text vector.
+    """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear layer for the pooled text vector.
 
     The features are not scaled to norm 1, because Fréchet distance and MID use unscaled features.
     The temperature is learned, with an initial value of 0.07.
@@ -197,7 +197,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
-        """Imports the weights of FLAME's released motion-CLIP into the task of a recipe with the same sizes.
+        """Imports the weights of FLAME's released motion-CLIP into a task whose recipe has the same sizes.
 
         The weights have the authors' names. The pooler of the text encoder is also imported,
         because it has random weights from the authors' training. Raises `ValueError` if weights or

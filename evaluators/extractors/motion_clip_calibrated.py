@@ -23,9 +23,9 @@ from flame_mdm.seeds import key
 
 # Near-miss captions per motion and step. They differ in different attributes if possible.
 NEAR_MISSES = 2
-# Standard deviation, in meters, of noise of strength 1 on the joints
+# Standard deviation, in meters, of noise on the joints at strength 1
 JITTER = 0.02
-# Standard deviation, in normalized features, of noise of strength 1 on the features. This noise
+# Standard deviation, in normalized features, of noise on the features at strength 1. This noise
 # moves joints by about 20 mm.
 FEATURE_NOISE = 0.3
 # Weight of `calibration_error` relative to `info_nce`
@@ -128,7 +128,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:
-        """Returns a near miss of a clip as a function of (seed, step, clip, number); "" if the clip has none."""
+        """Returns a near miss for a clip, as a function of (seed, step, clip, number); "" if the clip has none."""
         attributes = self.near_misses[name] or [[""]]
         draw = key("near miss", self.seed, step, name)
         texts = attributes[(draw + number) % len(attributes)]

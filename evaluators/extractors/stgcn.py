@@ -75,7 +75,7 @@ class STGCN(nn.Module):
         return x.mean(3).masked_fill(~mask[:, None], 0).sum(2) / mask.sum(1, keepdim=True)
 
     def logits(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns unnormalized log-probabilities (B, actions) of the input of `forward`."""
+        """Returns unnormalized log-probabilities (B, actions) for the same input as `forward`."""
         return self.fcn(self(x, mask)[..., None, None])[..., 0, 0]
 
 
@@ -105,7 +105,7 @@ class _Block(nn.Module):
 
 
 class UESTC(STGCN):
-    """The classifier of UESTC's 40 actions in the tables of ACTOR, MDM and MFM. It reads joint rotations."""
+    """The classifier for UESTC's 40 actions in the tables of ACTOR, MDM and MFM. It reads joint rotations."""
 
     def __init__(self):
         widths = (64,) * 4 + (128,) * 3 + (256,) * 3
@@ -137,7 +137,7 @@ class Unconstrained(STGCN):
 
 
 class JointSTGCN(STGCN):
-    """A trainable classifier of joints relative to the first position of the root, for any skeleton."""
+    """A trainable classifier for any skeleton. It reads joints relative to the first position of the root."""
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, 256) of joints (B, F, J, 3) in meters, with mask (B, F)."""

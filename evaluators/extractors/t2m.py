@@ -1,5 +1,5 @@
 # pyright: standard
-"""The evaluator of HumanML3D and KIT-ML.
+"""The evaluator for HumanML3D and KIT-ML.
 
 Source: Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text". The authors'
 code returns embeddings in the order of descending length. This code keeps the order of the input.
@@ -26,7 +26,7 @@ from flame_mdm.safe_io import read_npy
 
 # Number of tokens of a caption, including start and end marks
 SLOTS = MAX_TOKENS + 2
-# Frames per vector of the movement encoder
+# Number of frames that the movement encoder maps to one vector
 UNIT = 4
 # Number of features at the end of each frame that the evaluator ignores
 CONTACTS = 4
@@ -43,7 +43,7 @@ _SPECIAL_WORDS = {
     "Desc_VIP": "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly",
 }
 SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in words.split()}
-"""Words with a special part of speech, which overrides the tagger's."""
+"""Words with a special part of speech, which overrides the tag of the tagger."""
 
 
 class Words(NamedTuple):

@@ -179,14 +179,14 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
                 if self.learns_words
                 else clip.attributes.get("tokens", ())
             )
-            # Only the first of equal captions counts.
+            # If captions are equal, only the first one counts.
             self.tokens[clip.id] = dict(reversed(list(zip(clip.captions, tagged, strict=False))))
         bare = [name for name, tokens in self.tokens.items() if not tokens]
         if bare:
             kind = "captions" if self.learns_words else "captions with tagged words"
             raise UserError(
                 f"{data.folder}: {len(bare)} clips have no {kind}, such as {bare[0]}. Choose a "
-                f"data set with captions, or give task.words=learned if only the tagged words "
+                f"data set with captions, or set task.words=learned if only the tagged words "
                 f"are missing"
             )
 
@@ -218,7 +218,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self.network.text(self.words(tokens))
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of a batch: reconstruction at first, then matching of texts."""
+        """Returns the loss of a batch: of the reconstruction at first, then of matching motions and texts."""
         self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:

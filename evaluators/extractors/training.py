@@ -1,5 +1,5 @@
 # pyright: standard
-"""Base class of the tasks that train feature extractors."""
+"""Base class for tasks that train feature extractors."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Generic, Self, TypeVar
@@ -69,7 +69,7 @@ class ExtractorTask(Task, Generic[Network]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
-        """Builds `network` and `condition` of a recipe."""
+        """Builds the `network` and the `condition` that a recipe describes."""
         raise NotImplementedError
 
     def metrics(self) -> Mapping[str, Metric]:

@@ -40,14 +40,14 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct:
 
 
 class RPrecision(SampleMetric):
-    """Base class of R-precision.
+    """Base class for R-precision.
 
     R-precision is the fraction of queries whose correct candidate is among the k nearest candidates
     of a pool. `update` takes `generated` (B, E), `text` (B, E), `text_keys` (B,) and `keys` (B,).
     The values `top1`, `top2` and `top3` are in [0, 1]; higher is better.
 
     Args:
-        pool: number of candidates of a query, including the correct candidate.
+        pool: number of candidates per query, including the correct candidate.
         seed: seed of the random draws.
     """
 

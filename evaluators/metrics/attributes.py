@@ -69,7 +69,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
         fps: frames per second.
 
     Returns:
-        "action", and all further `ATTRIBUTES` of the motion. {} if no action of the set is
+        "action", and the other `ATTRIBUTES` of the motion. {} if no action of the set is
         recognized, for example in noise, or if the joints do not form a body.
 
     Example:
@@ -362,7 +362,7 @@ class AttributeAccuracy(Timed, MotionMean):
 
 
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
-    """Reads the side, left or right, of a motion (F, 22, 3) of the Bandai set.
+    """Reads which side, left or right, a motion from the Bandai set shows.
 
     For walk-turn-left and walk-turn-right, the side is read from the turn of the body; for
     walk-left and walk-right, from the direction of travel. For all other contents, it is the side
@@ -370,7 +370,7 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     used.
 
     Args:
-        joints: (F, 22, 3) in meters, y up.
+        joints: (F, 22, 3) positions of SMPL's joints in meters, y up.
         content: content of the motion, such as "walk-turn-left" or "wave-left-hand".
         fps: frames per second.
     """
@@ -386,10 +386,10 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
 
 
 class SideAccuracy(Timed, MotionMean):
-    """Fraction of motions of the Bandai set that show the requested side, left or right.
+    """Fraction of motions from the Bandai set that show the requested side, left or right.
 
     A metric of this project. `hand` covers gestures, `path` covers turns and sideways walks, and
-    `hand_or_path` covers both. The value of chance is 0.5; higher is better. Rules read the sides
+    `hand_or_path` covers both. Chance level is 0.5; higher is better. Rules read the sides
     from the joints, without a network; see `read_side`.
 
     Args:

@@ -1,8 +1,8 @@
 """Checks of single actions: whether a motion shows an action, and with which side, count or direction.
 
-`evaluators.metrics.attributes` reads one of 22 actions from a motion. Rules cannot distinguish
-further actions: a hand at the head for half a second may be a drink, a phone call or a scratch. A
-check therefore only verifies the requested action. Thresholds are stated next to the rules.
+`evaluators.metrics.attributes` recognizes 22 actions. Rules cannot tell the other actions apart: a
+hand at the head for half a second may be a drink, a phone call or a scratch. A check therefore only
+verifies that a motion shows the requested action. Thresholds are stated next to the rules.
 """
 
 from collections.abc import Callable

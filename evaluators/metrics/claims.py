@@ -1,5 +1,5 @@
 # pyright: standard
-"""Accuracy of the claims of captions, judged by the referee."""
+"""Accuracy of the claims in captions, judged by the referee."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -29,12 +29,12 @@ def claims_of(caption: str) -> tuple[Claim, ...]:
 class ClaimAccuracy(Timed, MotionMean):
     """Fraction of decided claims that are true.
 
-    A metric of this project. The claims are stated by the captions, and the motions are checked for
-    them. The referee (`flame_mdm.sampling.referee`) reads the claims of a caption and measures each
-    claim on the joints. The values are fractions in [0, 1] for each group of claims, such as "side"
+    A metric of this project. The referee (`flame_mdm.sampling.referee`) reads the claims in the
+    caption of each motion, and measures each claim on the joints of the motion. The values are
+    fractions in [0, 1] for each group of claims, such as "side"
     and "count", and for "all" claims; higher is better. "decided" is the fraction of all claims
     that are decided. "captions" is the fraction of captions with at least one decided claim.
-    Motions that are shorter than 0.5 seconds, or have another skeleton than SMPL's 22 joints, are
+    Motions that are shorter than 0.5 seconds, or have a skeleton other than SMPL's 22 joints, are
     not judged.
 
     Args:

@@ -78,7 +78,7 @@ class Diversity(SampleMetric):
 class TextMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): mean distance of random pairs per text.
 
-    For each text, 10 pairs are drawn from 30 motions. As in the authors' code, two sets of 10
+    By default, 10 pairs are drawn from 30 motions for each text. As in the authors' code, two sets of 10
     motions are drawn without replacement, with the same indices for all texts. A motion that is in
     both sets may be paired with itself. Published values are for 100 texts. The code of MDM and MFM
     uses whole batches, that is, 128 texts. `update` takes `generated` (B, E), `groups` (B,) and
@@ -246,7 +246,7 @@ class JointVariance(SampleMetric):
             lengths = {len(motion) for motion in motions}
             if len(lengths) > 1:
                 raise self.error(
-                    f"motions of one text have {sorted(lengths)} frames. Generate them at one length"
+                    f"motions for one text have {sorted(lengths)} frames. Generate them with the same length"
                 )
             values.append(torch.stack(motions).var(0).sum(-1).mean())
         return torch.stack(values).mean().item()

@@ -9,7 +9,7 @@ from torch import Tensor
 from evaluators.metrics.samples import JointMean, Timed
 from flame_mdm.formats.faults import LIMITS, LOW
 
-# Distance from the floor, in meters, that counts as 0
+# Maximum distance from the floor, in meters, that counts as 0
 TOLERANCE = 0.005
 # Speed in meters per second below which a motion counts as static
 STANDING = 0.03

@@ -23,7 +23,7 @@ FEET = (
     11,
 )
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
-"""FlowMDM's mean jerk of HumanML3D (20 frames per second) and BABEL (30), by frame rate."""
+"""FlowMDM's mean jerk of HumanML3D (20 frames per second) and BABEL (30 frames per second), by frame rate."""
 Values = dict[str, Tensor | float]
 
 
@@ -81,7 +81,7 @@ class MBenchQuality(PublishedPhysics):
     In this implementation, the height is y.
 
     Args:
-        fps: frames per second of the motions; at other rates than 20, `compute` raises
+        fps: frames per second of the motions; at rates other than 20, `compute` raises
             `UserError`.
         toes: indices of the left and the right toe.
 
@@ -150,9 +150,10 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
     The positions of the two feet are (F, 2, 3), their contacts (F, 2) bool.
 
-    Three numbers of frames, one per kind. In frames of the first kind, the feet on the ground do
-    not move like the body. In the second kind, a foot in the air moves much less than the body;
-    these frames count half in the score. In the third kind, both feet swing to and fro in the air.
+    Returns three numbers of frames, one per kind. In frames of the first kind, the feet on the
+    ground do not move like the body. In the second kind, a foot in the air moves much less than the
+    body; these frames count half in the score. In the third kind, both feet swing to and fro in the
+    air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
@@ -340,7 +341,7 @@ class KimodoConstraints(MotionMean):
 
 
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
-    """Computes the values of `KimodoConstraints` from the offsets (N, 2) or (..., 3) of a motion.
+    """Computes the values of `KimodoConstraints` from the offsets (N, 2) or (..., 3) between two motions.
 
     Values without offsets are NaN.
     """
@@ -360,7 +361,7 @@ class PhysicalFootContact(PublishedPhysics):
     is better.
 
     Args:
-        fps: frames per second of the motions; at other rates than 30, `compute` raises
+        fps: frames per second of the motions; at rates other than 30, `compute` raises
             `UserError`.
         feet: indices of the left ankle, left toe, right ankle and right toe.
 

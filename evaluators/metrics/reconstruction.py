@@ -1,5 +1,5 @@
 # pyright: standard
-"""Errors of motions relative to the real motion of the same text, or to the motion before an edit."""
+"""Errors of motions relative to the real motion for the same text, or to the motion before an edit."""
 
 from collections.abc import Mapping, Sequence
 
@@ -141,7 +141,7 @@ class PositionErrors(MotionMean):
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Returns the errors of a clip by name.
 
-        "ape" has one value per frame (F,). If clips have equal weight, it is the mean over frames.
+        "ape" has one value per frame (F,) or, if all clips have equal weight, is the mean over frames.
         """
         raise NotImplementedError
 
@@ -334,11 +334,11 @@ class DisplacementErrors(EditErrors):
 
 
 class KeptDrift(EditErrors):
-    """World distance, in meters, by which the kept part of an edit has moved. A metric of this project.
+    """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
 
     `mean` is averaged over the kept joints and frames of a motion, then over motions. `largest` is
     the maximum over all of them. If features are relative to the root, an edit can keep steps and
-    poses exactly, and still move a kept ending, because it begins where the new part ends.
+    poses exactly and still move a kept ending, because the ending begins where the new part ends.
 
     Example:
         >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)

@@ -276,7 +276,7 @@ class TMRRetrieval(CaptionMetric):
         super().__init__(encoder, seed)
         listed = [] if ids is None else read_text(ids, MEBIBYTE).split()
         if ids is not None and not listed:
-            raise UserError(f"{ids}: contains no ids. Write one per line")
+            raise UserError(f"{ids}: contains no ids. Write one id per line")
         self.ids = torch.tensor([key(name) for name in listed], dtype=torch.long)
 
     def value(

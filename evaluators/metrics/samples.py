@@ -1,5 +1,5 @@
 # pyright: standard
-"""Base classes of metrics. A metric computes its values from all samples, sorted by key."""
+"""Base classes for metrics. A metric computes its values from all samples, sorted by key."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ class SampleMetric(Declared, Metric):
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         if twice := int((values[1:] == values[:-1]).sum()):
             raise self.error(
-                f"{twice} samples were given twice ({keys}). Evaluate each sample once, with "
+                f"{twice} samples were added twice ({keys}). Evaluate each sample once, with "
                 f"its own key"
             )
         return order
@@ -210,7 +210,7 @@ class SampleMetric(Declared, Metric):
         if wrong := int((sizes != samples).sum()):
             have = f"{wrong} of {len(names)} prompts do not have {samples} motions"
             raise self.error(
-                f"{have} but {int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each"
+                f"{have}, but {int(sizes.min())} to {int(sizes.max())}. Generate {samples} motions per prompt"
             )
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
@@ -267,7 +267,7 @@ class MotionMean(SampleMetric):
     """
 
     states = ("sums", "counts")
-    #: Names of the values of a motion, if `names` contains further names.
+    #: Names of the values of a motion, if `names` contains additional names.
     parts: Sequence[str] = ()
 
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:
@@ -278,7 +278,7 @@ class MotionMean(SampleMetric):
             motions: B numbers or tensors, such as one number per frame. If the metric has
                 `names`, B mappings from names to numbers or tensors. NaN or missing values are
                 undefined and do not count.
-            more: further states with B rows each.
+            more: additional states with B rows each.
         """
         names, rows = self.parts or self.names, []
         for motion in motions:
@@ -344,7 +344,7 @@ class JointMean(MotionMean):
         return {name: pairs[..., k] for k, name in enumerate(names) if pairs[:, 1, k].any()}
 
     def extras(self, motions: Rows, i: int) -> dict[str, Any]:
-        """Returns further inputs of `update` for motion number i."""
+        """Returns additional inputs of `update` for motion number i."""
         return {}
 
 

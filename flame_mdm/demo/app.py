@@ -118,12 +118,12 @@ class Writers:
 
     @property
     def is_full(self) -> bool:
-        """Whether further requests are refused."""
+        """Whether new requests are refused."""
         return self.waiting >= WAITING_FILES
 
 
 def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
-    """Adds the blocks of streams at `/live`, the files of streams, and the page of their player."""
+    """Adds routes for the blocks of streams (`/live`), the files of streams, and the page that plays them."""
     waiting = 0
 
     @app.get("/live.html")
@@ -135,7 +135,9 @@ def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
     async def block(web: Request) -> Response:
         nonlocal waiting
         if waiting >= WAITING_BLOCKS:
-            return JSONResponse({"error": "too many streams wait. Try again in a minute"}, 503)
+            return JSONResponse(
+                {"error": "too many streams are waiting. Try again in a minute"}, 503
+            )
         waiting += 1
         try:
             call = LiveCall.model_validate_json(await web.body())

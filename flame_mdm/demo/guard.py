@@ -21,7 +21,7 @@ from flame_mdm.demo.request import MAX_TEXT, MAX_WAYPOINTS, PLAIN
 MAX_BODY = 64 * 1024
 # Maximum number of seconds until the body has arrived
 BODY_TIME = 10.0
-# Maximum number of characters in the path of an address. File names have at most 255 characters.
+# Maximum number of characters in the path of a URL. File names have at most 255 characters.
 MAX_PATH = 200
 READ = re.compile(
     r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"

@@ -68,7 +68,10 @@ class LiveStreams:
 
     @property
     def can_lead(self) -> bool:
-        """Whether the model can walk, so that visitors can lead the person along waypoints."""
+        """Whether visitors can lead the person along waypoints.
+
+        This requires the representation `HumanML`, and a model that understands the text `WALK`.
+        """
         if not isinstance(self.model.representation, HumanML):
             return False
         try:
@@ -148,7 +151,7 @@ class LiveStreams:
         if name:
             return name, self._running(name)
         if len(self._streams) >= MAX_STREAMS:
-            raise UserError("too many streams run at the moment. Try again in two minutes")
+            raise UserError("too many streams are running at the moment. Try again in two minutes")
         name = secrets.token_hex(16)
         nothing = np.zeros((0, len(self.model.representation.skeleton), 3), np.float32)
         self._streams[name] = LiveStream(stream(self.model, text), now, nothing, text)
@@ -161,7 +164,11 @@ class LiveStreams:
         return self._streams[name]
 
     def _count(self, live: LiveStream) -> None:
-        """Counts a block. Raises `UserError` if a stream computes more blocks than a visitor can watch."""
+        """Counts a block.
+
+        Raises `UserError` if a stream computes more blocks than a visitor can watch, or if it has
+        reached its maximum duration.
+        """
         now = self.clock()
         live.allowance = min(BURST, live.allowance + RATE * (now - live.used))
         live.used = now
@@ -169,4 +176,6 @@ class LiveStreams:
             raise UserError("too many changes in a short time. Wait a few seconds")
         live.allowance -= 1
         if live.stream.frames > LONGEST * self.model.representation.fps:
-            raise UserError("this stream has lasted for an hour. Reload the page")
+            raise UserError(
+                "this stream has reached the limit of one hour. Reload the page to begin another one"
+            )

@@ -101,7 +101,7 @@ class DemoRequest(BaseModel):
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps: for each step, the number of the motion to edit, and keywords of `generate` or `edit`.
+        """Returns the steps: for each step, the number of the motion to edit, and keywords for `generate` or `edit`.
 
         The number is None in the first step, which generates.
         """
@@ -153,7 +153,7 @@ def query_pairs(query: str) -> list[tuple[str, str]]:
         return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_FIELDS)
     except ValueError:
         fields = query.count("&") + 1
-        raise UserError(f"the link has {fields} options. Give at most {MAX_FIELDS}") from None
+        raise UserError(f"the link has {fields} options. Use at most {MAX_FIELDS}") from None
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:

@@ -98,7 +98,7 @@ class Studio:
 
             def before(*_: object) -> None:
                 nonlocal calls
-                # A stream of another visitor may use the model at the same time
+                # Another visitor's stream may use the model at the same time
                 if get_ident() != thread:
                     return
                 if stop is not None and stop.is_set():
@@ -212,7 +212,7 @@ def check_length(request: DemoRequest) -> None:
     """Raises `UserError` if the parts of a text are longer than the page allows."""
     parts = read_parts(request.text) if request.text else []
     if sum(seconds or request.seconds for _, seconds in parts) > MAX_SECONDS:
-        raise UserError(f"the parts are too long: give at most {MAX_SECONDS} seconds in total")
+        raise UserError(f"the parts are too long. Use at most {MAX_SECONDS} seconds in total")
 
 
 def _cleaned(model: MotionGenerator, motions: Sequence[Motion]) -> list[Motion]:

@@ -19,7 +19,7 @@ from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
 SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
-"""Perturbations of sets that show the bias of a metric, and the motions that are measured at their strongest grade."""
+"""Perturbations of sets that show the bias of a metric, and the motions measured at their strongest grades."""
 ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
@@ -32,7 +32,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Seen:
-    """Response of a metric to a perturbation; None = at no grade."""
+    """Response of a metric to a perturbation. A grade of None means that no grade meets the condition."""
 
     # The paired difference from real motions is not 0 at this and all stronger grades
     grade: float | None
@@ -108,10 +108,10 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns a tuple by which cards are compared. Larger tuples mean cards that better fit the evaluated data.
+        """Returns a tuple for comparing cards. A card with a larger tuple better fits the evaluated data.
 
-        Cards with the same length limits are best, followed by cards of the test split, cards of
-        the same data, and cards of more motions.
+        Cards with the same length limits are best, followed by cards for the test split, cards for
+        the same data, and cards with more motions.
         """
         same_frames = self.data.frames == data.frames
         return (
@@ -249,7 +249,7 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def findings(card: AuditCard) -> list[str]:
-    """Returns sentences about perturbations that metrics do not notice, or rate better than real motions."""
+    """Returns sentences about perturbations that metrics do not detect, or rate better than real motions."""
     table = {
         (perturbation.name, metric): seen(card, perturbation, metric)
         for perturbation in card.perturbations
@@ -257,8 +257,8 @@ def findings(card: AuditCard) -> list[str]:
     }
     group = {perturbation.name: perturbation.group for perturbation in card.perturbations}
 
-    # A metric notices a perturbation if it responds to one of its grades. Metrics are expected to
-    # notice perturbations that make motions or their meaning wrong. A name with a colon is a
+    # A metric detects a perturbation if it responds to one of its grades. Metrics are expected to
+    # detect perturbations that make motions or their meaning wrong. A name with a colon is a
     # variant of a perturbation.
     seen_by: dict[str, list[str]] = {name: [] for name in group}
     for (name, metric), response in table.items():

@@ -22,7 +22,7 @@ SECONDS = 15  # only the first seconds of a longer clip are shown, to keep the p
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
-    """Returns the clips of a split (None = all) whose id and captions contain all words of `search`.
+    """Returns the clips of a split (None = all splits) whose id and captions contain all words of `search`.
 
     Upper and lower case are not distinguished. Each clip is grouped with its mirrored copy,
     original first. A group matches if one of its clips matches.
@@ -54,7 +54,7 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
-    """Returns the first `SECONDS` of a clip as a motion that stands on the floor."""
+    """Returns the first `SECONDS` seconds of a clip as a motion that stands on the floor."""
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
@@ -114,7 +114,7 @@ def write_clips(
     )
     if others:
         raise UserError(
-            f"motions={folder}: the folder holds other motions, such as {others[0].name}. "
+            f"motions={folder}: the folder contains other motions, such as {others[0].name}. "
             f"Delete it, or choose another folder"
         )
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.visualize.body import Mesh
 
-# The requested caption or action, and the index of the motion among motions with the same request
+# The requested caption or action, and the index of a motion among the motions with the same request
 Prompt = tuple[str, int]
 # First frame, last frame (exclusive), kind and description of a span of a time line
 Mark = tuple[int, int, str, str]
@@ -214,22 +214,22 @@ EXPLAINED = (
 def differences(first: Result, second: Result) -> list[list[str]] | str:
     """Returns rows for `HEAD`: the differences of all metrics of two results, or the reason why there is no comparison.
 
-    Both results must be of the same evaluation.
+    Both results must come from the same evaluation: the same protocol, data and extractor.
     """
     if invalid := [*first.invalid_because, *second.invalid_because]:
         return f"not compared: not valid: {invalid[0]}"
     paired = [(r.seed, r.data.frames, r.skeleton) for r in (first, second)]
     if paired[0] != paired[1]:
         return (
-            "not compared: the seeds, limits of length or skeletons differ, so the motions "
+            "not compared: the seeds, length limits or skeletons differ, so the motions "
             "are not paired"
         )
     one, two = first.values or {}, second.values or {}
     rows = [_difference(name, one[name], two[name]) for name in sorted(one.keys() & two.keys())]
     return [row for row in rows if row] or (
         "not compared: no metric has values per replication for the same number of motions. "
-        "Results of earlier versions have no such values: evaluate both again. Motions are not "
-        "generated again"
+        "Results from earlier versions have no such values. Evaluate both again; the motions are "
+        "not generated again"
     )
 
 
@@ -266,7 +266,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
-    """Groups the results of the same protocol, data and extractor by title, with the labels of their runs."""
+    """Groups the results for the same protocol, data and extractor by title, with the labels of their runs."""
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, run in runs.items():
         for result in run.results.values():

@@ -43,7 +43,7 @@ class Series:
 
 @dataclass
 class Histogram:
-    """Numbers of motions by length. The first bar is for 0 to `step` frames."""
+    """Histogram of motion lengths. The first bar is for 0 to `step` frames."""
 
     step: int
     counts: Sequence[int]

@@ -120,7 +120,7 @@ def _pairs(
     if not prompts:
         raise UserError(
             f"{run_a.label} and {run_b.label} have no prompt in common. "
-            "Give prompts=FILE to sample both for the same prompts"
+            "Add prompts=FILE to sample both for the same prompts"
         )
 
     items = []
@@ -158,13 +158,12 @@ def tally(files: Sequence[Path]) -> list[Pair]:
     raters: dict[tuple[str, str], set[str]] = {}
 
     for path in files:
-        answers: Answers = read_json(path, Answers, "give a file that the rating page saved")
+        answers: Answers = read_json(path, Answers, "use a file that the rating page saved")
         study, rater = answers.study, answers.rater
         if (study, rater) in answered:
             earlier = answered[study, rater]
             raise UserError(
-                f"{path}: {rater} also answered this page in {earlier}. Give only one of these "
-                f"files"
+                f"{path}: {rater} also answered this page in {earlier}. Use only one of these files"
             )
         answered[study, rater] = path
 

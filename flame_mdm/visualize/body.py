@@ -16,7 +16,7 @@ from flame_mdm.safe_io import naming, read_npz
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
 """Limbs with a helper bone, by their first joint, and the share of a twist that the helper bone takes.
 
-It is the twist of the hip or shoulder or, for the elbow, the twist of the wrist.
+The twist is measured at the hip or shoulder or, for the forearm, at the wrist.
 """
 HELPERS = tuple(
     (JOINT[f"{side}_{name}"], share)
@@ -66,7 +66,7 @@ class Figure:
 
         Without a body, a skeleton is drawn instead.
 
-        `body` is the mesh; None = the mannequin. Joints without rotations cannot move a body.
+        `body` is the mesh; None = the mannequin. A body needs the rotations of the joints.
         """
         return None, "the rotations of its joints are unknown"
 
@@ -79,7 +79,7 @@ def target(path: str | Path, motions: Sequence[Figure]) -> Path:
 
 
 def sides(skeleton: Skeleton) -> list[int]:
-    """Returns for each joint 1 = left, -1 = right, 0 = middle."""
+    """Returns the side of each joint: 1 = left, -1 = right, 0 = middle."""
     return [name.startswith("left_") - name.startswith("right_") for name in skeleton.joints]
 
 
@@ -145,7 +145,7 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def mannequin() -> Mesh:
-    """Returns the body of the package."""
+    """Returns the body that the package contains, the mannequin."""
     return Mesh(MANNEQUIN)
 
 

@@ -39,7 +39,7 @@ FORCED = "Forced: real motions do not have the values that the protocol expects.
 
 
 def build(name: str, spec: Config, results: Path) -> Table:
-    """Builds the table of a spec from existing results and published numbers.
+    """Builds the table that a spec describes, from existing results and published numbers.
 
     Raises `UserError` if the results, the published numbers and the spec do not match.
     """
@@ -207,7 +207,7 @@ def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 def _listed(labels: Iterable[str]) -> str:
-    """Returns labels as a list whose separator is not part of a label."""
+    """Joins labels with a separator that none of them contains."""
     texts = list(labels)
     return ("; " if any("," in text for text in texts) else ", ").join(texts)
 

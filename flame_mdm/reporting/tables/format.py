@@ -75,7 +75,9 @@ class Part:
     """One table within the table of a paper."""
 
     name: str
-    columns: dict[str, str]  # which values are better, by column label: a key of `ARROWS`
+    columns: dict[
+        str, str
+    ]  # by column label, a key of `ARROWS` that states which values are better
     lines: list[Line]
     # Mark and text of each footnote; the mark may be empty
     notes: list[tuple[str, str]] = field(default_factory=list)

@@ -36,7 +36,7 @@ SWEPT = (
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
 """Maximum numbers of rows (after expanding lists of options), columns and plots of a table.
 
-Tables of papers have about 20 rows.
+Tables in papers have about 20 rows.
 """
 
 
@@ -54,7 +54,7 @@ class Options(ClosedSchema):
 
 
 class ColumnSpec(Options):
-    """A column: a metric or a key of `ABOUT`."""
+    """A column: a metric, or a key of `ABOUT`."""
 
     value: str
     better: Literal["higher", "lower", "real", "none"] = "none"

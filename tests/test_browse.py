@@ -149,7 +149,7 @@ def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, c
                 np.testing.assert_allclose(decoded, arrays["joints"], atol=1e-6)
 
     assert run("split=test", "clips=1", f"motions={folder}") == 1
-    assert "holds other motions, such as motion_001_" in capsys.readouterr().err
+    assert "contains other motions, such as motion_001_" in capsys.readouterr().err
 
 
 @pytest.mark.tools

@@ -113,7 +113,7 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, subtests)
         ({"seed": 1}, "not compared: the seeds"),
         (
             {"data": result()["data"] | {"frames": [24, 40]}},
-            "not compared: the seeds, limits of length or skeletons differ",
+            "not compared: the seeds, length limits or skeletons differ",
         ),
         (
             {"invalid_because": ["real motions are off"]},
@@ -123,7 +123,10 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, subtests)
             {"values": {"fid": of(4.2, [4.1, 4.3], n=65)}},
             "not compared: no metric has values per replication",
         ),
-        ({"values": result()["values"]}, "evaluate both again. Motions are not generated again"),
+        (
+            {"values": result()["values"]},
+            "Evaluate both again; the motions are not generated again",
+        ),
         ({"protocol": {"name": "q", "version": 3}}, "q version 3, synthetic test, data abc"),
         ({"extractor": {"sha256": "0" * 64}}, "No evaluation in common"),
     ):
@@ -259,7 +262,7 @@ def test_only_runs_with_a_common_prompt_are_rated(tmp_path, capsys):
     folders = [motions(tmp_path / name, (name,)) for name in ("a", "b")]
     words = [f"runs={folders[0]} {folders[1]}", f"out={tmp_path / 'rate.html'}", "rate=true"]
     assert main(["compare", *words]) == 1
-    assert "a and b have no prompt in common. Give prompts=FILE" in capsys.readouterr().err
+    assert "a and b have no prompt in common. Add prompts=FILE" in capsys.readouterr().err
     assert not (tmp_path / "rate.html").exists()
 
 

@@ -86,9 +86,9 @@ BAD = {
     "sampler=../../etc": "unknown sampler '../../etc': GaussianDiffusion has ancestral",
     "model=/etc/passwd": "unknown model '/etc/passwd'", "model=packige": "Did you mean package?",
     "text=": "the text is empty", "text=walks+|": "part 2 is empty", "text=" + quote("a\x00b\x1b[31m"): "text=",
-    "text=walks+@600+|+waves": "the parts are too long: give at most 30 seconds in total",
-    "text=walks+@20+|+waves+@20": "the parts are too long: give at most 30 seconds in total",
-    "text=walks+|+waves+|+sits&seconds=11": "the parts are too long: give at most 30 seconds in total",
+    "text=walks+@600+|+waves": "the parts are too long. Use at most 30 seconds in total",
+    "text=walks+@20+|+waves+@20": "the parts are too long. Use at most 30 seconds in total",
+    "text=walks+|+waves+|+sits&seconds=11": "the parts are too long. Use at most 30 seconds in total",
     f"text={'x' * 100_000}": "string should have at most 300 characters",
     "text=walks+%E2%80%AEkcab": "string should match", "file=/etc/passwd": "unknown option file",
     "path=0,nan": "path.0.1=nan: input should be a finite number",
@@ -326,7 +326,9 @@ def test_the_parts_of_a_text_are_limited_in_total(query: str, seconds: int):
     if seconds <= 30:
         making.check_length(request)
         return
-    with pytest.raises(UserError, match="the parts are too long: give at most 30 seconds in total"):
+    with pytest.raises(
+        UserError, match=r"the parts are too long\. Use at most 30 seconds in total"
+    ):
         making.check_length(request)
 
 
@@ -450,13 +452,13 @@ def test_an_address_that_the_page_does_not_use_gets_one_line(server, address):
     assert body.decode() in (
         "this page has nothing at that address",
         "this page has no such session. Reload it",
-        "the link has 60 options. Give at most 50",
+        "the link has 60 options. Use at most 50",
     )
 
 
 def test_a_link_with_too_many_options_is_refused_on_the_page(server):
     notes = generated(server, "&".join(f"a{number}=1" for number in range(51)))[1]
-    assert "the link has 51 options. Give at most 50" in notes
+    assert "the link has 51 options. Use at most 50" in notes
 
 
 def test_bodies_are_counted_as_they_arrive(server, subtests):

@@ -571,7 +571,7 @@ def test_variants_replace_options_of_their_file(tmp_path):
         "editing_prediction",
         "reconstruction_kit",
     }
-    with pytest.raises(UserError, match="choose a variant: editing_in_between, "):
+    with pytest.raises(UserError, match=r"has variants\. Choose one of editing_in_between, "):
         protocol_config("editing")
     with pytest.raises(UserError, match=r"editing_predicton.*Did you mean editing_prediction"):
         protocol_config("editing_predicton")
@@ -672,14 +672,14 @@ def own(folder: Path, old: str, new: str) -> str:
 
 def test_what_does_not_fit_is_refused(runs, tmp_path, subtests):
     for message, keys in (
-        ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
+        ("resamples=20: expected 0, or at least 100", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
         ("contains a motion generator, not a motion-CLIP", {"extractor": str(runs.model)}),
         ("Did you mean synthetic", {"protocol": "synthetical"}),
         ("condition text", {"protocol": "action_to_motion"}),
         ("does not edit motions", {"method": "mdm"}),
         ("option of method=mfm", {"protocol": "editing_prediction", "until": 0.3}),
-        ("give exactly one of", {"baseline": "real"}),
+        ("use exactly one of", {"baseline": "real"}),
         ("needs a protocol", {"ckpt": None, "baseline": "real", "data": {"name": "synthetic"}}),
     ):
         with subtests.test(message=message, keys=keys):

@@ -240,7 +240,7 @@ def released_folder(folder: Path, features: int) -> T2MEvaluator:
 
 @pytest.mark.usefixtures("small_networks")
 def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"finest\.tar, .*mean\.npy, .*no such file\. Give"):
+    with pytest.raises(FileNotFoundError, match=r"finest\.tar, .*mean\.npy, .*no such file\. Use"):
         T2MExtractor(str(tmp_path))
     made = released_folder(tmp_path, 251)
     write_words(tmp_path, WORDS, np.random.default_rng(0).normal(size=VECTORS.shape))
@@ -479,7 +479,7 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind, subtest
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(UserError, match=r"weights\.tar: damaged"):
         ClassifierExtractor(kind, str(path))
-    with pytest.raises(FileNotFoundError, match=r"absent\.tar: no such file\. Give the path"):
+    with pytest.raises(FileNotFoundError, match=r"absent\.tar: no such file\. Use the path"):
         ClassifierExtractor(kind, str(tmp_path / "absent.tar"))
 
 

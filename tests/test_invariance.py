@@ -221,7 +221,7 @@ def test_too_few_samples_and_wrong_inputs_are_errors(subtests):
         (
             diversity.TextMultimodality(),
             45,
-            "9 of 9 prompts do not have 30 motions but 5 to 5. Generate 30 for each",
+            "9 of 9 prompts do not have 30 motions, but 5 to 5. Generate 30 motions per prompt",
         ),
         (diversity.ActionMultimodality(), 5, "got 1 motions of class 1, needs at least 2"),
         (reconstruction.DisplacementErrors(), kept, "a motion has no generated frame"),
@@ -255,7 +255,7 @@ def test_samples_given_twice_and_features_that_are_not_finite_are_errors(subtest
     for name, metric in all_metrics().items():
         with subtests.test(name=name):
             if isinstance(metric, SampleMetric):
-                with pytest.raises(UserError, match="1 samples were given twice"):
+                with pytest.raises(UserError, match="1 samples were added twice"):
                     measure(
                         {name: metric},
                         batches(evaluation(), [torch.arange(COUNT), torch.tensor([3])]),

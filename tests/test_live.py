@@ -90,7 +90,7 @@ def test_streams_are_bounded_and_end_when_nobody_reads_them(model, monkeypatch):
     first = live.block("", WALK, 0)["stream"]
     clock.time = 100.0
     live.block("", WALK, 0)
-    with pytest.raises(UserError, match="too many streams run"):
+    with pytest.raises(UserError, match="too many streams are running"):
         live.block("", WALK, 0)
     clock.time = 130.0
     live.block("", WALK, 0)

@@ -325,7 +325,7 @@ def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, tmp_p
 
 def test_a_list_of_dissimilar_motions_needs_ids(tmp_path):
     (tmp_path / "empty.txt").write_text("\n")
-    with pytest.raises(UserError, match=r"empty\.txt: contains no ids. Write one per line"):
+    with pytest.raises(UserError, match=r"empty\.txt: contains no ids. Write one id per line"):
         TMRRetrieval(ids=str(tmp_path / "empty.txt"))
     with pytest.raises(FileNotFoundError):
         TMRRetrieval(ids=str(tmp_path / "none.txt"))

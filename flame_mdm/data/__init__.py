@@ -27,7 +27,7 @@ Value = TypeVar("Value")
 class Clip:
     """One motion of a data set, which is written into a store."""
 
-    # Unique name. A mirrored copy has the name `M` + the name of its original.
+    # Unique name. The name of a mirrored copy is `M` + the name of its original.
     id: str
     # Input of the representation, at its frame rate. Representations of joints take positions
     # (F, J, 3) in meters, y up, in the joint order of the skeleton.
@@ -36,7 +36,7 @@ class Clip:
     captions: list[str]
     # Split. Mirrored copies and cuts of a take are in the split of the take.
     split: Split
-    # The take that the clip comes from. All clips of one source are in the same split.
+    # The take that the clip comes from. All clips from one source are in the same split.
     source: str
     # Index into the data set's `actions`, or None
     action: int | None = None
@@ -90,7 +90,7 @@ class MotionSource(ABC):
     version: int = 1
     """Version of the code that reads the motions.
 
-    The version is part of the fingerprint. Stores of another version are not used.
+    The version is part of the fingerprint. Stores written by another version are not used.
     """
     failures: Sequence[str] = ()
     """One line per motion that could not be read and was left out.
@@ -207,7 +207,7 @@ class MotionSource(ABC):
         """
         if fps != published:
             raise UserError(
-                f"{self.name} has {published:g} frames per second, not {fps:g}: set representation.fps"
+                f"{self.name} has {published:g} frames per second, not {fps:g}. Set representation.fps"
             )
 
 
@@ -254,7 +254,7 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 
 
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
-    """Returns the split of each block of `size` consecutive clips, drawn by a hash of `name`.
+    """Returns the split of each block of `size` consecutive clips, drawn with a hash of `name`.
 
     Neighboring clips may be similar, so all clips of a block are in the same split. `val` and
     `test` are fractions of the blocks. Each split gets at least one block.

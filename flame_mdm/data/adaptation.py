@@ -35,10 +35,9 @@ KEPT = "prior/"  # prefix of the names of the known clips
 
 
 class Lesson(MotionSource):
-    """Clips of the user's folder, with mirrored copies, and clips that the model already knows.
+    """Clips in the user's folder, with mirrored copies, and clips that the model already knows.
 
-    All clips of the folder are for training, unless its table states otherwise. Clips are
-    normalized
+    All clips in the folder are for training unless its table states otherwise. Clips are normalized
 
     Args:
         path: the user's folder of motions.
@@ -125,7 +124,7 @@ def check_clips(path: str | Path, fps: float) -> None:
     say(*folder.findings())
     if listed := some(faults):
         raise UserError(
-            f"{path}: {listed}. The model would learn that: correct these clips, or add force=true"
+            f"{path}: {listed}. The model would learn these faults. Correct the clips, or add force=true"
         )
 
 
@@ -185,7 +184,7 @@ class LessonData(MotionDataModule):
         """Returns a line with the numbers of training clips of both halves."""
         taught, kept = map(len, self.halves())
         return [
-            f"clips: {taught} of {self.source.name}, mirrored copies included; {kept} of what the model knows"
+            f"clips: {taught} of {self.source.name}, mirrored copies included; {kept} that the model already knows"
         ]
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:

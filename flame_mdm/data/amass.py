@@ -1,4 +1,4 @@
-"""Reader of AMASS (SMPL+H G release), from downloaded archives or unpacked folders.
+"""Reader for AMASS (SMPL+H G release) in downloaded archives or unpacked folders.
 
 Source: Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019. The
 license is at amass.is.tue.mpg.de.
@@ -28,7 +28,7 @@ SUBSETS: dict[str, list[str]] = FACTS["subsets"]
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 ARCHIVE = re.compile(r"(.+)\.tar(\.bz2|\.xz|\.gz)?")
-RELEASE = "not a motion of AMASS's SMPL+H G release, which is the one to download"
+RELEASE = "not a motion from AMASS's SMPL+H G release, which is the one to download"
 GET_IT = (
     "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
 )
@@ -88,10 +88,10 @@ class Recording(NamedTuple):
 def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
-    Returns None if the path belongs to no subset. All names of a subset result in the same key, in
-    index files, archives and folders, nested or not. Case is ignored, and spaces are replaced by
-    underscores, as in later releases. A file of the SMPL-X release has the same key as the SMPL+H
-    file.
+    Returns None if the path belongs to no subset. A subset may have different names in index files,
+    archives and folders; all of them result in the same key. Case is ignored, and spaces are
+    replaced by underscores, as in later releases. A file from the SMPL-X release has the same key as
+    the SMPL+H file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -109,7 +109,7 @@ def read(file: Path | bytes, name: str) -> Recording:
         name: name of the file in error messages.
 
     Raises:
-        UserError: If the file is not a motion of the SMPL+H G release, or if a number is not
+        UserError: If the file is not a motion from the SMPL+H G release, or if a number is not
             finite.
     """
     names = ("poses", "trans", "betas", "gender", "mocap_framerate")

@@ -1,4 +1,4 @@
-"""Reader of zip and tar archives of motion data.
+"""Reader for zip and tar archives of motion data.
 
 Only regular files are read, with size limits.
 """
@@ -135,7 +135,7 @@ def _tar_members(
 
 def _check_size(name: str, size: int) -> None:
     if size > MEMBER_LIMIT:
-        raise UserError(f"{name}: {size:,} bytes are too many for a motion")
+        raise UserError(f"{name}: {size:,} bytes are too large for a motion")
 
 
 class _Member(tarfile.TarInfo):
@@ -156,7 +156,7 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """Reader of the content of a compressed file of `packed` bytes.
+    """Reader for the content of a compressed file with a size of `packed` bytes.
 
     It refuses to read implausibly large amounts of data.
     """

@@ -34,7 +34,7 @@ PARTS = {
 
 
 class Label(NamedTuple):
-    """A text for a segment of a motion."""
+    """A label: a text for a segment of a motion."""
 
     motion: str  # key of the AMASS recording, as returned by `amass.key_of`
     text: str
@@ -59,8 +59,8 @@ class Babel(MotionSource):
     """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
 
     Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
-    start) to floor(20 end) - 1. A label that is longer than a clip gives one window every `STRIDE`
-    frames. If a label is shorter than a clip, the clip continues past the end of the label. The
+    start) to floor(20 end) - 1. A label that is longer than a clip results in one window every
+    `STRIDE` frames. If a label is shorter than a clip, the clip continues past the end of the label. The
     label is left out if the motion ends before the clip.
 
     Both splits train on BABEL's entire train part, and test on 20 % of its val part. The project's
@@ -192,7 +192,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip of a label, or the reason why the label gives no clip.
+    """Returns the first frame of each clip of a label, or the reason why the label has no clip.
 
     `frames` is the number of frames of the motion.
     """

@@ -38,7 +38,7 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""The joint in the files for each SMPL joint, in order. spine1 lies between Hips and Spine."""
+"""The files' joint for each SMPL joint, in order. spine1 lies between Hips and Spine."""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
 _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's left foot
@@ -203,7 +203,7 @@ class Bandai(MotionSource):
         for file in sorted(folder.rglob("dataset-*.bvh")):
             if FILE.fullmatch(file.name) and files.setdefault(file.stem, file) != file:
                 raise UserError(
-                    f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}; delete one"
+                    f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}. Delete one of them"
                 )
         if not files:
             raise FileNotFoundError(
@@ -290,7 +290,7 @@ def side_of(content: str) -> str:
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Returns four captions of a take, worded like the captions of HumanML3D."""
+    """Returns four captions for a take, worded like HumanML3D's captions."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     filled = (
@@ -306,8 +306,8 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
     only one take of most combinations, so each combination is in one split. The normal takes of
     walk-turn-left and -right overlap in time across names. All these takes are used for training.
 
-    With the rule "compositional", the combinations `HELD_OUT` are the test split. All other takes
-    that are test takes with the rule "takes" are used for training.
+    With the rule "compositional", the combinations `HELD_OUT` are the test split. The other takes
+    that would be in the test split under the rule "takes" are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:

@@ -97,7 +97,7 @@ class Body(NamedTuple):
 
 
 def load_body(folder: Path, gender: str) -> Body:
-    """Loads the extended SMPL+H model of a gender.
+    """Loads the extended SMPL+H model for a gender.
 
     For "male", the file is `male/model.npz` or `SMPLH_MALE.npz`, in the folder or in its subfolder
     `smplh`.

@@ -20,7 +20,7 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields the rows of a table of captions.
 
-    For each row, these are its file and line (for error messages), and its cells by column.
+    A row consists of its file and line, for error messages, and its cells by column.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in
@@ -49,7 +49,7 @@ def known_split(split: str) -> Split:
     for name in SPLITS:
         if split == name:
             return name
-    raise UserError(f"unknown split {split!r}; use {', '.join(SPLITS)}")
+    raise UserError(f"unknown split {split!r}. Use {', '.join(SPLITS)}")
 
 
 def drawn_splits(
@@ -57,9 +57,9 @@ def drawn_splits(
 ) -> dict[str, Split]:
     """Returns the split of each motion: the split in the table or, if it states none, a drawn split.
 
-    Splits are drawn by a hash of the source, so that all motions of a source are in one split. If
-    no motion is drawn for training, the source with the highest hash in the largest split is moved
-    to training. With `SPLITTABLE` or more motions, val and test are filled in the same way.
+    Splits are drawn with a hash of the source, so that all motions from a source are in one split.
+    If no motion is drawn for training, the source with the highest hash in the largest split is
+    moved to training. With `SPLITTABLE` or more motions, val and test are filled in the same way.
 
     Args:
         sources: source of each motion, by name.

@@ -1,9 +1,8 @@
-"""The CMU motion capture database, with captions of HumanML3D, of KIT-ML, or of the user.
+"""The CMU motion capture database, with captions from HumanML3D, KIT-ML or the user.
 
 The motions are from http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH.
 Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML).
-`docs/cmu.md` lists the required downloads, and the differences between this data and these data
-sets.
+`docs/cmu.md` lists the required downloads, and how this data differs from HumanML3D and KIT-ML.
 """
 
 import re
@@ -85,7 +84,7 @@ class Item(NamedTuple):
     """Captions of a recording, or of its part from frame `start` to frame `end` at 20 fps.
 
     `action` is the label of a part in `captions.csv`. `is_own` is True for such parts, and False
-    for captions of HumanML3D and KIT-ML.
+    for captions from HumanML3D and KIT-ML.
     """
 
     id: str
@@ -108,12 +107,11 @@ class Item(NamedTuple):
 class CMU(MotionSource):
     """Recordings of the CMU database with captions, on SMPL's 22 joints.
 
-    The clips are clips of HumanML3D, recordings with captions of KIT-ML, or motions with the user's
+    The clips are HumanML3D's clips, recordings with KIT-ML's captions, or motions with the user's
     captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
     in the test (val) split if a test (val) clip of HumanML3D is cut from it. If HumanML3D has no
-    clip of the recording, its split is determined by the subject. If there is a table
-    `captions.csv`, its rows are the only captions, and each of its parts of a recording is one
-    clip.
+    clip of the recording, the subject determines the split. If there is a table `captions.csv`, its
+    rows are the only captions, and each part of a recording that it names is one clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -183,7 +181,7 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips of CMU recordings, and the captions and splits by name.
+        """HumanML3D's clips from CMU recordings, and the captions and splits by name.
 
         All of them are empty if the user provides captions.
         """
@@ -207,7 +205,7 @@ class CMU(MotionSource):
 
     @cached_property
     def kit(self) -> list[tuple[str, str, str, float]]:
-        """KIT-ML's captions of CMU recordings: id, recording, text and seconds.
+        """KIT-ML's captions for CMU recordings: id, recording, text and seconds.
 
         The list is empty if there is no such file.
         """
@@ -354,7 +352,7 @@ class _Part:
 def _parts(table: Path) -> dict[str, _Part]:
     """Returns the parts of recordings in a table, by name.
 
-    Rows with the same part are captions of one clip.
+    Rows that name the same part are captions for one clip.
     """
     parts: dict[str, _Part] = {}
     for where, cells in table_rows(table, COLUMNS):
@@ -368,8 +366,8 @@ def _parts(table: Path) -> dict[str, _Part]:
         bare = [name for name, part in parts.items() if not getattr(part, kind)]
         if 0 < len(bare) < len(parts):
             raise UserError(
-                f"{table}: {len(bare)} of {len(parts)} parts have no {kind.removesuffix('s')}, such as {bare[0]}; add "
-                "one to each, or leave these out"
+                f"{table}: {len(bare)} of {len(parts)} parts have no {kind.removesuffix('s')}, such as {bare[0]}. Add "
+                "one to each, or leave these parts out"
             )
     return parts
 
@@ -405,7 +403,7 @@ def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
 
 
 def _part_in_table(cells: Mapping[str, str]) -> _Part:
-    """Returns the part of a recording that the cells of a row name, without its captions."""
+    """Returns the part of a recording that a row names, without its captions."""
     trial, begin, end = cells["id"], cells.get("begin", ""), cells.get("end", "")
     if not re.fullmatch(r"\d{2,3}_\d{2,3}", trial):
         raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
@@ -420,7 +418,7 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
         last = round(float(end) * FPS) if end else None
     if first < 0 or (last is not None and last <= first):
         raise UserError(
-            f"begin {begin!r}, end {end!r}: give the beginning and end of a part, in seconds"
+            f"begin {begin!r}, end {end!r}: expected the beginning and the end of a part, in seconds"
         )
     name = f"{trial}@{begin or 0}-{end or 'end'}" if begin or end else trial
     split = known_split(cells["split"]) if cells.get("split") else None

@@ -1,4 +1,4 @@
-"""Rules that crop clips to training samples, and data sets of cropped clips.
+"""Rules for cropping clips to training samples, and data sets of cropped clips.
 
 The rules follow the authors' code.
 """
@@ -66,11 +66,11 @@ class Crop(ABC):
 
 @dataclass(frozen=True)
 class Units(Crop):
-    """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
+    """The rule for HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
 
-    In one of three draws, the sample is shorter by one unit. From a clip longer than `max_frames`,
-    a window of that length is taken at a random position. Without a generator, the longest window
-    that starts at the first frame is taken.
+    In one of three draws, the sample is one unit shorter than possible. If a clip is longer than
+    `max_frames`, the sample is a window at a random position. Without a generator, the longest
+    window that starts at the first frame is taken.
     """
 
     min_frames: int = 40
@@ -95,7 +95,7 @@ class Units(Crop):
 
 @dataclass(frozen=True)
 class Whole(Crop):
-    """FLAME: the entire clip, truncated after `max_frames`."""
+    """FLAME's rule: the entire clip, truncated after `max_frames`."""
 
     min_frames: int = 1
     max_frames: int = 471
@@ -108,7 +108,7 @@ class Whole(Crop):
 
 @dataclass(frozen=True)
 class Fixed(Crop):
-    """ACTOR's action data sets: always `frames` frames.
+    """The rule for ACTOR's action data sets: always `frames` frames.
 
     Short clips repeat their last frame. From long clips, a window is taken. As in ACTOR's code, the
     window never starts at the last possible frame. Without a generator, the first window is used.

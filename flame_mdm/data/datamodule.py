@@ -26,10 +26,10 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
-# Maximum number of frames of a sample. One hour at 20 frames per second has 72,000.
+# Maximum number of frames of a sample. One hour at 20 frames per second has 72,000 frames.
 MAX_FRAMES = 100_000
-# Permitted names of a data set. The name of the data set's folder starts with this name. The folder
-# must neither be outside `root` nor hidden.
+# Permitted names of a data set. The data set's folder name starts with this name, so the pattern
+# ensures that the folder is inside `root` and not hidden.
 NAME = r"\w[\w .-]*"
 Loader = DataLoader[Sample] | ResidentLoader
 
@@ -93,7 +93,7 @@ class MotionDataModule(LightningDataModule):
         batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 = load in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
-        resident: whether the data set is kept on the training device. The same batches are then
+        resident: whether the data set is kept on the training device. If so, the same batches are
             gathered on the device, without workers. "auto" = only if the data set takes at most a
             quarter of the free memory.
         pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
@@ -124,25 +124,25 @@ class MotionDataModule(LightningDataModule):
                 "name",
                 name,
                 re.fullmatch(NAME, name),
-                "give a name of letters, digits, _, - and ., such as my_motions",
+                "use a name of letters, digits, _, - and ., such as my_motions",
             ),
             (
                 "resident",
                 resident,
                 isinstance(resident, bool) or resident == "auto",
-                "give true, false or auto",
+                "use true, false or auto",
             ),
             (
                 "pad_multiple",
                 pad_multiple,
                 1 <= pad_multiple <= MAX_FRAMES,
-                f"give 1 to {MAX_FRAMES:,}",
+                f"expected 1 to {MAX_FRAMES:,}",
             ),
             (
                 "crop",
                 crop,
                 is_crop,
-                f"give a rule of flame_mdm.data.crops, of 1 to {MAX_FRAMES:,} frames",
+                f"use a rule in flame_mdm.data.crops, with 1 to {MAX_FRAMES:,} frames",
             ),
         ):
             if not is_valid:
@@ -214,12 +214,12 @@ class MotionDataModule(LightningDataModule):
             of_all = f" of {used[split] + n} ({n} shorter than {shortest} frames)" if n else ""
             counts.append(f"{used[split]}{of_all} {split}")
             if n and not used[split]:
-                advice.append(f"all {split} clips are too short: lower data.crop.min_frames")
+                advice.append(f"all {split} clips are too short. Lower data.crop.min_frames")
             elif not used[split]:
                 advice.append(f"no {split} clips.{advice_on_splits(self.source)}")
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
             advice.append(
-                "no captions: add captions.csv and prepare with force=true, or train with condition=none"
+                "no captions. Add captions.csv and prepare with force=true, or train with condition=none"
             )
         return ["clips: " + ", ".join(counts), *(() if store.info["published_split"] else advice)]
 
@@ -241,7 +241,7 @@ class MotionDataModule(LightningDataModule):
     def choose_device(self, more: int = 0) -> torch.device | None:
         """Returns the device on which the data set is kept; None = no device.
 
-        `more` is the size of the text encoder's cache in bytes.
+        `more` is the size of the text encoder's cache, in bytes.
         """
         device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
         free, size = free_memory(device), 4 * self.store.features.size + more

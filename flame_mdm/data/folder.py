@@ -99,7 +99,7 @@ class Folder(MotionSource):
     ):
         if balance < 0:
             raise UserError(
-                f"data.source.balance={balance}: give the number of clips per action, or 0"
+                f"data.source.balance={balance}: expected a number of clips per action, or 0"
             )
         if mirror and motion == "smpl":
             raise UserError("data.source.mirror=true: needs data.source.motion=joints")
@@ -136,11 +136,11 @@ class Folder(MotionSource):
         name = representation.name
         if needs_rotations(representation) and self.motion == "joints":
             raise UserError(
-                f"{name} is made of rotations. Add data.source.motion=smpl: rotations are "
-                "then read from the files, or fitted to joints"
+                f"{name} encodes rotations. Add data.source.motion=smpl, which reads rotations "
+                "from the files, or fits them to joints"
             )
         if isinstance(representation, HumanML | Rifke) and self.motion == "smpl":
-            raise UserError(f"{name} is made of joints. Remove data.source.motion=smpl")
+            raise UserError(f"{name} encodes joint positions. Remove data.source.motion=smpl")
         self._representation = representation
 
     def count(self) -> int:
@@ -158,7 +158,7 @@ class Folder(MotionSource):
     def copies(self) -> dict[str, int]:
         """Number of times that each motion occurs in the set; see `balance`.
 
-        A mirrored copy occurs equally often.
+        A mirrored copy occurs as often as its original.
         """
         sizes = Counter(
             note.action for name, note in self.notes.items() if self.splits[name] == "train"
@@ -217,7 +217,7 @@ class Folder(MotionSource):
             yield name, attempt.motion
 
     def findings(self) -> list[str]:
-        """Returns the skeletons of the motions read so far, and the parts that were left out."""
+        """Returns lines about the skeletons of the motions read so far, and about the parts that were left out."""
         skeletons = [
             f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
         ]
@@ -265,13 +265,13 @@ class Folder(MotionSource):
                 if label in files:
                     other = files[label].path.name
                     raise UserError(
-                        f"{path}: has the same name as {other}; each motion needs its own name"
+                        f"{path}: has the same name as {other}. Each motion needs its own name"
                     )
                 files[label] = file
         if not files:
             reason = "no motions in this folder" if self.path.is_dir() else "no such folder"
             raise FileNotFoundError(
-                f"{self.path}: {reason}. Give a folder of {', '.join(ENDINGS)} files"
+                f"{self.path}: {reason}. Use a folder of {', '.join(ENDINGS)} files"
             )
         return self.not_excluded(dict(sorted(files.items())), self.path)
 
@@ -283,7 +283,7 @@ class Folder(MotionSource):
         ]
         newer = [str(path.relative_to(self.path)) for path in files]
         return (
-            [f"{self.path}: {some(newer)} changed since: prepare with force=true to read them"]
+            [f"{self.path}: {some(newer)} changed since. Prepare with force=true to read them"]
             if newer
             else []
         )
@@ -308,8 +308,8 @@ class Folder(MotionSource):
             bare = [name for name, note in notes.items() if not getattr(note, values)]
             if 0 < len(bare) < len(notes):
                 raise UserError(
-                    f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}; add one to "
-                    "each, or leave these out with data.source.exclude"
+                    f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}. Add one to "
+                    "each, or leave these motions out with data.source.exclude"
                 )
         _put_prefixes(self.prefixes, notes.values(), self.path / TABLE)
         return notes
@@ -353,7 +353,7 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
     for layout, values in uprights.items():
         if np.median(values) < LYING:
             raise UserError(
-                f"{folder}: the body is lying down in most motions ({layout}); set the axis `up` in skeleton.yaml"
+                f"{folder}: the body is lying down in most motions ({layout}). Set the axis `up` in skeleton.yaml"
             )
 
 
@@ -365,7 +365,7 @@ def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
 
 
 def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
-    """Yields the names of the motions of a file, and the motions.
+    """Yields the names of the motions in a file, and the motions.
 
     If there are several animations, each animation gets its own name.
     """
@@ -410,7 +410,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
 
 @dataclass
 class _Attempt:
-    """A motion that was read for a data set, or a line that says why it cannot be used."""
+    """A motion that was read for a data set, or a line that states why it cannot be used."""
 
     error: str = ""
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -424,7 +424,7 @@ class _Attempt:
 def _read(
     kind: str, representation: Representation | None, fps: float, file: MotionFile
 ) -> _Attempt:
-    """Reads joints or, if `kind` is "smpl", a raw motion of SMPL's rotations.
+    """Reads joints or, if `kind` is "smpl", a raw motion with SMPL's rotations.
 
     The motion has `fps` frames per second. Without a `representation`, the joints are SMPL's 22
     joints, and rotations are in AMASS's axes. For KIT-ML's representations, the joints are KIT-ML's
@@ -438,7 +438,7 @@ def _read(
             raise UserError(f"{path}: {doubts.jump}")
         if len(joints) < SHORTEST:
             raise UserError(
-                f"{path}: {len(joints)} frames at {fps:g} per second, but a motion has at least {SHORTEST}"
+                f"{path}: {len(joints)} frames at {fps:g} fps, but a motion needs at least {SHORTEST} frames"
             )
         notes = [note for note in recording.motion.notes if note not in doubts.lines]
         of_kit = representation is not None and representation.skeleton is KIT21

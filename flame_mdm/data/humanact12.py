@@ -25,8 +25,8 @@ NO_NUMBERS = (
     ValueError,
     OverflowError,
 )
-# Consecutive clips in the file may be cut from the same recording, so blocks of this size are in
-# one split
+# Number of consecutive clips that are put into the same split, because they may be cut from the
+# same recording
 BLOCK = 10
 
 
@@ -107,7 +107,7 @@ class HumanAct12(MotionSource):
 
 
 def read_unconstrained(path: Path) -> np.ndarray:
-    """Reads the reference motions of unconstrained generation.
+    """Reads the reference motions for unconstrained generation.
 
     Sources: Tevet et al. 2023, section 4.3; Raab et al. 2022. The array in
     `humanact12_unconstrained_modi_struct.npy` is (N, 15 or more, 3, F). The result (N, F, 15, 3)
@@ -124,7 +124,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 def find(path: Path, name: str) -> Path:
     """Returns `path`, or the file of this name in `path` or a subfolder.
 
-    The error for a missing file says where the data set is published.
+    The error for a missing file states where the data set is published.
     """
     for file in (path, path / name, *sorted(path.glob(f"*/{name}"))):
         if file.is_file():

@@ -1,4 +1,4 @@
-"""HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features or SMPL parameters.
+"""HumanML3D: motions from AMASS and HumanAct12 with descriptions, as features or SMPL parameters.
 
 Source: Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
 `docs/humanml3d.md`.
@@ -31,7 +31,7 @@ FPS = 20
 class IndexedClip(NamedTuple):
     """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps.
 
-    `key` is the key of the recording (see `amass.key_of`), or the file of a clip of HumanAct12.
+    `key` is the key of the recording (see `amass.key_of`) or, for a clip from HumanAct12, its file.
     """
 
     name: str
@@ -41,7 +41,7 @@ class IndexedClip(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Whether the clip is an entire file of HumanAct12, named by `key`."""
+        """Whether the clip is an entire file from HumanAct12, named by `key`."""
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
@@ -148,7 +148,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Files of HumanAct12's joints by name; empty if they are missing."""
+        """Files with HumanAct12's joints by name; empty if they are missing."""
         path = self._beside("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
         folder = archives.as_folder(path, self, lambda name: name.endswith(".npy"))
         return {file.stem: file for file in folder.rglob("*.npy")}
@@ -168,7 +168,7 @@ class HumanML3D(T2MFolder):
     def _bodies(self) -> dict[str, Body]:
         if not self.body_models:
             raise FileNotFoundError(
-                "data.source.body_models: not set; give the folder of the extended SMPL+H model"
+                "data.source.body_models is not set. Set it to the folder of the extended SMPL+H model"
             )
         return {gender: load_body(self.body_models, gender) for gender in ("male", "female")}
 
@@ -183,7 +183,7 @@ class HumanML3D(T2MFolder):
         return missing
 
     def _make(self, amass: Amass) -> None:
-        """Creates the motions that do not exist yet. An interrupted run thus continues."""
+        """Creates the motions that do not exist yet, so that an interrupted command can be continued."""
         if todo := self._todo():
             _ = self.names, self.texts  # raises an error if they are missing
             if missing := self._missing(amass, todo):
@@ -337,7 +337,7 @@ class HumanML3DSMPL(MotionSource):
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of AMASS, followed by the clips of HumanAct12."""
+        """Yields the clips from AMASS, followed by the clips from HumanAct12."""
         self.check_fps(fps, FPS)
         from_amass = by_recording(self.rows)
         for key, motions in self.amass.map(from_amass, _parameters, self.workers):
@@ -347,7 +347,7 @@ class HumanML3DSMPL(MotionSource):
             yield from self._from_humanact12(self.humanact12)
 
     def _from_humanact12(self, path: Path) -> Iterator[Clip]:
-        """Yields SMPL poses of HumanAct12.
+        """Yields SMPL poses from HumanAct12.
 
         As in FLAME's code, the root position is used as SMPL's translation.
         """

@@ -90,7 +90,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def frames(self) -> dict[str, int]:
-        """Number of frames, at 12.5 frames per second, of each motion with captions."""
+        """Length of each motion with captions, in frames at 12.5 frames per second."""
         rows = {
             name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1
             for name in self.texts

@@ -37,9 +37,9 @@ class Mixture(MotionSource):
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
         if not parts:
-            raise UserError("data.source.parts: give at least one data set")
+            raise UserError("data.source.parts is empty. Name at least one data set")
         if use not in ("any", "research"):
-            raise UserError(f"data.source.use={use!s:.40}: give any or research")
+            raise UserError(f"data.source.use={use!s:.40}: unknown. Use any or research")
         self.parts, self.use = dict(parts), use
         self.verbs = tuple(sorted({verb for part in parts.values() for verb in part.verbs}))
         self.options = {
@@ -74,7 +74,7 @@ class Mixture(MotionSource):
                     continue
                 label = f"license {license}" if license else "an unknown license"
                 raise UserError(
-                    f"data.source.parts.{name}: has motions of {label}, but data.source.use=any. Leave them out, or "
+                    f"data.source.parts.{name}: has motions with {label}, but data.source.use=any. Leave them out, or "
                     "set data.source.use=research for a model that is for research only"
                 )
 

@@ -19,7 +19,7 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# Seconds of work after which processes are started, if their number is not given. Starting the
+# Seconds of work after which processes are started if their number is not set. Starting the
 # processes takes about as long.
 PATIENCE = 2.0
 
@@ -101,8 +101,8 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             process.join()
         if isinstance(error, BrokenProcessPool):
             raise UserError(
-                "a worker process was killed, perhaps because memory ran out: use fewer processes "
-                "(data.source.workers=1 also names the file)"
+                "a worker process was killed, perhaps because memory ran out. Use fewer processes "
+                "(with data.source.workers=1, the message also names the file)"
             ) from error
         raise
     finally:

@@ -54,8 +54,8 @@ def free_memory(device: torch.device) -> int:
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
     """Returns the frames of a store on a device, (N + 1, D). The last row contains zeros, for padding.
 
-    The frames are normalized, unless the representation adapts cuts. In this case, they are
-    normalized later.
+    The frames are normalized unless the representation adapts clips that were cut. In this case,
+    they are normalized later.
     """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
@@ -68,7 +68,7 @@ def resident_features(store: Store, representation: Representation, device: torc
 
 
 def adapts_cuts(representation: Representation) -> bool:
-    """Returns whether a representation changes the features of cuts; see `rebase`."""
+    """Returns whether a representation adapts the features of clips that were cut; see `rebase`."""
     return type(representation).rebase is not Representation.rebase
 
 

@@ -1,4 +1,4 @@
-"""Restricted reader of pickles.
+"""Restricted reader for pickles.
 
 This module reads arrays, numbers, text, lists, tuples and dictionaries with text keys. A pickle can
 name any function and have it called. This reader calls no function. It keeps the arguments and the

@@ -109,7 +109,7 @@ class Store:
         self.folder = Path(folder)
         contents = self.folder / "store.json"
         if not contents.exists():
-            raise FileNotFoundError(f"{folder}: no prepared data set; run `make prepare`")
+            raise FileNotFoundError(f"{folder}: no prepared data set. Run `make prepare`")
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
@@ -159,7 +159,7 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns the license, clips, minutes and actions of the motions under each license.
+        """Returns, for each license, its name and the clips, minutes and actions of its motions.
 
         The list is empty if the data set states no licenses. Copies of a clip are counted once.
         """
@@ -193,7 +193,7 @@ class Store:
             with _intact(self.folder / name) as path:
                 regular_file(path)
                 if sha256(path) != self.info["sha256"].get(name):
-                    raise ValueError("its hash differs from the one in store.json")
+                    raise ValueError("its hash differs from the hash in store.json")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
@@ -402,7 +402,7 @@ def _encoded(
 
 
 def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.ndarray:
-    """Returns the features of a motion. `named` is its name, its published representation and the motion.
+    """Returns the features of a motion. `named` contains its name, its published representation and the motion.
 
     The representation is "" if the motion was not published as features.
     """

@@ -56,8 +56,8 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")
 def content() -> dict[str, Any]:
     """Returns the grammars of both groups of actions as one grammar.
 
-    Captions have single keys. The keys of verb forms are the infinitives. `core_verbs` contains the
-    infinitives of the core actions.
+    Lists of keys for captions are split into single keys. Verb forms are stored by their infinitive.
+    `core_verbs` contains the infinitives of the core actions.
     """
     grammar = read_package_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_package_yaml(Path(__file__).with_name("synthetic_more.yaml"))
@@ -83,7 +83,7 @@ def content() -> dict[str, Any]:
 def draw_captions(
     rng: np.random.Generator, attributes: Attributes, count: int, incomplete: bool = False
 ) -> tuple[list[str], Attributes]:
-    """Draws `count` different captions of a clip. Also returns the attributes that they state.
+    """Draws `count` different captions for a clip. Also returns the attributes that they state.
 
     If `incomplete` and the grammar contains such captions, all of them omit the same attributes.
     """
@@ -238,13 +238,13 @@ class Synthetic(MotionSource):
     ):
         if clips < 1 or seed < 0:
             raise UserError(
-                f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed of 0 or more"
+                f"synthetic: clips={clips}, seed={seed}: expected at least one clip, and a seed of 0 or more"
             )
         if actions not in ("core", "all"):
             raise UserError(f'synthetic: actions={actions!r}: choose "core" or "all"')
         if not 0 <= core_share <= 1 or (core_share and actions == "core"):
             raise UserError(
-                f"synthetic: core_share={core_share}: give a number from 0 to 1, with actions=all"
+                f"synthetic: core_share={core_share}: expected a number from 0 to 1, with actions=all"
             )
         self.size, self.seed, self.workers, self.everything = clips, seed, workers, actions == "all"
         self.core_share = core_share
@@ -335,9 +335,9 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 
 
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes.
+    """Returns the joints (F, 22, 3) of a motion of three seconds with at least the given attributes.
 
-    For example, they are the attributes of a prompt.
+    For example, these are the attributes of a prompt.
     """
     name = str(attributes["action"])
     drawn = attributes

@@ -140,7 +140,7 @@ def _way(rng: np.random.Generator, posture: str, fps: float, up: bool = False) -
 def _moved(
     rng: np.random.Generator, attributes: Attributes, fps: float, whole: bool = True
 ) -> Body:
-    """Returns a body that has moved through the action.
+    """Returns a body that moves through the action.
 
     If the action is endless and not `whole`, its end is cut off.
     """

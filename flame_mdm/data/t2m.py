@@ -86,9 +86,9 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion of `frames` frames, in the published order.
 
-    The description of a part gives a separate item, NAME@from-to. A second description of the same
-    part gives NAME@from-to#2. As in the published code, a motion that is too short or too long
-    gives no items, even if parts of it would fit.
+    The description of a part results in a separate item, NAME@from-to, and a second description of
+    the same part in NAME@from-to#2. As in the published code, a motion that is too short or too long
+    results in no items, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
@@ -179,7 +179,7 @@ class T2MFolder(MotionSource):
         for files, kind in ((self._motions(), "new_joint_vecs/*.npy"), (self.texts, "texts/*.txt")):
             if absent := names.keys() - files:
                 raise FileNotFoundError(
-                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {some(absent)}; process them "
+                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {some(absent)}. Process them "
                     f"again, or leave them out with 'data.source.exclude=[{','.join(sorted(absent))}]'"
                 )
         return {name: len(self._load(name, mmap=True)) for name in names}

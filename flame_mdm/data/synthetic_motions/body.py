@@ -21,7 +21,7 @@ HEAD = (0.0, 0.085, 0.058)
 COLLAR = (0.072, 0.119, -0.01)
 SHOULDER = (0.125, -0.02, -0.01)
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
-# Height of the ankle of a flat foot, whose toe joint is on the floor
+# Height of the ankle when the foot is flat and its toe joint is on the floor
 ANKLE_HEIGHT = 0.06
 FOOT = (0.0, -0.06, 0.134)
 STAND = 0.97  # target height of the pelvis in meters, just out of reach of standing legs
@@ -70,7 +70,7 @@ class Body:
     def __init__(
         self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
     ):
-        """`width` is half the distance between the feet in meters, or a range of it.
+        """`width` is half the distance between the feet in meters, or a range to draw it from.
 
         None = the width of a relaxed stance.
         """
@@ -251,8 +251,8 @@ def step(
 ) -> None:
     """Moves a foot by (x, y, z) in meters between two times.
 
-    The heel leaves the floor first, at the angle `heel`. If a foot lands higher than it stood, it
-    rises before it moves ahead.
+    The heel leaves the floor first; `heel` is its angle in radians. If the foot lands at another
+    height (y is not 0), its horizontal motion begins later.
     """
     s = np.clip((body.t - start) / (end - start), 0, 1)
     across, up = ease(s, 0.25 if by[1] else 0.08, 0.96), ease(s, 0.02, 0.7)
@@ -283,7 +283,7 @@ def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
 def events(
     rng: np.random.Generator, t: np.ndarray, count: int, slowest: float
 ) -> list[tuple[float, float]]:
-    """Returns (start, seconds) of `count` equally long repetitions, at random times."""
+    """Returns the start and the duration, in seconds, of `count` equally long repetitions at random times."""
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]

@@ -1,4 +1,4 @@
-"""Actions of games: dodging, ducking, blocking, being hit, and a stroke with a sword."""
+"""Actions for games: dodging, ducking, blocking, being hit, and a stroke with a sword."""
 
 import numpy as np
 

@@ -26,8 +26,8 @@ class Gait:
 
     # Approximate time from one footprint to the next
     step: float
-    # Time of a foot in the air, in steps. Above 1, both feet are in the air between two steps, as
-    # in a run.
+    # Time that a foot spends in the air, as a multiple of the time per step. Above 1, both feet are
+    # in the air between two steps, as in a run.
     swing: float
     # Height of the foot in the middle of its swing
     lift: float

@@ -1,4 +1,4 @@
-"""Further ways to move, such as sneaking, limping, marching, climbing or carrying."""
+"""More ways to move, such as sneaking, limping, marching, climbing or carrying."""
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def limp(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def stagger(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Walks like a drunk person: in a wavy line, with a trunk that sways and arms that dangle."""
+    """Walks like a drunk person: in a wavy line, with a swaying trunk and dangling arms."""
     size, turns, sign = rng.uniform(0.13, 0.18), rng.uniform(0.9, 1.3), rng.choice(SIGN)
 
     def wavy(share: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

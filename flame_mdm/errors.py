@@ -90,7 +90,7 @@ def show_as(path: str, name: str) -> None:
 def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line; texts may come from untrusted files.
 
-    If the output is piped to a program that has ended, such as `head`, further lines are dropped.
+    If the output is piped to a program that has ended, such as `head`, all later lines are dropped.
     The command still finishes its work.
     """
     stream = sys.stderr if error else sys.stdout

@@ -94,7 +94,7 @@ class MotionLosses(nn.Module):
         root_relative: subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of features that `velocity` uses, counted from the first. MDM's
             code uses 144 of 25 x 6 and 262 of 263: it leaves out the last row of the feature
-            matrix. None = all.
+            matrix. None = all features.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)

@@ -35,7 +35,7 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """The entry `data` of a provenance file, which may contain further facts about the data."""
+    """The entry `data` in a provenance file, which may contain additional facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
@@ -127,7 +127,7 @@ def check_run(folder: Path) -> None:
     """Raises `UserError` if a folder is not a run directory."""
     if not (folder / CONFIG).exists():
         raise UserError(
-            f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default"
+            f"{folder}: contains no {CONFIG}. Use a run directory, such as runs/synthetic/mdm/default"
         )
 
 
@@ -181,7 +181,7 @@ def records(path: Path) -> list[dict[str, Any]]:
             "".join(record).encode()  # fails for a lone surrogate, which cannot be written again
         except (ValueError, RecursionError) as error:
             raise UserError(
-                f"{path}: line {number} is damaged; delete that line ({error})"
+                f"{path}: line {number} is damaged ({error}). Delete this line"
             ) from error
         complete.append(record)
     return complete

@@ -58,18 +58,18 @@ class SamplerOptions:
             if value is not None and not (isinstance(value, int | float) and math.isfinite(value)):
                 raise UserError(f"{name}={value} is not a finite number")
         if self.eta is not None and not 0 <= self.eta <= 1:
-            raise UserError(f"eta={self.eta:g}: give a number from 0 to 1")
+            raise UserError(f"eta={self.eta:g}: expected a number from 0 to 1")
         if self.sampler is not None and not isinstance(self.sampler, str):
-            raise UserError(f"sampler={self.sampler!r}: give the name of a sampler")
+            raise UserError(f"sampler={self.sampler!r}: expected the name of a sampler")
         if self.spacing is not None and self.spacing not in SPACINGS:
-            raise UserError(f"spacing={self.spacing} is unknown: choose from {', '.join(SPACINGS)}")
+            raise UserError(f"spacing={self.spacing} is unknown. Use {', '.join(SPACINGS)}")
         steps = self.num_inference_steps
         listed, least = (steps, 0) if isinstance(steps, list | tuple) else ([steps], 1)
         if steps is not None and not all(
             type(step) is int and least <= step <= MAX_STEPS for step in listed
         ):
             raise UserError(
-                f"num_inference_steps={steps}: give a number of steps, or a list, up to {MAX_STEPS:,}"
+                f"num_inference_steps={steps}: expected a number of steps, or a list, up to {MAX_STEPS:,}"
             )
         object.__setattr__(
             self, "num_inference_steps", tuple(steps) if isinstance(steps, list) else steps

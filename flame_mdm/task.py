@@ -31,7 +31,7 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
 class Task(Model, LightningModule):
-    """Base class of everything that `make train` trains.
+    """Base class for everything that `make train` trains.
 
     A recipe names its class in `task._target_`.
     """
@@ -58,7 +58,7 @@ class Task(Model, LightningModule):
             config: the recipe.
             representation: features of a motion.
             actions: names of the actions in the training data.
-            facts: further facts about the training data; see `add_facts`. Default: none.
+            facts: additional facts about the training data; see `add_facts`. Default: none.
         """
         raise NotImplementedError
 
@@ -123,22 +123,24 @@ class Task(Model, LightningModule):
                 self.reported[name] = value.detach() if isinstance(value, Tensor) else value
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """Returns the recipe's optimizer of all parameters that are trained."""
+        """Returns the recipe's optimizer for all trained parameters."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Returns the optimizer and the schedule of its learning rate.
 
         The learning rate rises linearly over the first `lr_warmup` steps. It falls linearly to 0
-        over the last fraction `lr_decay` of the training.
+        over the last fraction `lr_decay` of the training run.
         """
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
         if not 0 <= share <= 1:
-            raise UserError(f"lr_decay={share}: give a fraction of the training, from 0 to 1")
+            raise UserError(
+                f"lr_decay={share}: expected a fraction of the training run, from 0 to 1"
+            )
         warmup = self.config.get("lr_warmup") or 0
         if warmup < 0:
-            raise UserError(f"lr_warmup={warmup}: give a number of steps, 0 or more")
+            raise UserError(f"lr_warmup={warmup}: expected a number of steps, at least 0")
 
         steps = self.trainer.max_steps
         falling = share * steps
@@ -212,7 +214,9 @@ class GeneratorTask(Task):
     ):
         super().__init__(optimizer=optimizer, seed=seed)
         if not 0 <= cond_drop_prob <= 1:
-            raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
+            raise UserError(
+                f"task.cond_drop_prob={cond_drop_prob}: expected a probability from 0 to 1"
+            )
         defaults = sampling_defaults(
             guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
         )
@@ -230,7 +234,7 @@ class GeneratorTask(Task):
             else TargetConditions(skeleton.joints, skeleton.facing, **targets)
         )
         if (self.targets is None) != (getattr(parts.denoiser, "target", None) is None):
-            raise UserError("task.targets and denoiser.target_encoder: give both or neither")
+            raise UserError("task.targets and denoiser.target_encoder: set both or neither")
         self.cond_drop_prob, self.compiles = cond_drop_prob, compile
         self.checkpoints_activations = checkpoint_activations
         self.val_losses = torch.nn.ModuleDict()
@@ -315,7 +319,7 @@ class GeneratorTask(Task):
             self.pretrain()
 
     def pretrain(self) -> None:
-        """Trains the text encoder on captions before the first step, if the recipe says so."""
+        """Trains the text encoder on captions before the first step if the recipe requests it."""
         self.encoder().pretrain([clip.captions for clip in self.data.train.clips], self.seed)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
@@ -330,7 +334,7 @@ class GeneratorTask(Task):
         )
         if self.targets is not None and targeted is not None:
             cond = replace(cond, target_mask=targeted[1] >= self.targets.drop_prob)
-        # Also with probability 0: DDP requires a gradient for every parameter
+        # This also happens with probability 0, because DDP requires a gradient for every parameter
         if cond.null is not None:
             cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)

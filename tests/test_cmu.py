@@ -274,7 +274,7 @@ def test_captions_of_ones_own(folder, capsys):
         ),
         (
             "02_01,3,1,a,b,",
-            "captions.csv, line 2: begin '3', end '1': give the beginning and end of a part, in seconds",
+            "captions.csv, line 2: begin '3', end '1': expected the beginning and the end of a part, in seconds",
         ),
         ("02_01,x,1,a,b,", "begin 'x', end '1': not numbers of seconds"),
         ("02_01,nan,1,a,b,", "begin 'nan', end '1': not numbers of seconds"),

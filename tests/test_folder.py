@@ -214,7 +214,7 @@ HEADLESS = {joint: f"{joint} b" for joint in SMPL22.joints}
 BAD = {
     "no motion": (
         lambda f: [p.unlink() for p in f.rglob("*.np*")],
-        "no motions in this folder. Give a folder",
+        "no motions in this folder. Use a folder",
     ),
     "twice": (
         lambda f: np.savez(f / "one.npz", joints=WALK, fps=30),
@@ -437,13 +437,13 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
 
     output = prepared()
     assert Store(tmp_path / "data" / "mine-humanml-clean-smpl22").info["dataset"] == "mine"
-    assert "all train clips are too short: lower data.crop.min_frames" in output
-    assert "no captions: add captions.csv and prepare with force=true" in output
+    assert "all train clips are too short. Lower data.crop.min_frames" in output
+    assert "no captions. Add captions.csv and prepare with force=true" in output
     assert "changed since" not in prepared()
     write_table(tmp_path / "mine", [{"id": str(n), "text": "walks"} for n in range(10)])
     later = time.time() + 10
     os.utime(tmp_path / "mine" / "captions.csv", (later, later))
-    assert "mine: captions.csv changed since: prepare with force=true to read them" in prepared()
+    assert "mine: captions.csv changed since. Prepare with force=true to read them" in prepared()
     assert not re.search("changed since|no captions", prepared("force=true"))
 
 
@@ -461,7 +461,7 @@ def test_an_empty_folder_and_a_missing_one_are_told_apart(tmp_path, subtests):
     for name, says in (("empty", "no motions in this folder"), ("absent", "no such folder")):
         with (
             subtests.test(name=name, says=says),
-            pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Give a folder of"),
+            pytest.raises(FileNotFoundError, match=rf"{name}: {says}\. Use a folder of"),
         ):
             Folder(str(tmp_path / name)).count()
 

@@ -88,7 +88,7 @@ def test_a_license_that_forbids_the_use_is_refused_before_motions_are_read(
     people: Path, license: str, words: str
 ):
     (people / "captions.csv").write_text(CAPTIONS.replace("CC0", license))
-    with pytest.raises(UserError, match=f"parts.people: has motions of {words}"):
+    with pytest.raises(UserError, match=f"parts.people: has motions with {words}"):
         mixture(people).count()
     assert mixture(people, use="research").count() == 12
 
@@ -127,7 +127,7 @@ def test_captions_of_some_actions_get_a_word_in_front(people: Path):
 
 
 def test_a_recipe_of_a_mixture_is_checked_at_the_command_line():
-    with pytest.raises(UserError, match="give any or research"):
+    with pytest.raises(UserError, match="Use any or research"):
         Mixture({"synthetic": Synthetic(clips=1)}, use="sale")  # pyright: ignore[reportArgumentType]
     with pytest.raises(UserError, match="at least one data set"):
         Mixture({})

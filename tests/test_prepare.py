@@ -176,7 +176,7 @@ WHERE = {
     },
     **dict.fromkeys(("humanact12", "uestc"), "github.com/Mathux/ACTOR"),
     **dict.fromkeys(("humanml3d", "humanml3d_smpl", "kit"), "github.com/EricGuo5513/HumanML3D"),
-    "folder": "Give a folder of .npz, .bvh, .fbx, .glb, .vrm, .vrma, .amc, .json, .npy files",
+    "folder": "Use a folder of .npz, .bvh, .fbx, .glb, .vrm, .vrma, .amc, .json, .npy files",
 }
 
 

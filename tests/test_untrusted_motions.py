@@ -255,7 +255,7 @@ def sparse(name: str, size: int) -> bytes:
 def archive_cases() -> Iterator[tuple[bytes, str]]:
     whole = bvh_text().encode()
     yield sparse(TAKE, 40 * 10**9), "sparse"
-    yield member(TAKE, 10**12) + bytes(1024), "too many for a motion"
+    yield member(TAKE, 10**12) + bytes(1024), "too large for a motion"
     yield member("junk", 10**12) + bytes(1024), "damaged archive"
     for target in (TAKE, "/etc/passwd", "../../x", "none"):
         for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):

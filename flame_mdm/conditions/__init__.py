@@ -12,7 +12,7 @@ from flame_mdm.batch import Condition, MotionBatch
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Base class of encoders of text or actions.
+    """Base class for encoders of texts or actions.
 
     An encoder returns a `Condition` for a batch, which includes the null condition.
 

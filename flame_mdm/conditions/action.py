@@ -51,7 +51,7 @@ class ActionLabels(ConditionEncoder):
         """
         if batch.action is None:
             raise UserError(
-                "condition=action needs action labels, and this batch has none: choose data with labels"
+                "condition=action needs action labels, but this batch has none. Choose data with labels"
             )
         pooled, nothing = (
             self.table[batch.action.to(self.table.device)],

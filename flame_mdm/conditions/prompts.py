@@ -14,7 +14,7 @@ class ReadPrompt:
     """A prompt as a model reads it.
 
     Attributes:
-        parts: words of each part, and its seconds if the prompt states them.
+        parts: words of each part, and its duration in seconds if the prompt states one.
         captions: the caption that the model reads for each part.
         unknown: words that never occur in the training captions, or that the model does not read.
         summary: one line that says how the prompt was understood. It is "" unless each caption of
@@ -42,11 +42,12 @@ def read_prompt(
 
     Args:
         prompt: the text.
-        parts: words of its parts, "walks @3 | sits", and their seconds if the text states them.
+        parts: words of its parts, as in "walks @3 | sits", and their durations in seconds if the
+            text states them.
         facts: facts of the model.
         max_words: maximum number of words that the model reads in a caption; None = no limit.
-        splits: whether a sentence of several actions is split into one part per action. Only for
-            texts of a single part.
+        splits: whether a sentence with several actions is split into one part per action. Only for
+            texts with a single part.
         check_words: whether the model's words for actions replace the words of the text. A text is
             then also refused if the model knows none of its content words.
 
@@ -79,7 +80,7 @@ def _with_actions(
     max_words: int | None,
     splits: bool,
 ) -> ReadPrompt:
-    """Reads a text as a model of single actions reads it.
+    """Reads a text for a model whose captions describe single actions.
 
     Unless it is split, a text keeps its parts. If a part names several actions, the model reads the
     words of the part unchanged.

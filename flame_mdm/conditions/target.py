@@ -79,10 +79,12 @@ class TargetConditions:
         if unknown or not choices:
             advice = did_you_mean(unknown[0], SLOTS) if unknown else ""
             raise UserError(
-                f"task.targets.choices={list(choices)}:{advice} Give sets of {', '.join(SLOTS)}"
+                f"task.targets.choices={list(choices)}:{advice} Use sets of {', '.join(SLOTS)}"
             )
         if not 0 <= drop_prob <= 1:
-            raise UserError(f"task.targets.drop_prob={drop_prob}: give a probability from 0 to 1")
+            raise UserError(
+                f"task.targets.drop_prob={drop_prob}: expected a probability from 0 to 1"
+            )
         self.columns = Constant([joints.index(name) for name in JOINTS])
         self.facing = Constant(list(facing))
         self.choices = Constant([[slot in choice for slot in SLOTS] for choice in choices])

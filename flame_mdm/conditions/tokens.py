@@ -41,7 +41,7 @@ class LearnedTokens(ConditionEncoder):
     Args:
         features: C, the width of the tokens and of the pooled vector.
         buckets: rows of the word table.
-        max_words: maximum number of words per caption. Further words are dropped.
+        max_words: maximum number of words per caption. Additional words are dropped.
         heads: number of attention heads; divides `features`.
         dropout: probability of dropout in the transformer layer.
         pretrain_steps: number of steps of `pretrain`.

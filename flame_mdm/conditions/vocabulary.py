@@ -21,10 +21,9 @@ FUNCTION_WORDS = frozenset(
         "boy girl guy lady someone somebody will"
     )
 )
-"""Function words, which do not say what happens.
+"""Function words, which do not describe what happens.
 
-A text that contains only these words says nothing. No warning is given if a model does not know
-them.
+A text with only these words describes nothing. There is no warning if a model does not know them.
 """
 NUMBERS = frozenset(
     [

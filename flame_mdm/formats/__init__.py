@@ -32,9 +32,9 @@ WRITTEN = (
 ADVICE = {
     ".gltf": "Save it as .glb, which is one file, for example with Blender (File > Export > glTF 2.0)",
     ".blend": "Open it in Blender and export BVH (File > Export > Motion Capture)",
-    ".c3d": "It contains markers, not joints: fit a skeleton with your motion capture program and export BVH",
-    ".trc": "It contains markers, not joints: fit a skeleton with your motion capture program and export BVH",
-    ".pkl": "A pickle can run code and is never opened: save its arrays with numpy.savez as poses, trans and fps",
+    ".c3d": "It contains markers, not joints. Fit a skeleton with your motion capture program and export BVH",
+    ".trc": "It contains markers, not joints. Fit a skeleton with your motion capture program and export BVH",
+    ".pkl": "A pickle can run code and is never opened. Save its arrays with numpy.savez as poses, trans and fps",
     ".pt": "Save its arrays with numpy.savez as joints and fps, or as poses, trans and mocap_framerate",
     ".csv": "Save joints (frames, joints, 3) with numpy.savez as joints and fps",
 }
@@ -47,7 +47,7 @@ JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 
 
 def unread(path: Path) -> UserError:
-    """Returns the error for a file whose ending is not supported as a motion file."""
+    """Returns the error for a file that has an unsupported ending."""
     advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
     return UserError(
         f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}"
@@ -64,7 +64,7 @@ def motions_in(folder: Path) -> list[Path]:
 
 
 def motion_files(folder: Path) -> list[Path]:
-    """Returns the files of `motions_in`. Raises `UserError` if there are none."""
+    """Returns the same files as `motions_in`. Raises `UserError` if there are none."""
     files = motions_in(folder)
     if not files:
         raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")

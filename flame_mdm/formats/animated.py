@@ -28,8 +28,8 @@ class AnimatedNodes:
         positions: (F, N, 3) in the world, in meters, y up.
         fps: frames per second.
         animation: the name of the animation.
-        humanoid: index of a node by SMPL joint, if the file says which nodes form a human body;
-            otherwise empty.
+        humanoid: index of the node for each SMPL joint if the file declares which nodes form a human
+            body; otherwise empty.
         unit: meters per unit of length, as declared in the file.
     """
 

@@ -20,7 +20,7 @@ RATES = (
     "mocap_framerate",
     "mocap_frame_rate",
 )  # names under which files store the frame rate
-# Names of the parts of `poses` in AMASS's SMPL-X files
+# Names under which AMASS's SMPL-X files store the parts of `poses`
 BODY = ("root_orient", "pose_body")
 NEEDED = {
     "joints",
@@ -51,7 +51,7 @@ NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Reads the arrays of an .npz, .json or .npy motion.
+    """Reads the arrays in an .npz, .json or .npy motion file.
 
     Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text, features
     and representation if the file contains them, and up, unit and names for `.json` files. `ours`
@@ -94,7 +94,7 @@ def is_real(values: np.ndarray) -> bool:
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns the motion of AMASS arrays, resampled to `fps` if given.
+    """Returns the motion in AMASS arrays, resampled to `fps` if it is given.
 
     The motion consists of the translation (F, 3) and quaternions (F, 24, 4), float64.
     """
@@ -127,9 +127,9 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
         advice = ""
         if count in (9 * joints for joints in AXIS_ANGLES.values()):
-            advice = ". They seem to be rotation matrices: convert them to axis-angle vectors"
+            advice = ". They seem to be rotation matrices. Convert them to axis-angle vectors"
         elif count in (6 * joints for joints in AXIS_ANGLES.values()):
-            advice = ". They seem to be 6D rotations: convert them to axis-angle vectors"
+            advice = ". They seem to be 6D rotations. Convert them to axis-angle vectors"
         raise UserError(
             f"poses have shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}"
         )
@@ -138,11 +138,11 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
 
 
 def check_numbers(name: str, values: np.ndarray) -> None:
-    """Checks the numbers of an array (F, ...).
+    """Checks the numbers in an array (F, ...).
 
     Raises:
-        UserError: If there are no frames or too many, or if a number is not real or not below a
-            million.
+        UserError: If there are no frames or too many frames, or if a number is not real, not finite,
+            or has an absolute value of a million or more.
     """
     if not is_real(values):
         raise UserError(f"{name} are not an array of real numbers")

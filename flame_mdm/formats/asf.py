@@ -1,4 +1,4 @@
-"""ASF/AMC motion capture files of Acclaim and the CMU database, with one file per skeleton and per motion.
+"""ASF/AMC motion capture files, as used by Acclaim and the CMU database: one file per skeleton, one per motion.
 
 An ASF file lists the bones of a subject. Each bone has a direction and length in the world in the
 rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file contains
@@ -49,7 +49,7 @@ def read(path: Path, fps: float | None) -> Bvh:
     bones, parents = read_skeleton(skeleton_of(path))
     if fps is None:
         raise UserError(
-            f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml"
+            f"{path}: AMC files contain no frame rate. Set fps=120, or write `fps: 120` into skeleton.yaml"
         )
     names = tuple(bones)
     inner = set(parents.values())
@@ -82,7 +82,7 @@ def read(path: Path, fps: float | None) -> Bvh:
 
 
 def skeleton_of(path: Path) -> Path:
-    """Returns the ASF file of an AMC file, in the same folder.
+    """Returns the ASF file for an AMC file, from the same folder.
 
     The ASF file has the name of the AMC file or of its subject (02.asf), or is the only ASF file in
     the folder.
@@ -97,7 +97,7 @@ def skeleton_of(path: Path) -> Path:
     )
     if chosen is None:
         raise UserError(
-            f"{path}: no skeleton {candidates[1].name} next to it; AMC files need their ASF file"
+            f"{path}: no skeleton {candidates[1].name} next to it. AMC files need their ASF file"
         )
     return chosen
 
@@ -193,7 +193,7 @@ def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.n
             frames += 1
         elif words[0] not in rows or len(rows[words[0]]) != frames - 1:
             lines.fail(
-                f"{words[0][:40]} is not a moving bone of the skeleton, outside of a frame, or there twice"
+                f"{words[0][:40]} is not a moving bone of the skeleton, is outside of a frame, or occurs twice"
             )
         else:
             rows[words[0]].append(lines.numbers(words[1:], len(bones[words[0]].freedoms)))

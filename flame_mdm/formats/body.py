@@ -15,7 +15,7 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh, mannequin
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
-"""Share of the shoulders in the width of the trunk, by joint; the rest follows the hips."""
+"""How much the width of the trunk at a joint follows the shoulders, from 0 to 1; the rest follows the hips."""
 # Limits of the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
 # positions must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)
@@ -110,7 +110,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 def local_rotations(body: FittedBody) -> np.ndarray:
     """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents.
 
-    The toes are bent.
+    The bend of the toes is included.
     """
     count = len(SMPL22)
     world = body.turns[:, :count] @ body.mesh.turns[:count] @ body.neutral.mT
@@ -121,9 +121,9 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the linear map (22, 3, 3) of each part of a body, and the scale of the body's width.
+    """Returns the linear map (22, 3, 3) for each part of a body, and the scale of the body's width.
 
-    With these maps, the body has the `offsets` (22, 3) of a clip in its rest pose.
+    With these maps, the body in its rest pose has the `offsets` (22, 3) of a clip.
     """
     # The limbs determine the size of the body. Hips and shoulders follow the clip's own widths.
     # The trunk blends both widths from bottom to top. Limbs are stretched only along their bones.

@@ -1,4 +1,4 @@
-"""Rotations of SMPL's joints from the bones of a BVH or AMC file.
+"""Rotations for SMPL's joints, computed from the bones in a BVH or AMC file.
 
 Joint positions do not show how a forearm or a head turns about its own axis, but the bones of a
 file do. Each SMPL joint is turned in the same way as its bone has turned from the rest pose. Three
@@ -65,7 +65,7 @@ def bone_poses(
 
     rest = _rest(tree, layout, bones, turned, steps, in_front)
     if rest is None:
-        return BoneRotations(reason="the rest pose of the file is not known")
+        return BoneRotations(reason="the rest pose of the file is unknown")
     turned = turned @ _aligned(rest, turned, steps)
     poses = _assembled(turned, joints[:, 0], steps)
     apart = np.linalg.norm(poses.joints().numpy() - joints, axis=-1).mean()

@@ -202,7 +202,7 @@ def read(path: str | Path) -> Bvh:
     with naming(source.name):
         check_tree(len(frames), len(nodes), source.size)
     if len(frames) != count or not frames:
-        source.fail(f"the file contains {len(frames)} frames, but says {count}")
+        source.fail(f"the file declares {count} frames, but contains {len(frames)}")
     return Bvh(
         tuple(node.name for node in nodes),
         tuple(node.parent for node in nodes),
@@ -218,7 +218,7 @@ _IN_JOINT, _IN_END = ("OFFSET", "CHANNELS", "JOINT", "END", "}"), ("OFFSET", "}"
 
 @dataclass
 class _Node:
-    """A joint or end site of a hierarchy, and the keywords that may be in its braces."""
+    """A joint or end site in a hierarchy, and the keywords that may be inside its braces."""
 
     name: str
     parent: int

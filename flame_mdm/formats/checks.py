@@ -99,12 +99,12 @@ def jump(joints: np.ndarray, fps: float) -> str:
         )
         if speeds.max(initial=0.0) > fastest:
             frame = int(speeds.max(1).argmax())
-            return f"{verb}, it moves at {speeds.max():.0f} m/s in frame {frame} ({fps:g} per second): a damaged file"
+            return f"{verb}, it moves at {speeds.max():.0f} m/s in frame {frame} ({fps:g} fps), so the file is damaged"
     return ""
 
 
 def below_floor(joints: np.ndarray) -> str:
-    """Returns a message if a body with the bones of an adult is below the floor; otherwise "".
+    """Returns a message if a body with adult bones sinks below the floor; otherwise "".
 
     This happens if the body in the file is smaller than an adult.
     """

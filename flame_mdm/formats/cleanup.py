@@ -18,7 +18,7 @@ from flame_mdm.formats.poses import BoneRotations
 from flame_mdm.representations.skeleton import Skeleton
 
 # Weight of the squared third differences of a joint's path, relative to the squared change of the
-# path. Third differences are changes of acceleration, so the steady accelerations of fast motions
+# path. Third differences are changes in acceleration, so the steady accelerations of fast motions
 # are preserved.
 SMOOTHNESS = 0.034
 # Distance in meters from the smooth path at which the weight of a position is halved
@@ -78,7 +78,7 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 def cleanup(
     joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None
 ) -> np.ndarray:
-    """Removes pops, changes of bone lengths, foot sliding, and hands inside the body.
+    """Removes pops, changes in bone lengths, foot sliding, and hands inside the body.
 
     Args:
         joints: (F, J, 3) in meters, y up. Motions of fewer than 4 frames are returned unchanged.

@@ -39,9 +39,8 @@ class RawMotion:
         values: joints (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
         note: a line for the user if a body with other proportions was used, with the error;
-            otherwise "". The line says whether the rotations come from the file or were fitted to
+            otherwise "". The line states whether the rotations come from the file or were fitted to
             the joints.
-            joints.
         error: mean distance in meters between the joints of this body and of the motion.
     """
 
@@ -97,8 +96,8 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
     """Returns SMPL rotations in coordinates that `axes` (3, 3) converts to y up."""
     if motion.skeleton.joints[: len(SMPL22)] != SMPL22.joints:
         raise UserError(
-            f"the model needs rotations of SMPL's joints, but {motion.skeleton.name} does not determine them. Give a "
-            "motion of SMPL's 22 joints"
+            f"the model needs rotations of SMPL's joints, but {motion.skeleton.name} does not determine them. Use a "
+            "motion with SMPL's 22 joints"
         )
     note, error = "", 0.0
     if motion.poses is not None:

@@ -21,7 +21,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, regular_file
 
 MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
-# FBX 7.4 of 2014 is the newest version with 32-bit offsets. All programs read it.
+# FBX 7.4 from 2014 is the newest version with 32-bit offsets. All programs read it.
 VERSION = 7400
 # First version whose records have 64-bit offsets
 WIDE_VERSION = 7500
@@ -29,7 +29,7 @@ WIDE_VERSION = 7500
 OLDEST_VERSION = 7000
 # Maximum size of a file that is read
 LIMIT = 512 * MEBIBYTE
-# Maximum total size of all decompressed arrays of a file in bytes
+# Maximum total size in bytes of all decompressed arrays in a file
 EXPANDED_LIMIT = 512 * MEBIBYTE
 # Maximum nesting of records; programs write about 8
 MAX_DEPTH = 32
@@ -123,7 +123,7 @@ def read(path: Path) -> Record:
     if not content.startswith(MAGIC[:18]):
         if content.lstrip()[:1] == b";" or b"FBXHeaderExtension" in content[:4096]:
             raise UserError(
-                f"{path}: this FBX file is in ASCII. Export it as binary FBX, the default of most programs"
+                f"{path}: this FBX file is in ASCII. Export it as binary FBX, the default in most programs"
             )
         raise UserError(f"{path}: not an FBX file")
     try:

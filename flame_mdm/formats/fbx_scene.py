@@ -27,7 +27,7 @@ from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 TICKS = 46_186_158_000
 # Meters per centimeter; `UnitScaleFactor` is the number of centimeters per unit
 CENTIMETER = 0.01
-# Maximum number of models of a scene
+# Maximum number of models in a scene
 MAX_MODELS = 4096
 # Maximum number of frames times models
 MAX_CELLS = 4_000_000
@@ -294,7 +294,7 @@ class _Scene:
         stop = max(curve.times[-1] for curve in curves)
         count = math.floor((stop - start) * fps + 1e-3) + 1
         if count > MAX_FRAMES or count * len(self.models) > MAX_CELLS:
-            raise ValueError(f"{count} frames of {len(self.models)} models are too many")
+            raise ValueError(f"{count} frames with {len(self.models)} models are too many")
         times = start + np.arange(count) / fps
 
         numbers = list(self.models)

@@ -24,7 +24,7 @@ from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 PER_METER = 100
 # `TimeMode` of a rate in `CustomFrameRate`
 CUSTOM_RATE = 14
-# A fixed time, so that identical motions give identical files. Readers compare it with `FileId`.
+# A fixed time, so that identical motions result in identical files. Readers compare it with `FileId`.
 CREATED = "1970-01-01 10:00:00:000"
 FILE_ID = bytes.fromhex("28b32aebb624ccc2bfc8b02aa92bfcf1")
 # R = Rz Ry Rx, the order that FBX calls eEulerXYZ

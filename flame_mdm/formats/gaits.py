@@ -1,8 +1,9 @@
 """Clips for game engines, cut from longer motions: loops, starts, stops and turns.
 
 The ends of the clips fit together. A gait is cut at two frames that are one cycle apart. The start
-is before these frames, the loop between them, and the stop after them. Then the ends of the clips
-are changed to shared poses: the first pose of the loop, and the standing pose.
+clip ends at the first of these frames, the loop lies between them, and the stop clip begins at the
+second one. Then the ends of the clips are changed to shared poses: the first pose of the loop, and
+the standing pose.
 """
 
 from collections.abc import Sequence
@@ -61,7 +62,7 @@ class Clip:
     Attributes:
         name: name, without the name of the set.
         kind: loop (the last pose equals the first pose), start, stop or turn.
-        motion: the joints and the path of the root.
+        motion: the joints and the root trajectory.
         text: the text from which the motion was generated.
     """
 
@@ -152,7 +153,7 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
 def gait(
     motion: GroundedMotion, cycle: Cycle, degrees: float, stand: np.ndarray
 ) -> list[GroundedMotion]:
-    """Returns start, loop and stop of a gait on a straight path.
+    """Returns the start, the loop and the stop of a gait on a straight path.
 
     Args:
         motion: a person who stands, moves in a direction, and stands again.
@@ -219,7 +220,7 @@ def moving(motion: GroundedMotion) -> tuple[int, int]:
 def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedMotion | None:
     """Returns a turn in place by an angle. `stand` (22, 3) is the first and the last pose.
 
-    Returns None if the motion turns by a very different angle, or to the other side.
+    Returns None if the motion turns by a very different angle or to the other side.
     """
     # The model turns by about the requested angle. The root gets exactly this angle, and the pose
     # turns along.

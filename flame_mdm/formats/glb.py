@@ -43,7 +43,7 @@ KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LIMIT = 512 * MEBIBYTE
 # Maximum size of the JSON part in bytes. Parsed, it takes several times as much memory.
 DOCUMENT_LIMIT = 16 * MEBIBYTE
-# Maximum number of nodes, and of the items of any other list
+# Maximum number of nodes, and of items in any other list
 MAX_NODES, MAX_ITEMS = 4096, 65_536
 # Largest coordinate or matrix entry that is read
 LARGEST = 1e9
@@ -141,7 +141,7 @@ class _Document(_Object):
 def _item(items: Sequence[Item], index: int, name: str) -> Item:
     """Returns an item of a list in the document. Raises `ValueError` if it does not exist."""
     if not 0 <= index < len(items):
-        raise ValueError(f"{name}: there is no number {index}, because there are only {len(items)}")
+        raise ValueError(f"{name}: there is no item {index}, only {len(items)} items")
     return items[index]
 
 

@@ -33,7 +33,7 @@ WIDTHS = {
     "scale": 3,
 }
 
-# SMPL joints of the bones of VRM's humanoid
+# SMPL joints by the bones of VRM's humanoid
 HUMANOID = {
     "hips": "pelvis",
     "spine": "spine1",
@@ -170,7 +170,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of the animations of a file that move nodes."""
+    """Returns the names of the animations in a file that move nodes."""
     file = glb.read(path)
     try:
         return [name for name, _ in _animations(file)]
@@ -211,7 +211,7 @@ def _worlds(
     last = max(track.times[-1] for properties in tracks.values() for track in properties.values())
     count = math.floor(last * fps + 1e-3) + 1
     if count > MAX_FRAMES or count * len(file.names) > MAX_CELLS:
-        raise ValueError(f"{count} frames of {len(file.names)} nodes are too many")
+        raise ValueError(f"{count} frames with {len(file.names)} nodes are too many")
     times = np.arange(count) / fps
 
     local = np.tile(file.locals, (count, 1, 1, 1))

@@ -1,4 +1,4 @@
-"""Skeletons of motion files, their maps to SMPL's joints, and body size checks."""
+"""Skeletons in motion files, their maps to SMPL's joints, and body size checks."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """Map from the joints of files to SMPL's 22 joints, in meters, y up.
+    """Map from the joints in files to SMPL's 22 joints, in meters, y up.
 
     The fields are the keys of `skeleton.yaml`.
     """
@@ -177,7 +177,7 @@ def _shares(source: Source) -> Mapping[str, float]:
 def _layout(
     joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, **fields: Any
 ) -> Layout:
-    """Returns a layout of `layouts.yaml`, which describes the arguments."""
+    """Returns a layout in `layouts.yaml`, which describes the arguments."""
     parts = {key: fields.pop(key) for key in ("sides", "trunk", "arm", "leg") if key in fields}
     skeleton = presets()[rig] if rig else parts
     bones = joint_names(skeleton) if skeleton else {joint: joint for joint in SMPL22.joints}
@@ -276,7 +276,7 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
             else "not the 22, 24 or 52 of SMPL or 30 or 77 of SOMA"
         )
         raise UserError(
-            f"{count} joints, {rest}: write the names of all joints and a map into skeleton.yaml"
+            f"{count} joints, {rest}. Write the names of all joints and a map into skeleton.yaml"
         )
     return find_layout(names, fields), names
 
@@ -353,7 +353,7 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
     `up` (y, z or -y) overrides the up axis.
     """
     if up is not None and up not in UP:
-        raise UserError(f"up={up}: the axis that points up is one of {', '.join(UP)}")
+        raise UserError(f"up={up}: the axis that points up must be one of {', '.join(UP)}")
     file = skeleton_file(path)
     return (read_skeleton(file) if file else {}) | ({} if up is None else {"up": up})
 
@@ -422,7 +422,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
     )
     raise UserError(
         f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
-        f"{advice}: set `unit` in skeleton.yaml, or unit=... of convert and edit{also}"
+        f"{advice}. Set `unit` in skeleton.yaml, or unit=... in convert and edit{also}"
     )
 
 
@@ -431,7 +431,7 @@ def _usual_unit(leg: float, unit: float) -> str:
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"
-    return f"The file has no usual unit; {usual:.3g} gives the usual legs of {USUAL_LEG:g} m"
+    return f"No common unit fits the file; with {usual:.3g}, the legs have the usual length of {USUAL_LEG:g} m"
 
 
 # Fraction of the frames in which the toes of both feet point backwards. Above this fraction, left
@@ -507,6 +507,6 @@ def _bone(joints: np.ndarray, start: str, end: str) -> float:
 
 
 def _lengths(joints: np.ndarray, start: str, end: str) -> np.ndarray:
-    """Returns the distances (F,) of two joints of SMPL."""
+    """Returns the distances (F,) between two of SMPL's joints."""
     first, last = (joints[:, SMPL22.joints.index(name)].astype(float) for name in (start, end))
     return np.linalg.norm(first - last, axis=1)

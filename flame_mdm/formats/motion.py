@@ -65,7 +65,7 @@ Without them, programs do not draw these bones.
 
 @dataclass(eq=False, repr=False)
 class Motion(PosedFigure):
-    """One motion outside the models: generated, real or read from a file.
+    """One motion outside the models: generated, real, or read from a file.
 
     Attributes:
         joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`. Joints
@@ -111,7 +111,7 @@ class Motion(PosedFigure):
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
             raise UserError(
-                f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?"
+                f"{name}: joint {joint} in frame {frame} is not finite. Did the model diverge?"
             )
         self.fps = frame_rate(self.fps, f"{name}: fps")
         if self.contacts is not None:
@@ -192,7 +192,7 @@ class Motion(PosedFigure):
             summary = f"joints {self.joints.shape} in meters, y up; the file does not contain the frame rate"
         else:
             summary = _write_video(self, path, body)
-        return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {summary}"
+        return f"{path}: {len(self.joints)} frames at {self.fps:g} fps, {summary}"
 
     def resampled(self, fps: float) -> "Motion":
         """Returns this motion at another frame rate, with the same duration.

@@ -27,8 +27,8 @@ class Match(NamedTuple):
 
     Attributes:
         skeleton: key of the skeleton.
-        numbers: indices of the joints to which each name in the skeleton may refer. Several indices
-            are ambiguous.
+        numbers: indices of the joints to which each name in the skeleton may refer. A name with
+            several indices is ambiguous.
         missing: names of the skeleton that match no joint.
     """
 
@@ -88,8 +88,7 @@ def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]])
     Args:
         names: names of the joints of a file, at least one name.
         skeletons: for each skeleton, a mapping from spellings of a joint to the skeleton's name of
-            the joint. The first
-            spelling is preferred.
+            the joint. The first spelling is preferred.
     """
     best: list[Match] = []
     score = (False, -1)

@@ -76,7 +76,7 @@ def load_body(name: str) -> Mesh:
     """Returns a body by its name.
 
     A name is "mannequin", a file, or "anny" with shape parameters, such as "anny gender=1 age=0.9".
-    The first body of Anny takes about 90 seconds. Each body is saved in the user's cache.
+    Creating the first Anny body takes about 90 seconds. Each body is saved in the user's cache.
 
     Raises:
         UserError: If the file is damaged, a number is unknown, or Anny is not installed.
@@ -115,7 +115,7 @@ def shape_of(words: list[str]) -> dict[str, float]:
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of a body file for a body of Anny; see `packed`.
+    """Returns the arrays of a body file for an Anny body; see `packed`.
 
     The first call takes about 90 seconds.
     """

@@ -27,7 +27,7 @@ SPINE = {
     6: 2 / 3,
 }
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
-"""For hips and shoulders: z of the direction in which the knee or elbow bends in the rest pose."""
+"""For hips and shoulders, the z component of the direction in which the knee or elbow bends at rest."""
 STRAIGHT = 0.15
 """Sine of the bend angle of a knee or elbow at which two cues of the limb's twist have equal weight.
 

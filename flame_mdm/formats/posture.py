@@ -21,9 +21,9 @@ height. The third number is the maximum bend.
 def complete(
     joints: np.ndarray, offsets: np.ndarray, world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Completes rotations that were computed from positions.
+    """Completes rotations that were computed from joint positions.
 
-    Positions show neither the pitch of the head nor the bend of the toes.
+    Joint positions determine neither the pitch of the head nor the bend of the toes.
 
     Args:
         joints: (F, 22, 3) in meters.
@@ -67,7 +67,8 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Returns orthonormal axes as rows (3, 3).
 
-    The rows are the direction, then `u` made orthogonal to it, then the third axis.
+    The rows are the normalized direction, the part of `u` that is orthogonal to it, normalized, and
+    the cross product of the two.
     """
     along = direction / np.linalg.norm(direction)
     across = u - (u @ along) * along

@@ -1,4 +1,4 @@
-"""The reader of motion files. Writers are in `flame_mdm.formats.motion`.
+"""The reader for motion files. Writers are in `flame_mdm.formats.motion`.
 
 `docs/formats.md` describes the files. Commands, data sets and Python all use this reader, so that a
 file always gets the same skeleton, frame rate and checks.
@@ -139,7 +139,7 @@ def read(
             first animation.
 
     Returns:
-        The motion. Its `notes` say what was left out or looks wrong.
+        The motion. Its `notes` state what was left out or looks wrong.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -207,12 +207,12 @@ def from_array(joints: Any, fps: float | None) -> Motion:
     if not is_real(values):
         name = type(joints).__name__
         raise UserError(
-            f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)"
+            f"{name}: not a motion. Pass a path, a Motion, or an array of joints (frames, joints, 3)"
         )
     check_numbers("joints", values)
     skeleton = _skeleton(values)
     if fps is None:
-        raise UserError("an array has no frame rate: set it, for example with fps=20")
+        raise UserError("an array has no frame rate. Set it, for example with fps=20")
     return Motion(values, frame_rate(fps), skeleton)
 
 
@@ -229,7 +229,7 @@ def _of_tree(
     )
     notes = []
     if (people := tree.parents.count(-1)) > 1:
-        notes.append(f"{people} people in the file (ROOT): the first one is read")
+        notes.append(f"{people} people (ROOT) in the file, of which the first one is read")
 
     if standard is not None:
         tree, standard_fields = standard(tree)
@@ -241,7 +241,7 @@ def _of_tree(
         and (recorded := known_rate(path.stem, layout_name(layout), tree.fps))
     ):
         notes.append(
-            f"CMU recorded it at {recorded:g} frames per second, not {tree.fps:g} as the file says: read at that"
+            f"CMU recorded it at {recorded:g} frames per second, not {tree.fps:g} as the file states: read at that rate"
         )
         tree = replace(tree, fps=recorded)
 
@@ -430,7 +430,7 @@ def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
         raise UserError(
-            "no frame rate in the file: give fps=20, or write `fps: 20` into skeleton.yaml"
+            "no frame rate in the file. Set fps=20, or write `fps: 20` into skeleton.yaml"
         )
     return frame_rate(rate)
 

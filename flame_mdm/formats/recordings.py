@@ -9,7 +9,7 @@ AT_60: frozenset[str] = frozenset(
     read_package_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"]
 )
 """Subjects and single recordings that CMU recorded at 60 frames per second."""
-# Skeletons of CMU's recordings and of their conversions
+# Skeletons in CMU's recordings and in their conversions
 CMU_SKELETONS = (
     "CMU",
     "CMU ASF",

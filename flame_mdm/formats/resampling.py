@@ -45,7 +45,7 @@ def frame_rate(value: Any, name: str = "fps") -> float:
 def check_frames(frames: int) -> None:
     """Raises `UserError` if a motion has more than `MAX_FRAMES` frames."""
     if frames > MAX_FRAMES:
-        raise UserError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}: cut it")
+        raise UserError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}. Cut it")
 
 
 def check_tree(frames: int, joints: int, size: int) -> None:
@@ -58,7 +58,7 @@ def check_tree(frames: int, joints: int, size: int) -> None:
     if frames * joints > most:
         raise UserError(
             f"{frames:,} frames of {joints:,} joints, but a file of this size may have at most {most // joints:,} "
-            "frames: cut it, or remove joints that do not move"
+            "frames. Cut it, or remove joints that do not move"
         )
 
 
@@ -79,7 +79,7 @@ def frame_pairs(
     if count * joints > max(frames * joints, MAX_RESAMPLED):
         raise UserError(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
-            "too many; check the frame rate, or cut the motion"
+            "too many. Check the frame rate, or cut the motion"
         )
     # Frames are counted from the first frame, so that rounding errors do not accumulate. A new
     # frame that is slightly past the last old frame takes the value of the last old frame.

@@ -132,7 +132,7 @@ class Rig:
 def recognized(
     names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]
 ) -> dict[str, list[int]]:
-    """Returns, for each SMPL joint, the numbers of the joints that may correspond to it.
+    """Returns the numbers of the joints that may correspond to each SMPL joint.
 
     The correspondence is determined by the most similar known skeleton.
 
@@ -230,7 +230,7 @@ def rest_pose(
     )
     if not tilt <= TILT:
         raise UserError(
-            f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. Use a T- or an A-pose"
+            f"{source}: the rest pose is not upright: it leans by {tilt:.0f} degrees. Use a T-pose or an A-pose"
         )
 
     # The axes of the new coordinates are x to the left (from hips and shoulders), y up, and z

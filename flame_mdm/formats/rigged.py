@@ -202,7 +202,7 @@ class ContactEvent(NamedTuple):
 
 
 def contact_events(contacts: np.ndarray, fps: float) -> list[ContactEvent]:
-    """Returns when the left and the right foot land and leave the floor, sorted by time.
+    """Returns the moments at which the left and the right foot land on and leave the floor, sorted by time.
 
     `contacts` are (F, 2).
     """
@@ -222,7 +222,7 @@ def rigged(
     fitted: FittedBody | None = None,
     root_motion: bool = False,
 ) -> RiggedClip:
-    """Converts a moving body to a clip of a skeleton.
+    """Converts a moving body to a clip on a skeleton.
 
     Args:
         poses: the body.

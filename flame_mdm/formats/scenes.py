@@ -14,14 +14,14 @@ def read(path: Path, animation: str | None = None) -> AnimatedNodes:
     """Reads an animation by its name or number, counted from 1; None = the first animation.
 
     Raises:
-        UserError: As in the readers of both formats.
+        UserError: As in the readers for both formats.
     """
     reader = fbx_scene if path.suffix.lower() == ".fbx" else glb_animation
     return reader.read(path, animation)
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of the animations of a file. Raises `UserError` if it is damaged."""
+    """Returns the names of the animations in a file. Raises `UserError` if the file is damaged."""
     reader = fbx_scene if path.suffix.lower() == ".fbx" else glb_animation
     return reader.animations(path)
 

@@ -25,9 +25,9 @@ def write(path: Path, clip: RiggedClip) -> None:
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
     except ImportError as error:
-        advice = 'install it with pip install "flame-mdm[usd]"'
+        advice = 'Run pip install "flame-mdm[usd]"'
         raise UserError(
-            f"{path}: {path.suffix} files need the package usd-core: {advice}"
+            f"{path}: {path.suffix} files need the package usd-core. {advice}"
         ) from error
 
     with atomic_write(path) as temporary, tempfile.TemporaryDirectory() as folder:

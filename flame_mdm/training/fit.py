@@ -147,7 +147,7 @@ def check_devices(trainer: Config) -> None:
         there = f"this machine has {most} " + (
             f"GPU{'s' * (most > 1)}" if gpus else f"CPU cores, and {NO_GPU}"
         )
-        raise UserError(f"trainer.devices={devices}: {there}. Give at most trainer.devices={most}")
+        raise UserError(f"trainer.devices={devices}: {there}. Use at most trainer.devices={most}")
 
 
 def _check_strategy(strategy: str | Config) -> None:

@@ -1,4 +1,4 @@
-"""Clauses of a sentence, and their order in time."""
+"""The clauses of a sentence, and their order in time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

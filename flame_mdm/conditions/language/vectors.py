@@ -55,7 +55,7 @@ class WordTable:
 
 @cache
 def word_table() -> WordTable:
-    """Returns the table of the package."""
+    """Returns the table that the package contains."""
     arrays = read_npz(FILE)
     words = arrays["words"].tobytes().decode().split("\n")
     # 8 bits per number. The scale of each word is lost, but all vectors have length 1.

@@ -131,6 +131,6 @@ def _find_extractor(source: str) -> None:
         find(source)
     except (UserError, FileNotFoundError) as error:
         raise UserError(
-            f"callbacks.evaluate.extractor={source}: no such file, but it is needed to choose the best checkpoint: "
-            f"{made_by(source)}. Or choose by the validation loss: selection=loss"
+            f"callbacks.evaluate.extractor={source}: no such file, but it is needed to choose the best checkpoint. "
+            f"Obtain it ({made_by(source)}), or choose the checkpoint by the validation loss with selection=loss"
         ) from error

@@ -73,10 +73,10 @@ class Fault(Schema):
 
 
 def made_by(path: str | Path) -> str:
-    """Returns a text that says how to obtain a missing checkpoint or extractor.
+    """Returns a text about how to obtain a missing checkpoint or extractor.
 
-    The text names the command that creates the file or, if no command creates it, the page that
-    says where to find it.
+    The text is the command that creates the file or, if no command creates it, names the page that
+    states where to find it.
     """
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)

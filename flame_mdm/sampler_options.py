@@ -62,7 +62,7 @@ class SamplerOptions:
         if self.sampler is not None and not isinstance(self.sampler, str):
             raise UserError(f"sampler={self.sampler!r}: expected the name of a sampler")
         if self.spacing is not None and self.spacing not in SPACINGS:
-            raise UserError(f"spacing={self.spacing} is unknown. Use {', '.join(SPACINGS)}")
+            raise UserError(f"spacing={self.spacing} is unknown: choose from {', '.join(SPACINGS)}")
         steps = self.num_inference_steps
         listed, least = (steps, 0) if isinstance(steps, list | tuple) else ([steps], 1)
         if steps is not None and not all(

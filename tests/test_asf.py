@@ -78,7 +78,8 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
     (files / "07.asf").rename(files / "someone.asf")  # the only skeleton of the folder
     np.testing.assert_array_equal(asf.read(files / "07_01.amc", 120).frames, motion.frames)
     with pytest.raises(
-        UserError, match="AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton"
+        UserError,
+        match=r"AMC files contain no frame rate\. Set fps=120, or write `fps: 120` into skeleton",
     ):
         asf.read(files / "07_01.amc", None)
     (files / "someone.asf").unlink()

@@ -45,7 +45,7 @@ ROWS = {
         Row(STANDS, keys={"up": "z"}),
     ],
     "f03_swapped_sides.bvh": [Row("", "the toes point backwards. Exchange left and right")],
-    "f04_rotmat_216.npz": [Row("", "216.*rotation matrices: convert them to axis-angle")],
+    "f04_rotmat_216.npz": [Row("", r"216.*rotation matrices\. Convert them to axis-angle")],
     "f05_json_z_up.json": [Row(STANDS), Row(STANDS, keys={"up": "z"})],
     "f06_tpose_first.bvh": [Row(STANDS, "the first frame is a rest pose and is left out")],
     "f09_names_with_spaces.bvh": [Row(STANDS)],
@@ -65,7 +65,7 @@ ROWS = {
     "f14_two_people.bvh": [Row(STANDS, "2 people in the file")],
     "f15_half.npz": [Row(STANDS)],
     "f18_git_lfs_pointer.bvh": [Row("", "a Git LFS pointer.*git lfs pull")],
-    "f20_more_frames_than_stated.bvh": [Row("", r"the file contains \d+ frames, but says \d+")],
+    "f20_more_frames_than_stated.bvh": [Row("", r"the file contains \d+ frames, but declares \d+")],
 }
 CASES = [(name, row) for name, rows in ROWS.items() for row in rows]
 

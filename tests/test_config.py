@@ -143,7 +143,7 @@ def test_what_lightning_checks_late_is_checked_before_the_data(
         *((f"trainer.{key}=0", "must be above 0") for key in sweeps.LATE),
         (
             "trainer.devices=99",
-            f"this machine has 3 CPU cores, and {NO_GPU}. Give at most trainer.devices=3",
+            f"this machine has 3 CPU cores, and {NO_GPU}. Use at most trainer.devices=3",
         ),
     ):
         with subtests.test(word=word, reason=reason):

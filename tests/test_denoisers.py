@@ -255,7 +255,7 @@ def test_bad_options_are_named(subtests) -> None:
         (lambda: MDMDecoder(D, D, C, **TRANSFORMER, memory="concat"), "Set token_memory=true"),
         (
             lambda: MDMDecoder(D, D, C, **TRANSFORMER, context_frames=-1),
-            "context_frames=-1: give the number",
+            "context_frames=-1: expected a number",
         ),
         (
             lambda: MDMDecoder(D, D, C, **TRANSFORMER, target_encoder="single", target_layers=0),

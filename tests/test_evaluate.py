@@ -874,7 +874,7 @@ def test_a_missing_extractor_of_the_selection_stops_before_training(
         in error
     )
     assert (
-        "make train EXP=motion_clip/babel. Or choose by the validation loss: selection=loss"
+        "(make train EXP=motion_clip/babel), or choose the checkpoint by the validation loss"
         in error
     )
     assert not Path("run").exists()

@@ -122,7 +122,7 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
             np.testing.assert_array_equal(result.joints, expected.joints)
             assert result.feature_error == 0
     cases: list[tuple[Any, Any, str]] = [
-        (joints, None, "an array has no frame rate: set it, for example with fps=20"),
+        (joints, None, "an array has no frame rate. Set it, for example with fps=20"),
         (joints, "fast", "fps is fast, not a number of frames per second"),
         (
             joints[:, :13],
@@ -147,7 +147,7 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
             30,
             "^the motion: .* frames, but the model was trained on at most 196",
         ),
-        (None, 30, r"^NoneType: not a motion\. Give a path, a Motion, or an array of joints"),
+        (None, 30, r"^NoneType: not a motion\. Pass a path, a Motion, or an array of joints"),
         (walk, 20, r"fps=20: this motion has 30 frames per second\. Omit fps"),
         (Motion(joints * 100, 30, id="take"), None, "^take: the legs are"),
     ]

@@ -167,7 +167,9 @@ def test_the_unit_and_the_axis_of_a_small_figure_that_lies_are_proposed_together
         replace(turned, frames=np.concatenate([np.full((len(body), 1), 90.0), body], 1)),
         tmp_path / "b.bvh",
     )
-    with pytest.raises(UserError, match=r"0\.0\d+ gives the usual legs of 0\.83 m.* set up=z"):
+    with pytest.raises(
+        UserError, match=r"0\.0\d+, the legs have the usual length of 0\.83 m.* set up=z"
+    ):
         read(tmp_path / "b.bvh")
 
 
@@ -197,10 +199,11 @@ def test_a_unit_is_proposed_for_figures_that_have_no_usual_one():
         check_size(100 * joints, 1.0)
     figure = 0.26 * joints  # legs of about 0.2 m in centimeters, as of drawn figures
     with pytest.raises(
-        UserError, match=r"The file has no usual unit; 0\.0\d+ gives the usual legs of 0\.83 m"
+        UserError,
+        match=r"No common unit fits the file; with 0\.0\d+, the legs have the usual length of 0\.83 m",
     ) as error:
         check_size(figure, 0.01)
-    unit = float(str(error.value).partition("usual unit; ")[2].split()[0])
+    unit = float(str(error.value).partition("common unit fits the file; with ")[2].split(",")[0])
     check_size(figure * unit / 0.01, unit)
     with pytest.raises(UserError, match=r"The unit is wrong"):
         check_size(0 * joints, 0.01)

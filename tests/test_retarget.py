@@ -375,7 +375,7 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
         (short, "the bone from left_shoulder to left_elbow has no length"),
         (
             lambda d: below_another(d, rotation=[0, 0, 0.5**0.5, 0.5**0.5]),
-            "not upright, it leans by 90 degrees",
+            "not upright: it leans by 90 degrees",
         ),
         (
             lambda d: below_another(d, scale=[1, 1, 2]),

@@ -202,7 +202,7 @@ def read(path: str | Path) -> Bvh:
     with naming(source.name):
         check_tree(len(frames), len(nodes), source.size)
     if len(frames) != count or not frames:
-        source.fail(f"the file declares {count} frames, but contains {len(frames)}")
+        source.fail(f"the file contains {len(frames)} frames, but declares {count}")
     return Bvh(
         tuple(node.name for node in nodes),
         tuple(node.parent for node in nodes),

@@ -141,7 +141,7 @@ class _Document(_Object):
 def _item(items: Sequence[Item], index: int, name: str) -> Item:
     """Returns an item of a list in the document. Raises `ValueError` if it does not exist."""
     if not 0 <= index < len(items):
-        raise ValueError(f"{name}: there is no item {index}, only {len(items)} items")
+        raise ValueError(f"{name}: there is no number {index}, because there are only {len(items)}")
     return items[index]
 
 

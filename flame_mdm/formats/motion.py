@@ -192,7 +192,7 @@ class Motion(PosedFigure):
             summary = f"joints {self.joints.shape} in meters, y up; the file does not contain the frame rate"
         else:
             summary = _write_video(self, path, body)
-        return f"{path}: {len(self.joints)} frames at {self.fps:g} fps, {summary}"
+        return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {summary}"
 
     def resampled(self, fps: float) -> "Motion":
         """Returns this motion at another frame rate, with the same duration.

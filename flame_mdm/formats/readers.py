@@ -229,7 +229,7 @@ def _of_tree(
     )
     notes = []
     if (people := tree.parents.count(-1)) > 1:
-        notes.append(f"{people} people (ROOT) in the file, of which the first one is read")
+        notes.append(f"{people} people in the file (ROOT): the first one is read")
 
     if standard is not None:
         tree, standard_fields = standard(tree)

@@ -83,14 +83,14 @@ class Reader:
         understood = understand(sentence)
         if understood.is_foreign:
             raise UserError(
-                f"{_shown(text)}: only English texts are understood. Write it in English"
+                f"{_shown(text)}: texts are understood in English only. Write it in English"
             )
         as_typed = Reading(understood, (), (text,), (text,))
         if not understood.steps:
             if understood.unknown and self.abilities.has_words(" ".join(understood.unknown)):
                 return as_typed
             raise NotUnderstood(
-                f"{_shown(text)}: no word describes what happens",
+                f"{_shown(text)}: no word says what happens",
                 self.abilities.nearest(understood),
             )
 

@@ -311,7 +311,7 @@ class Baseline:
         return real_motions(self.clips, moved)
 
     def _shuffled(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
-        """Gives each row the motion of another caption or label.
+        """Gives each row the motion of a row with another caption or label.
 
         The rows are grouped by caption or label, with the groups in random order, and rotated by
         the size of the largest group.

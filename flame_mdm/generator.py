@@ -95,7 +95,7 @@ def sampling_defaults(
 
 
 class Model:
-    """Base class of the models that checkpoints hold."""
+    """Base class for the models that checkpoints hold."""
 
     # What the model's checkpoints contain, for messages
     noun = "a model"

@@ -270,7 +270,7 @@ class AuditCard(ClosedSchema):
     packages: dict[str, str]
     # Whether higher values are better. None = the best values are near the values of real motions
     metrics: dict[str, bool | None]
-    # By metric; empty in files of earlier versions
+    # By metric; empty in files from earlier versions
     facts: dict[str, AuditedMetric] = Field({})
     # By metric, the value of real motions and the half width of its interval
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]

@@ -83,5 +83,5 @@ class SamplerOptions:
         }
 
     def over(self, defaults: Self) -> Self:
-        """Returns these options, with `defaults` in place of the options that are None."""
+        """Returns these options; each option that is None is replaced by the option in `defaults`."""
         return replace(defaults, **self.chosen())

@@ -88,7 +88,7 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
 
 def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> T:
-    """Converts the content of an untrusted file as `check_shape` does, if all its values are plain.
+    """Converts the content of an untrusted file as `check_shape` does if all its values are plain.
 
     Raises `UserError` with `path` if this fails, or if the content is nested too deeply or contains
     itself.

@@ -76,7 +76,7 @@ class Task(Model, LightningModule):
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
-        """Encodes all captions of the data once, on one rank, if the encoder is frozen."""
+        """If the encoder is frozen, encodes all captions in the data once, on one rank."""
         self.encoder().precompute(*self._captions())
 
     def setup(self, stage: str) -> None:

@@ -298,7 +298,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
     for words, says in (
         (["trainer.max_steps=4"], "ckpt is missing. Usage: flame-mdm distill CKPT"),
         (["runs/no/model"], "runs/no/model: no such checkpoint"),
-        ([student], f"a distilled model. Give its teacher, {trained}"),
+        ([student], f"a distilled model. Use its teacher, {trained}"),
         (["process.ckpt"], "predicts noise, so computing the clean estimate divides"),
         (["untrained.ckpt"], "not trained by this framework"),
         (

@@ -56,7 +56,7 @@ class FrechetMotionDistance(TwoSets):
         """Returns the distance of features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
-        # Rounding may give a value slightly below 0
+        # Rounding errors may make the value slightly negative
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:

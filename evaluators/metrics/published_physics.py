@@ -28,7 +28,7 @@ Values = dict[str, Tensor | float]
 
 
 class PublishedPhysics(Timed, JointMean):
-    """Base class of published physics metrics, which are means over motions.
+    """Base class for published physics metrics, which are means over motions.
 
     `measured` is the fraction of motions for which all values are defined.
 

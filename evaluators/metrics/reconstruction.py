@@ -50,7 +50,7 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
 
 
 class PositionErrors(MotionMean):
-    """Base class of position errors: APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
+    """Base class for position errors: APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
 
     Args:
         samples: number of motions per text. If there are several motions, as in TEMOS,
@@ -86,7 +86,7 @@ class PositionErrors(MotionMean):
         Args:
             joints: (B, F, J, 3) generated motions in meters, y up.
             mask: (B, F) bool, True = real frame.
-            real_joints: (B, F', J, 3) real motions of the same texts, in the same order.
+            real_joints: (B, F', J, 3) real motions for the same texts, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the generated motions.
             groups: (B,) int64, keys of the texts; only needed for several `samples`.
@@ -238,7 +238,7 @@ class FlamePositionErrors(PositionErrors):
 
 
 class EditErrors(MotionMean):
-    """Base class of distances between the joints of edited and real motions, in meters.
+    """Base class for distances between the joints of edited and real motions, in meters.
 
     Lower is better.
     """

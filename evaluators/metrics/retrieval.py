@@ -89,7 +89,7 @@ def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
 
 
 class CaptionMetric(SampleMetric):
-    """Base class of metrics in which several motions may have the same caption.
+    """Base class for metrics in which several motions may have the same caption.
 
     Captions are the same if they differ only in case, punctuation and spaces or, with an
     `encoder`, if the cosine of their embeddings exceeds `SAME`.

@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class of metrics: declarations about values, and values of single samples and of resamples.
+    """Base class for metrics: declarations about values, and values of single samples and of resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
@@ -89,7 +89,7 @@ class Declared:
 
 
 class SampleMetric(Declared, Metric):
-    """Base class of all metrics, which compute their value from one row per sample, sorted by key.
+    """Base class for metrics, which compute their value from one row per sample, sorted by key.
 
     Therefore, the value does not depend on the batches, their order or the number of ranks. A rank
     may have no samples. `value` is the formula. If a metric draws at random, its argument `seed`
@@ -253,7 +253,7 @@ class SampleMetric(Declared, Metric):
 
 
 class Timed(SampleMetric):
-    """Base class of metrics that depend on `fps`, the number of frames per second."""
+    """Base class for metrics that depend on `fps`, the number of frames per second."""
 
     def __init__(self, fps: float):
         super().__init__()
@@ -261,7 +261,7 @@ class Timed(SampleMetric):
 
 
 class MotionMean(SampleMetric):
-    """Base class of means over the values of motions.
+    """Base class for means over the values of motions.
 
     A motion adds one value, one value per frame, or any other number of values.
     """
@@ -307,7 +307,7 @@ class MotionMean(SampleMetric):
 
 
 class JointMean(MotionMean):
-    """Base class of metrics that average values measured on the joints of single motions."""
+    """Base class for metrics that average values measured on the joints of single motions."""
 
     sees_meaning = False
 
@@ -349,7 +349,7 @@ class JointMean(MotionMean):
 
 
 class TwoSets(SampleMetric):
-    """Base class of metrics that compare two sets of features: generated motions and real motions."""
+    """Base class for metrics that compare two sets of features: generated motions and real motions."""
 
     states = ("generated",)
     depends_on_count = True

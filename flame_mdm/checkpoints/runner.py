@@ -4,7 +4,7 @@
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
-The same caption, length and seed give the same motion as `flame_mdm.generate`, which also
+The same caption, length and seed result in the same motion as `flame_mdm.generate`, which also
 understands sentences that differ from the captions of the training data. A model that continues
 frames starts from a person who stands.
 """

@@ -44,7 +44,7 @@ class ImportSettings:
 
 
 def main(settings: ImportSettings) -> None:
-    """Converts a checkpoint of the authors and prints the path of the model file."""
+    """Converts a released checkpoint and prints the path of the model file."""
     from flame_mdm.checkpoints.released import import_released
 
     say(f"written: {import_released(**vars(settings))}")

@@ -27,7 +27,7 @@ class TablesSettings:
     Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in
     experiments/tables, or by your own file, which names checkpoints, a protocol and columns.
     Checkpoints without a result are evaluated first; evaluate=false only uses existing results.
-    The same results give the same bytes. Exit codes: 0 = success; 1 = wrong input, or an
+    The same results give the same bytes. Exit codes: 0 = success; 1 = invalid input, or an
     evaluation failed; 3 = the tables are written, but a requested row is NOT VALID.
     """
 

@@ -17,7 +17,7 @@ class ReadPrompt:
         parts: words of each part, and its duration in seconds if the prompt states one.
         captions: the caption that the model reads for each part.
         unknown: words that never occur in the training captions, or that the model does not read.
-        summary: one line that says how the prompt was understood. It is "" unless each caption of
+        summary: one line that states how the prompt was understood. It is "" unless each caption of
             the model describes a single action.
         changes: lines about differences between the prompt and what is sampled.
     """

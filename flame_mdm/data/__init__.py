@@ -162,7 +162,7 @@ class MotionSource(ABC):
         """Returns the number of clips that `clips` yields, without reading motions.
 
         Raises:
-            FileNotFoundError: If the raw data is missing. The message says how to obtain it.
+            FileNotFoundError: If the raw data is missing. The message explains how to obtain it.
             UserError: If a file is damaged, or if an option does not fit the data.
         """
 

@@ -256,7 +256,7 @@ class T2MFolder(MotionSource):
         return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        """Counts why a motion gives no items, or how many of its captions are left out."""
+        """Counts motions without items by reason, or the captions of a motion that are left out."""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:

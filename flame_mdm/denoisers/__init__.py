@@ -8,7 +8,7 @@ from flame_mdm.batch import Condition
 
 
 class Denoiser(nn.Module, ABC):
-    """Base class of all denoisers.
+    """Base class for denoisers.
 
     A denoiser predicts the target of a process from a noisy motion. Subclasses take some of the
     following arguments. The first three depend on other parts, and `Parts.build` passes them. All

@@ -29,7 +29,7 @@ class FLAME(Denoiser):
         dropout: probability of dropout inside the layers.
         max_frames: maximum length of a motion that ML can embed.
         length_token: False omits ML (table 4, first row).
-        cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4,
+        cross_attention: False builds a transformer encoder over ML, TS, CLS and frames (table 4,
             first two rows).
         condition_frames: also add TS and CLS to every frame. A small network then learns to
             follow the text in fewer steps.

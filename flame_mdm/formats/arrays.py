@@ -121,7 +121,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
     """Returns the axis-angle vectors (F, 72) of SMPL's joints.
 
-    Without hands in the file, the vectors of the hands are 0.
+    If the file contains no hands, the vectors of the hands are 0.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
@@ -131,7 +131,7 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
         elif count in (6 * joints for joints in AXIS_ANGLES.values()):
             advice = ". They seem to be 6D rotations. Convert them to axis-angle vectors"
         raise UserError(
-            f"poses have shape {poses.shape}, not {NUMBERS} axis-angle numbers per frame{advice}"
+            f"poses have shape {poses.shape}; expected {NUMBERS} axis-angle numbers per frame{advice}"
         )
     vectors = poses.reshape(len(poses), count)[:, :72].astype(float)
     return np.pad(vectors, ((0, 0), (0, 72 - vectors.shape[1])))

@@ -72,7 +72,7 @@ class Bvh:
     def translations(self) -> np.ndarray:
         """Returns the position (F, J, 3) of each joint in its parent's frame.
 
-        Positions are read from the position channels. Without them, the offset is used.
+        Positions are read from the position channels. For a joint without such channels, the offset is used.
         """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):

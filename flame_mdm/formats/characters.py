@@ -166,7 +166,7 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     """
     # If the file is stored in the bind pose, joint matrix times inverse bind matrix is the same
     # for all joints. Otherwise, this product of the pelvis, with its rotation rounded to quarter
-    # turns, is used as the frame of the skin. The bind matrices then give the pose of all joints.
+    # turns, is used as the frame of the skin. The bind matrices then determine the pose of all joints.
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}
     for skin in sorted(file.skins, key=lambda skin: (pelvis in skin.joints, len(skin.joints))):

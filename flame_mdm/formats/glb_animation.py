@@ -279,7 +279,7 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     computed from the distances between keys.
     """
     # glTF stores keys, but no frame rate. In a sampled animation, the median distance between keys
-    # gives the frame rate. Times have single precision, so the rate is rounded to a nearly equal
+    # determines the frame rate. Times have single precision, so the rate is rounded to a nearly equal
     # integer.
     extras = file.document["asset"].get("extras")
     noted = extras.get("fps") if isinstance(extras, dict) else None

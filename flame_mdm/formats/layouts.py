@@ -295,7 +295,9 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
         UserError: If no layout fits, or a name could mean several joints.
     """
     joints, mapped = ", ".join(names)[:1000], "map" in fields
-    advice = f"Map SMPL's joints in skeleton.yaml (docs/own-data.md) to those of the file: {joints}"
+    advice = (
+        f"In skeleton.yaml (docs/own-data.md), map SMPL's joints to the file's joints: {joints}"
+    )
     if mapped:
         layout = Layout(map=fields["map"])
         match = best_match(names, {"": spelled(layout.pairs())})

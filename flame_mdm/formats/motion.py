@@ -59,7 +59,7 @@ END_SITES = {
 }
 """Tips of the head, toes and hands beyond the last joints, in meters.
 
-Without them, programs do not draw these bones.
+Programs draw a bone only if it has a tip.
 """
 
 

@@ -61,7 +61,7 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
     """
     if len(set(folders)) < 2:
         raise UserError(
-            f'runs={" ".join(map(str, folders))}: a comparison needs two or more runs. Give runs="A B"'
+            f'runs={" ".join(map(str, folders))}: a comparison needs two or more runs. Set runs="A B"'
         )
 
     compared = []

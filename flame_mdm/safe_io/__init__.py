@@ -384,7 +384,7 @@ def read_npz(
     Args:
         source: the file.
         skip: names of arrays that are not read.
-        only: names of the arrays that are read; None = all.
+        only: names of the arrays that are read; None = all arrays.
 
     Raises:
         UserError: If the file is damaged, contains objects, or exceeds the limits of this module.

@@ -283,7 +283,7 @@ def method_options(
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options for `Edit` and for the sampler.
 
-    They belong to the requested method. Without one, they belong to the default method of the process.
+    They belong to the requested method or, if none is requested, to the default method of the process.
     """
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes

@@ -76,7 +76,7 @@ def write_motions(
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder.
 
-    Either all files are written, or none. Files of an earlier request that are not written again
+    Either all files are written, or none. Files from an earlier request that are not written again
     are removed. Only the first eight motions are drawn. The stages of a sampling run are drawn in
     `trajectory.png`. `facts` are added to each `.npz`. Links must not lead out of `within`; see
     `flame_mdm.safe_io.atomic_folder`.

@@ -41,7 +41,7 @@ class ResolvedPrompt:
             frames that overlap with the previous motion.
         unknown: words of the text that never occur in the training captions, or that the model does
             not read.
-        summary: one line that says how the text was understood. It is "" unless each caption of the
+        summary: one line that states how the text was understood. It is "" unless each caption of the
             model describes a single action.
         changes: lines about differences between the text and the sampled prompt.
     """

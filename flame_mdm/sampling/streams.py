@@ -97,7 +97,7 @@ class Stream(Iterator[Motion]):
 
     Each block is a `Motion`, placed in the world after the previous block. A block is computed when
     it is requested. With `cleanup`, the next block is also computed. The same seed and the same
-    texts at the same times give the same motion.
+    texts at the same times result in the same motion.
 
     Example:
         >>> import itertools, flame_mdm

@@ -106,7 +106,7 @@ class DistillationTask(GeneratorTask):
         self.teacher[0].to(self.device)
 
     def on_train_start(self) -> None:
-        """Computes the targets with the averaged weights, if the recipe averages weights."""
+        """Computes the targets with the averaged weights if the recipe averages weights."""
         super().on_train_start()
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, MovingAverage):
@@ -174,13 +174,13 @@ def read_teacher(path: Path) -> MotionGenerator:
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(
-            f"{path}: a distilled model. Give its teacher, "
+            f"{path}: a distilled model. Use its teacher, "
             f"{teacher.config['distillation']['teacher']}"
         )
     if teacher.process.prediction == "epsilon":
         raise UserError(
             f"{path}: predicts noise, so computing the clean estimate divides by almost 0 at "
-            f"the noisiest times. Give a model that predicts the clean motion or the velocity "
+            f"the noisiest times. Use a model that predicts the clean motion or the velocity "
             f"(MDM, MFM)"
         )
     return teacher

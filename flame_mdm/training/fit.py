@@ -37,7 +37,7 @@ SHARDING = ("fsdp", "deepspeed", "modelparallel")
 def fit(folder: Path, config: Config) -> None:
     """Trains a recipe in its run directory.
 
-    Resumes from the newest checkpoint, if there is one.
+    Resumes from the newest checkpoint if there is one.
     """
     _quiet()
     check_devices(config["trainer"])
@@ -111,7 +111,7 @@ def fit(folder: Path, config: Config) -> None:
             _requeue(job)
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
-        # Otherwise, the other processes would wait for this one for half an hour.
+        # Otherwise, the other processes would wait for this process for half an hour.
         if trainer.strategy.launcher is not None:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
@@ -130,7 +130,7 @@ def fit(folder: Path, config: Config) -> None:
 
 
 def check_devices(trainer: Config) -> None:
-    """Raises `UserError` if this machine lacks the devices of a recipe, or if the recipe shards.
+    """Raises `UserError` if this machine lacks the devices of a recipe, or if the recipe shards the model.
 
     On a CPU, there is at most one process per core.
     """
@@ -155,7 +155,7 @@ def _check_strategy(strategy: str | Config) -> None:
     if any(kind in name.lower().replace("_", "") for kind in SHARDING):
         raise UserError(
             f"trainer.strategy={name}: a model is not divided among processes, because averages and exact resuming "
-            "need whole weights. Use trainer.strategy=ddp; docs/memory.md has the memory that models need"
+            "need whole weights. Use trainer.strategy=ddp; docs/memory.md lists how much memory models need"
         )
 
 
@@ -197,7 +197,7 @@ def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
 def _quiet() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     for message in (
-        ".*isinstance\\(treespec, LeafSpec\\).*",  # warnings of Lightning
+        ".*isinstance\\(treespec, LeafSpec\\).*",  # warnings from Lightning
         ".*does not have many workers.*",
         ".*module\\(s\\) in eval mode at the start of training.*",  # a student without dropout
         ".*Checkpoint directory .* exists and is not empty.*",

@@ -86,7 +86,7 @@ class BadLoss(Callback):
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
-        """Raises `UserError` on all ranks at the same step, if a loss since the last check is bad."""
+        """Raises `UserError` on all ranks at the same step if a loss since the last check is bad."""
         if not self.seen:
             return
         recent = torch.stack([loss for *_, loss in self.seen])

@@ -37,7 +37,7 @@ A caption that states the value contains one of these parts.
 
 
 class Abilities:
-    """Actions and attributes that a model knows. Each of its captions names one action of a list.
+    """Actions and attributes that a model knows. Each of its captions names one action from a list.
 
     Args:
         facts: facts of the model: "actions", "vocabulary" and, if known, "captions".

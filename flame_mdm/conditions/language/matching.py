@@ -72,7 +72,7 @@ def _longest_at(tokens: Sequence[Token], start: int) -> tuple[tuple[int, ...], P
 
 
 def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[int, ...] | None:
-    """Returns the indices of the tokens that match a phrase at `start`; None without a match."""
+    """Returns the indices of the tokens that match a phrase at `start`; None if there is no match."""
     if not words:
         return ()
     if words[0] == GAP:

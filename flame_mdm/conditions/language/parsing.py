@@ -25,7 +25,7 @@ NEAREST = 3
 
 @lru_cache(4096)
 def understand(text: str) -> Understanding:
-    """Returns the actions that a sentence asks for, and the words that are not understood."""
+    """Returns the actions that a sentence requests, and the words that are not understood."""
     typed = tokenize(text)
     if is_foreign(typed):
         return Understanding(text, is_foreign=True)

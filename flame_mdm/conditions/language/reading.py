@@ -21,7 +21,7 @@ class Reading:
     """A sentence as a model reads it.
 
     Attributes:
-        understanding: what the sentence asks for.
+        understanding: the understood content of the sentence.
         steps: the actions to sample, in order; the model knows all of them.
         captions: one caption per step, for the model.
         texts: the words of the sentence for each step.
@@ -51,7 +51,7 @@ class Reading:
 
 
 class Reader:
-    """Reads sentences for a model in which each caption names one action of a list.
+    """Reads sentences for a model whose captions each name one action from a list.
 
     Args:
         facts: facts of the model: "actions", "vocabulary" and, if known, "captions".

@@ -89,12 +89,12 @@ class Judgment:
 
     @property
     def decided(self) -> int:
-        """Number of claims that are answered with "yes" or "no"."""
+        """Number of claims with the answer "yes" or "no"."""
         return sum(verdict.answer != "cannot tell" for verdict in self.verdicts)
 
     @property
     def true(self) -> int:
-        """Number of claims that are answered with "yes"."""
+        """Number of claims with the answer "yes"."""
         return sum(verdict.answer == "yes" for verdict in self.verdicts)
 
     @property
@@ -114,7 +114,7 @@ def judge(
     """Judges whether a motion does what a sentence says.
 
     The claims of the sentence are read, and each is measured on the motion. The answer is "yes",
-    "no" or "cannot tell". docs/referee.md says what can be checked.
+    "no" or "cannot tell". docs/referee.md lists what can be checked.
 
     Args:
         motion: a motion on SMPL's 22 joints, or joints (F, 22, 3) in meters, y up.
@@ -208,7 +208,7 @@ def _order(body: Body, claim: Claim) -> Reading:
     """Measures how many seconds after the first part of an order the second part begins.
 
     If a part happens several times, the pair of times with the largest difference counts. An order
-    is undecided if one of its parts is not answered with "yes", or if the reverse order also happens.
+    is undecided if the answer for one of its parts is not "yes", or if the reverse order also happens.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]

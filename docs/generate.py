@@ -92,7 +92,10 @@ def printed(text: str) -> Any:
 TABLES = published_tables()
 
 DEVIATIONS = {
-    ("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen so that the number is close"
+    (
+        "humanml3d/mdm_unet",
+        "parameters",
+    ): "no code is public; the widths are chosen so that the number is close"
 }
 """Deviations of recipes from their papers, by (recipe, key), with the reason."""
 

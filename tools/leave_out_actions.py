@@ -1,0 +1,48 @@
+"""Removes actions from the list of actions that a model file knows, such as actions that the model shows wrongly.
+
+    python tools/leave_out_actions.py flame_mdm/models/package.safetensors waltz cry
+
+Sentences about these actions are then rejected, and the nearest actions are suggested. The names are
+those in `flame_mdm/conditions/language/actions.yaml`. The weights do not change.
+"""
+
+import sys
+from pathlib import Path
+
+from flame_mdm.checkpoints.model_files import read_model_file, write_model_file
+from flame_mdm.conditions.language.parsing import understand
+from flame_mdm.conditions.language.tables import actions
+from flame_mdm.errors import UserError
+
+
+def main(path: Path, left_out: set[str]) -> None:
+    unknown = left_out - actions().keys()
+    if unknown:
+        raise UserError(f"{', '.join(sorted(unknown))}: not in actions.yaml")
+    content = read_model_file(path)
+    facts = content["facts"]
+    facts["actions"] = [name for name in facts["actions"] if not named(name) & left_out]
+    facts["captions"] = [text for text in facts["captions"] if not mentioned(text) & left_out]
+    write_model_file(
+        path,
+        content["state_dict"],
+        config=content["config"],
+        facts=facts,
+        origin=content["origin"],
+    )
+
+
+def named(name: str) -> set[str]:
+    """Returns the actions of the table that a name of an action in a model stands for."""
+    plain = name.replace("_", " ").lower()
+    listed = {entry.name for entry in actions().values() if plain in entry.names}
+    return listed or mentioned(plain)
+
+
+def mentioned(text: str) -> set[str]:
+    """Returns the actions that a text names."""
+    return {mention.action for mention in understand(text).mentions}
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), set(sys.argv[2:]))

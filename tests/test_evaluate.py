@@ -267,7 +267,7 @@ def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path,
         excluded,
     )
     biased, unequal = result.warnings
-    assert biased == "fid: biased upwards: 7 motions are fewer than twice the 4 features"
+    assert biased == "fid: biased upward, because 7 motions are fewer than twice the 4 features"
     assert unequal.startswith(f"fid: 7 generated and {long} real motions.")
     out = capsys.readouterr().out
     for words in (

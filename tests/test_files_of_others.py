@@ -65,7 +65,7 @@ def test_shapes_are_read_by_their_layout_and_rates_of_one_element_are_rates(
     for numbers, advice in (
         (216, "rotation matrices"),
         (144, "6D rotations"),
-        (69, "not 66, 72, 156, 165"),
+        (69, "expected 66, 72, 156, 165"),
     ):
         with subtests.test(numbers=numbers, advice=advice):
             np.savez(path, poses=np.zeros((40, numbers)), **parts)

@@ -234,7 +234,7 @@ BAD = {
     ),
     "split": (
         lambda f: write_table(f, [{"id": "one", "split": "dev"}]),
-        "line 2: unknown split 'dev'; use train, val",
+        "line 2: unknown split 'dev'. Use train, val",
     ),
     "columns": (
         lambda f: write_table(f, [{"id": "one", "name": "a"}]),
@@ -304,7 +304,7 @@ def test_wrong_units_are_refused_with_the_unit_that_fits(
     monkeypatch.chdir(tmp_path)
     mixamo(tmp_path / "mine" / "a.bvh", INCH)
     message = (
-        r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\): set `unit`"
+        r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\)\. Set `unit`"
     )
     with pytest.raises(ValueError, match=message):
         only(tmp_path / "mine")

@@ -256,7 +256,7 @@ def motion(folder, name="000001"):
     [
         (
             lambda f: motion(f).unlink(),
-            r"new_joint_vecs/\*\.npy lacks 1 of the names .* 000001; .*exclude=\[000001\]",
+            r"new_joint_vecs/\*\.npy lacks 1 of the names .* 000001\. .*exclude=\[000001\]",
         ),
         (
             lambda f: np.save(motion(f), np.full((60, 263), math.nan)),

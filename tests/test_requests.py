@@ -220,7 +220,7 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys, sub
             ["scorer=quickstart"],
             "scorer=quickstart chooses among motions for a text. Add text=... and candidates=8",
         ),
-        (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
+        (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Use a run"),
         (["scorer=quickstart", "candidates=2"], "contains a motion generator, not a motion-CLIP"),
     ):
         with subtests.test(options=options, message=message):
@@ -298,7 +298,7 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
         ),
         (
             ["walk.glb", "mp4=true"],
-            "mp4=true: walk.glb is a single motion file. Give a folder, or omit out",
+            "mp4=true: walk.glb is a single motion file. Use a folder, or omit out",
         ),
         (
             ["walk.fbx", "root_motion=true"],

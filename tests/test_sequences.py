@@ -113,7 +113,7 @@ def test_a_continued_motion_begins_with_it_and_knows_its_parts(model, tmp_path):
     np.testing.assert_allclose(motion.joints[:40], begin.joints, atol=1e-5)
     step = np.linalg.norm(np.diff(motion.joints, axis=0), axis=-1).max(1)
     assert step[39] < 1.5 * np.delete(step, 39).max()
-    with pytest.raises(UserError, match="too short"):
+    with pytest.raises(UserError, match="at least 10 frames"):
         flame_mdm.generate(model, TEXT, after=flame_mdm.generate(model, TEXT, frames=4, **FAST)[0])
 
 

@@ -85,7 +85,7 @@ def test_no_training_starts_beside_others_without_memory(processes, tmp_path, mo
 @pytest.mark.parametrize(("code", "error"), [(1, UserError), (143, SystemExit), (-9, SystemExit)])
 def test_a_training_that_ends_badly_stops_the_others(processes, tmp_path, code, error):
     processes.codes["extractor"] = code
-    with pytest.raises(error, match=r"training extractor failed|143|137"):
+    with pytest.raises(error, match=r"training of extractor failed|143|137"):
         run_trainings(jobs(), 2, tmp_path)
     assert [(process.name, process.terminated) for process in processes.started] == [
         ("extractor", False),

@@ -427,7 +427,7 @@ def test_the_name_of_a_data_set_names_a_folder_in_the_data_root(
     words = ["prepare", "synthetic", f"data.name='{name}'", "data.source.clips=8", "data_root=data"]
     assert main(words) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"error: data.name={name}: give a name of letters, digits")
+    assert line.startswith(f"error: data.name={name}: use a name of letters, digits")
     assert [path.name for path in (tmp_path / "data").iterdir()] == [".mine.keep"]
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
@@ -492,7 +492,7 @@ def test_a_json_file_never_has_numbers_that_json_lacks(number: float, tmp_path: 
 def test_push_overwrites_the_model_file_that_it_wrote_only(tmp_path, trained):
     model = hub.export(trained, tmp_path)
     before = model.read_bytes()
-    with one_line_error(r"model\.safetensors: not overwritten, since it was not written by push"):
+    with one_line_error(r"model\.safetensors: not overwritten because push did not write it"):
         hub.push(trained, "me/walker", tmp_path, upload=False, private=False)
     assert [path.name for path in tmp_path.iterdir()] == ["model.safetensors"]
     assert model.read_bytes() == before

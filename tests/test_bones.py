@@ -178,9 +178,7 @@ def test_a_rest_pose_in_front_shows_the_axes_of_the_joints_and_without_one_joint
     unknown = changed(any_axes)
     assert unknown.bones.poses is None
     note = raw_motion(unknown, SMPL(20.0)).note
-    assert note.startswith(
-        "rotations were fitted to joints (the rest pose of the file is unknown)"
-    )
+    assert note.startswith("rotations were fitted to joints (the rest pose of the file is unknown)")
 
 
 def test_rotations_that_do_not_move_the_joints_are_not_used(changed):

@@ -434,7 +434,9 @@ def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
     assert (fid.n, fid.n_per_replication, fid.n_real) == (None, [count, count - 30], count)
     assert fid.counts == result.counts == f"{count} + {count - 30}"
     assert result.ground_truth["fid"].n == count
-    assert any(f"replications have {count}, {count - 30} motions" in line for line in result.warnings)
+    assert any(
+        f"replications have {count}, {count - 30} motions" in line for line in result.warnings
+    )
 
 
 def test_more_motions_than_clips_are_said_to_repeat_clips(runs):

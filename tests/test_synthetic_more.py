@@ -62,7 +62,9 @@ def test_a_share_of_the_clips_shows_actions_of_the_core():
     assert share == pytest.approx(0.5 + 0.5 * plain, abs=0.06)
     assert few.options["core_share"] == 0.5
     assert "core_share" not in without.options
-    with pytest.raises(UserError, match=r"core_share=0.5: expected a number from 0 to 1, with actions"):
+    with pytest.raises(
+        UserError, match=r"core_share=0.5: expected a number from 0 to 1, with actions"
+    ):
         Synthetic(1, core_share=0.5)
 
 

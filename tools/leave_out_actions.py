@@ -12,13 +12,15 @@ from pathlib import Path
 from flame_mdm.checkpoints.model_files import read_model_file, write_model_file
 from flame_mdm.conditions.language.parsing import understand
 from flame_mdm.conditions.language.tables import actions
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, say
 
 
 def main(path: Path, left_out: set[str]) -> None:
     unknown = left_out - actions().keys()
     if unknown:
-        raise UserError(f"{', '.join(sorted(unknown))}: not in actions.yaml")
+        raise UserError(
+            f"{', '.join(sorted(unknown))}: not in flame_mdm/conditions/language/actions.yaml. Use its names"
+        )
     content = read_model_file(path)
     facts = content["facts"]
     facts["actions"] = [name for name in facts["actions"] if not named(name) & left_out]
@@ -45,4 +47,9 @@ def mentioned(text: str) -> set[str]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), set(sys.argv[2:]))
+    try:
+        path, *left_out = sys.argv[1:]
+        main(Path(path), set(left_out))
+    except UserError as error:
+        say(f"error: {error}", error=True)
+        sys.exit(1)

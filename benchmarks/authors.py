@@ -20,21 +20,21 @@ CLIP_WIDTH, CLIP_TOKENS = 512, 77
 
 
 class _Clip(nn.Module):
-    """A stub of CLIP that returns zeros as text features."""
+    """A stub for CLIP that returns zeros as text features."""
 
     def encode_text(self, tokens: Tensor) -> Tensor:
         return torch.zeros(len(tokens), CLIP_WIDTH, device=tokens.device)
 
 
 class _Rotation2xyz:
-    """A stub of the converter of SMPL rotations, which a step on HumanML3D does not call."""
+    """A stub for the converter of SMPL rotations, which a step on HumanML3D does not call."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.smpl_model = nn.Module()
 
 
 def _stubs() -> dict[str, ModuleType]:
-    """Returns the stubs of CLIP and of the body model, as modules."""
+    """Returns the stubs for CLIP and for the body model, as modules."""
     clip: Any = ModuleType("clip")
     clip.load = lambda *_, **__: (_Clip(), None)
     clip.tokenize = lambda texts, context_length=CLIP_TOKENS, **_: torch.zeros(
@@ -53,7 +53,7 @@ def authors_step(
     """Returns the authors' training step for HumanML3D, with the defaults of their parser.
 
     Args:
-        repository: path of the clone.
+        repository: path to the clone.
         width: width of the network.
         layers: number of its layers.
         device: cpu or cuda.

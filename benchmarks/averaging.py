@@ -49,7 +49,7 @@ def updates(network: nn.Module) -> dict[str, Callable[[], object]]:
 
 
 def measure(settings: Settings) -> Section:
-    """Times the moving average of weights and returns the section of the page."""
+    """Times the moving average of weights and returns the page section."""
     rounds = 1 if settings.quick else 100
     rows: list[Row] = []
     faster: dict[str, float] = {}
@@ -69,8 +69,8 @@ def measure(settings: Settings) -> Section:
             rows.append(row | {"ratio": taken / times["framework"]})
     return section(
         "Averaged weights",
-        f"""The table has the time of one update of the exponential moving average of all weights, median of
-        {rounds} alternating updates. The framework updates all weights in one call.""",
+        f"""The table shows the time of one update of the exponential moving average of all weights. Values are
+        medians of {rounds} alternating updates. The framework updates all weights in one call.""",
         f"The update of the averaged weights is {faster['quickstart']:.1f} times as fast as Lightning's in the "
         f"quickstart, and {faster['full size']:.1f} times at full size.",
         {"updates": rows},

@@ -1,7 +1,7 @@
-"""Times an evaluation of HumanML3D's size without networks: `python benchmarks/evaluation.py`.
+"""Times an evaluation at HumanML3D's size without networks: `python benchmarks/evaluation.py`.
 
 A protocol measures random motions with HumanML3D's lengths (40 to 196 frames at 20 frames per
-second, 22 joints). The extractor returns 512 numbers of the motion and 512 random text features.
+second, 22 joints). The extractor returns 512 numbers from the motion and 512 random text features.
 The source returns other windows of the same clips. The remaining time is the cost of the evaluation
 itself: reading and decoding motions, and computing metrics. FID is also compared with torchmetrics'
 implementation on the same features.
@@ -33,7 +33,7 @@ TORCHMETRICS, FRAMEWORK = "torchmetrics' FrechetInceptionDistance", "framework"
 
 
 class Stub(Extractor):
-    """An extractor without a network: the first numbers of a motion, and random features of captions."""
+    """An extractor without a network: the first numbers of a motion, and random features for captions."""
 
     sha256 = "stub"
 
@@ -132,7 +132,7 @@ def fid(motions: int, rounds: int) -> list[Row]:
 
 
 def measure(settings: Settings) -> Section:
-    """Times an evaluation without its extractor and returns the section of the page."""
+    """Times an evaluation without its extractor and returns the page section."""
     motions, rounds = (40, 1) if settings.quick else (4600, 3)
     torch.manual_seed(0)
     clips = random_clips(motions)
@@ -157,12 +157,12 @@ def measure(settings: Settings) -> Section:
     distances = fid(motions, 1 if settings.quick else 10)
     return section(
         "Evaluation",
-        f"""`{PROTOCOL}` with {motions:,} motions of HumanML3D's lengths, {protocol.replications} replications,
-        {repeated} of which measure multimodality, without networks. The time is spent on
-        reading and decoding motions, and on metrics. {torch.get_num_threads()} threads, medians of {rounds}
-        alternating rounds. FID alone takes {motions:,} features of width {WIDTH}
-        in batches of {BATCH}, medians of 10 alternating rounds.""",
-        f"An evaluation of the size of HumanML3D takes {total / 60:.1f} minutes plus the networks; torchmetrics' FID "
+        f"""`{PROTOCOL}` runs without networks on {motions:,} motions with HumanML3D's lengths, in
+        {protocol.replications} replications, {repeated} of which measure multimodality. The time is spent on
+        reading and decoding motions, and on metrics. The process has {torch.get_num_threads()} threads, and values
+        are medians of {rounds} alternating rounds. FID alone is computed from {motions:,} features of width {WIDTH}
+        in batches of {BATCH}, with medians of 10 alternating rounds.""",
+        f"An evaluation at HumanML3D's size takes {total / 60:.1f} minutes plus the networks; torchmetrics' FID "
         f"takes {distances[0]['ratio']:.1f} times as long as the framework's.",
         {"protocol": table, "FID alone": distances},
     )

@@ -74,7 +74,7 @@ def loop(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
 
 
 def measure(settings: Settings) -> Section:
-    """Times the encoding of features and returns the section of the page."""
+    """Times the encoding of features and returns the page section."""
     rounds = 1 if settings.quick else 15
     torch.set_num_threads(1)
     motions = [motion(seed) for seed in range(CLIPS)]
@@ -85,7 +85,7 @@ def measure(settings: Settings) -> Section:
     difference = np.abs(loop(joints.numpy(), heading) - clean.encode(motions[0]).numpy()).max()
     if difference > 1e-5:
         raise SystemExit(
-            f"the features of the loop and of the representation differ by {difference:.1e}"
+            f"the features from the loop and from the representation differ by {difference:.1e}"
         )
 
     features = torch.stack(clean.encode_many(motions))
@@ -109,8 +109,9 @@ def measure(settings: Settings) -> Section:
     ]
     return section(
         "HumanML3D's features",
-        f"""Joint positions to 263 features and back, {FRAMES} frames per clip, one core, medians of {rounds}
-        alternating rounds of processor time, compared to a loop over frames and joints in NumPy.""",
+        f"""Joint positions are converted to 263 features and back, with {FRAMES} frames per clip on one core. Values
+        are medians of {rounds} alternating rounds in CPU time, compared with a loop over frames and joints in
+        NumPy.""",
         f"Features of {CLIPS} clips are computed {fast / slow:.0f} times as fast as in a loop over frames and joints.",
         {"features": rows},
     )

@@ -3,12 +3,12 @@
 The network is a transformer with one layer of width 16 and no text encoder, so that most of the
 time is spent outside the network. The framework is compared with bare Lightning. Bare Lightning
 trains the same network with the same masked loss, fused optimizer and clipping on batches that are
-in memory. It logs nothing, and has no averaged weights, loggers and checkpoints. All measurements
-run on one thread and alternate.
+in memory. It logs nothing and has no averaged weights, loggers or checkpoints. All measurements run
+on one thread and alternate.
 
-A step takes the mean time of all steps after the first ones, so that work for several steps is also
-included: planned batches, logged values, and checks of the losses. Times are thread times, which
-exclude other programs on the machine. The parts of the framework's step are timed one by one,
+The time of a step is the mean over all steps after the first ones, so that it also includes work for
+several steps: planned batches, logged values, and checks of the losses. Times are thread times,
+which exclude other programs on the machine. The parts of the framework's step are timed one by one,
 without Lightning.
 """
 
@@ -60,22 +60,22 @@ BARE = "bare Lightning, the same network"
 PLAIN = "framework without averaged weights"
 FRAMEWORK = "framework, complete"
 LOOP = "plain PyTorch loop"
-BATCHES = 16  # distinct batches of bare Lightning and of the plain loop
+BATCHES = 16  # distinct batches for bare Lightning and for the plain loop
 
 
 class Measured(Exception):
-    """Ends a training without the work after its last step."""
+    """Ends training without the work that follows the last step."""
 
 
 class Clock(Callback):
-    """Measures the mean time of the thread between the ends of steps."""
+    """Measures the mean thread time between the ends of steps."""
 
     def __init__(self, steps: int) -> None:
         self.first, self.last = min(WARM, steps // 2), steps
         self.step, self.begin, self.seconds = 0, 0.0, 0.0
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Reads the clock after the first steps, and ends the training after the last one."""
+        """Reads the clock after the first steps, and ends training after the last one."""
         self.step += 1
         if self.step == self.first:
             self.begin = time.thread_time()
@@ -85,12 +85,12 @@ class Clock(Callback):
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """Runs a training until its last step is measured."""
+        """Runs training until its last step is measured."""
         try:
             yield
         except Measured:
             return
-        raise AssertionError("the training ended before its last step was measured")
+        raise AssertionError("training ended before its last step was measured")
 
 
 def log_interval() -> int:
@@ -99,7 +99,7 @@ def log_interval() -> int:
 
 
 def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
-    """Returns the batches and the task of the framework's training."""
+    """Returns the batches and the task with which the framework trains."""
     config = compose("quickstart", [*TINY, f"data_root={folder / 'data'}"])
     representation = instantiate(config["representation"])
     data: Any = instantiate(config["data"], representation=representation, seed=0)
@@ -119,11 +119,11 @@ def loss_of(task: GeneratorTask, batch: MotionBatch) -> Tensor:
 
 
 class Bare(LightningModule):
-    """The framework's network, loss and optimizer in a module of Lightning."""
+    """The framework's network, loss and optimizer in a LightningModule."""
 
     def __init__(self, task: GeneratorTask):
         super().__init__()
-        # In a list, the parameters of the task are not registered a second time
+        # The list keeps the task's parameters from being registered a second time
         self.denoiser = task.generator.denoiser
         self.task = [task]
 
@@ -132,12 +132,12 @@ class Bare(LightningModule):
         return loss_of(self.task[0], batch)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Returns the optimizer of the recipe."""
+        """Returns the recipe's optimizer."""
         return self.task[0].make_optimizer()
 
 
 def bare(steps: int, folder: Path) -> float:
-    """Returns seconds per step of bare Lightning."""
+    """Returns seconds per step for bare Lightning."""
     batches, task = built(folder)
     stream = itertools.islice(itertools.cycle(batches), steps)
     clock = Clock(steps)
@@ -158,7 +158,7 @@ def bare(steps: int, folder: Path) -> float:
 
 
 def framework(steps: int, folder: Path, *words: str) -> float:
-    """Returns seconds per step of the complete framework."""
+    """Returns seconds per step for the complete framework."""
     run = Path(tempfile.mkdtemp(dir=folder))
     words = (
         *TINY,
@@ -177,7 +177,7 @@ def framework(steps: int, folder: Path, *words: str) -> float:
 
 
 def loop(steps: int, folder: Path) -> float:
-    """Returns seconds per step of a plain PyTorch loop that trains the same network."""
+    """Returns seconds per step for a plain PyTorch loop that trains the same network."""
     batches, task = built(folder)
     optimizer, parameters = task.make_optimizer(), list(task.parameters())
     clock = Clock(steps)
@@ -192,7 +192,7 @@ def loop(steps: int, folder: Path) -> float:
 
 
 def parts(steps: int, folder: Path) -> dict[str, float]:
-    """Returns the median seconds of each part of a step."""
+    """Returns the median seconds for each part of a step."""
     batches, task = built(folder)
     model = task.generator
     optimizer, parameters = task.make_optimizer(), list(task.parameters())
@@ -227,7 +227,7 @@ def parts(steps: int, folder: Path) -> dict[str, float]:
 
 
 def measure(settings: Settings) -> Section:
-    """Times the framework's share of a step and returns the section of the page."""
+    """Times the framework's share of a step and returns the page section."""
     steps, rounds = (12, 1) if settings.quick else (150, 10)
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
@@ -254,15 +254,16 @@ def measure(settings: Settings) -> Section:
     whole, without = (times[name] / times[BARE] for name in (FRAMEWORK, PLAIN))
     return section(
         "Host cost of a training step",
-        f"""The network is tiny: one transformer layer of width 16, no text encoder, and batches of 4 clips. Its step
-        has almost no arithmetic: it is the time of calling torch, the framework and Lightning. Bare Lightning
-        trains the same network with the same masked loss, fused optimizer and clipping on batches that are in memory.
-        It logs nothing, and has no averaged weights, loggers and checkpoints. The complete framework cuts and
-        gathers its batches, checks losses, averages weights, shows its progress and logs every
-        {log_interval()} steps. One thread, medians of {rounds} alternating runs of {steps} steps, mean time of the
-        thread per step. The second table times the parts of the framework's step one by one, outside of Lightning.""",
-        f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms: {whole:.2f} times bare Lightning with "
-        f"the same network, and {without:.2f} times without averaged weights.",
+        f"""The network is tiny: one transformer layer of width 16, no text encoder, and batches of 4 clips. A step
+        does almost no arithmetic, so its time is the call overhead of torch, the framework and Lightning. Bare
+        Lightning trains the same network with the same masked loss, fused optimizer and clipping on batches that are
+        in memory. It logs nothing and has no averaged weights, loggers or checkpoints. The complete framework cuts
+        and gathers its batches, checks losses, averages weights, shows its progress and logs every
+        {log_interval()} steps. Values are medians of {rounds} alternating runs of {steps} steps on one thread, in
+        mean thread time per step. The second table times the parts of the framework's step one by one, outside of
+        Lightning.""",
+        f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms, {whole:.2f} times as long as in bare "
+        f"Lightning with the same network, and {without:.2f} times as long without averaged weights.",
         {"steps": ratios(times, BARE, "training"), "parts of the framework": shares},
     )
 

@@ -3,9 +3,9 @@
 A synthetic data set is packed into a temporary folder. Three measurements alternate: batches
 gathered from memory (data.resident=true), batches of the data loader in the training process, and
 training steps of the small MDM encoder (forward pass, backward pass and update). They are measured
-in processor time of one core, which excludes other programs on the machine. Loading with workers is
-measured in wall time, which includes passing batches between processes, and the load of the
-machine.
+in CPU time on one core, which excludes other programs on the machine. Loading with workers is
+measured in wall time, which includes passing batches between processes and depends on the load of
+the machine.
 """
 
 import itertools
@@ -26,12 +26,12 @@ from flame_mdm.losses import masked_mse
 from flame_mdm.representations.humanml import HumanML
 
 BATCH = 64
-GOAL = 5000  # target of clips per second and worker
+GOAL = 5000  # target in clips per second per worker
 STEP, LOADER, RESIDENT = "step", "loader, one core", "resident, one core"
 
 
 def training(features: int) -> Callable[[MotionBatch], None]:
-    """Returns a training step (forward, backward, update) of MDM's encoder in the size for CPUs."""
+    """Returns a training step (forward, backward, update) of MDM's encoder in its CPU size."""
     model = MDMEncoder(
         features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0
     )
@@ -55,7 +55,7 @@ def batches_of(data: MotionDataModule, resident: bool, workers: int = 0) -> Iter
 
 
 def measure(settings: Settings) -> Section:
-    """Times the batches of a data set and returns the section of the page."""
+    """Times the batches of a data set and returns the page section."""
     clips, count, rounds = (100, 3, 1) if settings.quick else (1000, 20, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)
@@ -94,12 +94,12 @@ def measure(settings: Settings) -> Section:
     gather, load = times[RESIDENT] / count, times[LOADER] / count
     return section(
         "Loading of batches",
-        f"""{BATCH} clips per batch, {lengths:.0f} frames of {shown[0].x.shape[2]} features on average, padded to
-        {frames:.0f}. Resident batches (`data.resident=true`) are gathered from memory. The loader collates clips in the
-        training process or in workers. A training step of the small MDM encoder takes {1000 * wait:.0f} ms of one core.
-        The target is {GOAL:,}
-        clips per second and worker. Medians of {rounds} alternating rounds of {count} batches.""",
-        f"A resident batch is ready {load / gather:.1f} times as fast as a batch of the loader, and takes "
+        f"""A batch has {BATCH} clips with {lengths:.0f} frames of {shown[0].x.shape[2]} features on average, padded
+        to {frames:.0f} frames. Resident batches (`data.resident=true`) are gathered from memory. The loader collates
+        clips in the training process or in workers. A training step of the small MDM encoder takes
+        {1000 * wait:.0f} ms on one core. The target is {GOAL:,} clips per second per worker. Values are medians of
+        {rounds} alternating rounds of {count} batches.""",
+        f"A resident batch is ready {load / gather:.1f} times as fast as a batch from the loader, and takes "
         f"{gather / wait:.1%} of the time of a small training step.",
         {"batches": rows},
     )

@@ -1,7 +1,7 @@
-"""Measures speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
+"""Measures the speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
 
 For each size, a new process prepares synthetic clips of about 51 frames in a temporary folder (1.1
-KB of disk per frame), with one worker per core. The results are the total processor time of all
+KB of disk per frame), with one worker per core. The results are the total CPU time of all
 processes, the maximum resident memory of the main process and of its largest worker, and the
 private part of each, which is not shared with other processes and is sampled. Another result is the
 number of bytes per frame by which the main process grows.
@@ -49,7 +49,7 @@ class Peaks(threading.Thread):
 
 
 def prepare(clips: int) -> None:
-    """Prepares clips in this process, and prints frames, processor seconds and bytes of memory as JSON."""
+    """Prepares clips in this process, and prints frames, CPU seconds and bytes of memory as JSON."""
     from flame_mdm.data.store import write_store
     from flame_mdm.data.synthetic import Synthetic
     from flame_mdm.representations.humanml import HumanML
@@ -73,7 +73,7 @@ def prepare(clips: int) -> None:
 
 
 def measure(settings: Settings) -> Section:
-    """Measures memory and time of the preparation of large data sets and returns the section of the page."""
+    """Measures the time and memory needed to prepare large data sets, and returns the page section."""
     rows: list[Row] = []
     growth: list[tuple[float, float]] = []
     for size in [2000] if settings.quick else [250_000, 1_000_000]:
@@ -86,8 +86,8 @@ def measure(settings: Settings) -> Section:
         frames, seconds, *memory = json.loads(finished.stdout.splitlines()[-1])
         row: Row = {
             "frames": frames,
-            "processor seconds": seconds,
-            "clips per second and core": clips / seconds,
+            "CPU seconds": seconds,
+            "clips per second per core": clips / seconds,
         }
         rows.append(
             row | {name: part / MEBIBYTE for name, part in zip(MEMORY, memory, strict=True)}
@@ -98,9 +98,9 @@ def measure(settings: Settings) -> Section:
     per_frame = (large - small) / (many - few) if many > few else 0
     return section(
         "Preparation of a data set",
-        f"""`make prepare` with synthetic clips of about {FRAMES_PER_CLIP} frames, one worker per core. Seconds are
-        the processor time of all processes together. Memory is the maximum during the run.""",
-        f"One core prepares {rows[-1]['clips per second and core']:,.0f} clips per second; the memory grows by "
+        f"""`make prepare` runs on synthetic clips of about {FRAMES_PER_CLIP} frames, with one worker per core. Times
+        are CPU seconds, summed over all processes. Memory is the maximum during the run.""",
+        f"One core prepares {rows[-1]['clips per second per core']:,.0f} clips per second; memory grows by "
         f"{per_frame:.0f} bytes per frame.",
         {"sizes": rows},
     )

@@ -1,6 +1,6 @@
-"""Times training steps of one process and of two gloo processes: `python benchmarks/processes.py`.
+"""Times training steps with one process and with two gloo processes: `python benchmarks/processes.py`.
 
-Both trainings use the same batches of 16 clips: one process has all 16 clips, and two processes
+Both runs use the same batches of 16 clips: one process has all 16 clips, and two processes
 have 8 clips each. Each process has one thread. With one core per process, the ideal ratio is 0.5.
 Two processes on one core cannot be below 1. The overhead consists of reducing the gradients and
 waiting for the slower process. Times are measured between steps, so that they do not include
@@ -91,10 +91,10 @@ def measure(settings: Settings) -> Section:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return section(
         "Two processes",
-        f"""The same batches of {CLIPS} clips, by one process and by two with {CLIPS // 2} clips each (DDP, gloo), one
-        thread per process, on {cores} cores. With one core per process, the ideal ratio is 0.5. Medians of {rounds}
-        alternating runs of {steps} steps.""",
-        f"For the same batch, two processes take {two / one:.2f} times the time of one process.",
+        f"""The same batches of {CLIPS} clips are used by one process, and by two processes with {CLIPS // 2} clips
+        each (DDP, gloo), with one thread per process, on {cores} cores. With one core per process, the ideal ratio
+        is 0.5. Values are medians of {rounds} alternating runs of {steps} steps.""",
+        f"For the same batch, two processes take {two / one:.2f} times as long as one process.",
         {"steps": ratios({"one": one, "two": two}, "one", "processes")},
     )
 

@@ -1,4 +1,4 @@
-"""Compares the quality of models at both speeds: `make bench ONLY=quality RUNS=FOLDER`.
+"""Compares the quality of models trained at both speeds: `make bench ONLY=quality RUNS=FOLDER`.
 
 This script trains nothing. It reads the runs in a folder, which were trained by `make train ...
 speed=...` and evaluated by `make evaluate`, with two or more seeds per data set and speed. The
@@ -17,8 +17,8 @@ from flame_mdm.reporting.compare import paired_difference
 from flame_mdm.runs import CONFIG, Run, read_run
 
 METRICS = {
-    "attributes/all": "requested attributes, share right",
-    "sides/all": "side, share right",
+    "attributes/all": "requested attributes, share correct",
+    "sides/all": "side, share correct",
     "fid": "FID",
     "texts_for_motion/top3": "R precision, top 3",
     "foot_skating": "foot skating, share of frames",
@@ -46,7 +46,7 @@ def values(run: Run) -> dict[str, float]:
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
-    """Returns the values of the runs in a folder, by training (with its data set), speed and seed."""
+    """Returns the values of the runs in a folder, by training setup (with its data set), speed and seed."""
     runs: dict[str, dict[str, BySeed]] = {}
     for path in sorted(folder.glob(f"*/{CONFIG}")):
         run = read_run(path.parent)
@@ -57,7 +57,7 @@ def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
         speeds[config["run"].get("speed", "reference")][config["seed"]] = values(run)
     if not runs:
         raise SystemExit(
-            f"{folder}: contains no runs. docs/speed.md has the commands that train and evaluate them"
+            f"{folder}: contains no runs. docs/speed.md lists the commands that train and evaluate them"
         )
     return runs
 
@@ -76,14 +76,14 @@ def interval(sample: Sequence[float]) -> tuple[float, float]:
 
 
 def measure(settings: Settings) -> Section:
-    """Compares the metrics of runs that differ only in speed, and returns the section of the page."""
+    """Compares the metrics of runs that differ only in speed, and returns the page section."""
     folder = Path(settings.runs or ".")
     tables: dict[str, list[Row]] = {}
     differing: list[str] = []
     for name, speeds in read_runs(folder).items():
         seeds = sorted(speeds["reference"])
         if len(seeds) < 2 or seeds != sorted(speeds["fast"]):
-            raise SystemExit(f"{folder}: {name}: needs two or more seeds, the same in both speeds")
+            raise SystemExit(f"{folder}: {name}: needs two or more seeds, the same at both speeds")
 
         rows = tables.setdefault(f"{name}, {len(seeds)} seeds", [])
         for metric in speeds["reference"][seeds[0]]:
@@ -103,9 +103,9 @@ def measure(settings: Settings) -> Section:
     others = f"; the others: {', '.join(differing)}" if differing else ""
     return section(
         "Quality in both speeds",
-        """Each speed is trained with several seeds, and evaluated once on the test motions. Means over the seeds, with
-        95 % intervals by Student's t. The differences are between runs with the same seed, which begin with the same
-        weights and see the same batches. [Commands](../speed.md#quality).""",
-        f"In {equal} of {total} figures of quality, the interval of `fast` − `reference` contains 0{others}.",
+        """Models are trained at each speed with several seeds, and evaluated once on the test motions. Values are means
+        over the seeds, with 95 % intervals by Student's t. The differences are between runs with the same seed, which
+        begin with the same weights and see the same batches. [Commands](../speed.md#quality).""",
+        f"For {equal} of {total} quality figures, the interval of `fast` − `reference` contains 0{others}.",
         tables,
     )

@@ -51,7 +51,7 @@ to choose](../speed.md).
 
 
 def machine() -> dict[str, str | int]:
-    """Returns the hardware and the versions on which a measurement depends."""
+    """Returns the hardware and software versions on which a measurement depends."""
     capabilities, software = torch.cpu.get_capabilities(), environment()
     has_affinity = hasattr(os, "sched_getaffinity")
     bfloat16 = [name for name in ("avx512_bf16", "amx_bf16") if capabilities.get(name)]
@@ -89,7 +89,7 @@ def child(name: str, out: str, settings: str) -> None:
 
 
 def render(sections: dict[str, Any]) -> str:
-    """Returns the page of the measured sections."""
+    """Returns the page that contains the measured sections."""
     order = sorted(sections, key=_position)
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
 
@@ -124,17 +124,17 @@ def _position(name: str) -> tuple[int, bool]:
 def chosen(only: str, settings: Settings) -> list[str]:
     """Returns the scripts to run.
 
-    Ends the program with one line if a script, or a requirement of a script, does not exist.
+    Exits with a one-line error if a script, or something that a script requires, does not exist.
     """
     if settings.device not in ("cpu", "cuda"):
         raise SystemExit(
-            f"DEVICE={settings.device}: give cpu, or cuda on a machine with a CUDA GPU"
+            f"DEVICE={settings.device}: unknown device. Use cpu, or cuda on a machine with a CUDA GPU"
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
     if settings.mdm_repo and not (Path(settings.mdm_repo) / "model" / "mdm.py").is_file():
         raise SystemExit(
-            f"MDM_REPO={settings.mdm_repo}: no model/mdm.py. Give the path of a clone of the authors' code"
+            f"MDM_REPO={settings.mdm_repo}: contains no model/mdm.py. Use the path of a clone of the authors' code"
         )
 
     usual = ON_GPU if settings.device == "cuda" else SECTIONS
@@ -142,9 +142,11 @@ def chosen(only: str, settings: Settings) -> list[str]:
     names: list[str] = only.split(",") if only else list(usual)
     unknown = [name for name in names if name not in possible]
     if unknown:
-        raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(possible)}")
+        raise SystemExit(f"ONLY={','.join(unknown)}: no such section. Use {', '.join(possible)}")
     if "quality" in names and not settings.runs:
-        raise SystemExit("ONLY=quality: give RUNS=..., a folder of trained and evaluated runs")
+        raise SystemExit(
+            "ONLY=quality: requires RUNS=..., a folder with trained and evaluated runs"
+        )
     return names
 
 

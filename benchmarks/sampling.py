@@ -199,7 +199,7 @@ def loops(size: Size) -> list[Row]:
 
 @torch.no_grad()
 def measure(settings: Settings) -> Section:
-    """Times samplers and returns the section of the page."""
+    """Times samplers and returns the page section."""
     torch.manual_seed(0)
     size = Size(settings.device)
     if settings.quick:
@@ -220,11 +220,11 @@ def measure(settings: Settings) -> Section:
     ten = {row["batch"]: float(row["seconds"] or 0) for row in steps if row["steps"] == "10"}
     return section(
         "Sampling",
-        f"""MDM's encoder with {sum(p.numel() for p in encoder.parameters()):,} parameters, motions of {size.frames}
-        frames of {FEATURES} features, on {size.device}, guidance {GUIDANCE} (two rows per motion in one call).
-        Latency and throughput are measured with the ancestral sampler, with noise; "distilled" is the sampler of
-        distilled models, without guidance; the samplers have {BATCH} motions per batch; the loops alone run without
-        a network, at batch 1. Medians of {size.rounds} alternating rounds.""",
+        f"""MDM's encoder has {sum(p.numel() for p in encoder.parameters()):,} parameters. Motions have {size.frames}
+        frames of {FEATURES} features and are sampled on {size.device} with guidance {GUIDANCE} (two rows per motion
+        in one call). Latency and throughput are measured with the ancestral sampler, with noise; "distilled" is the
+        sampler for distilled models, without guidance. The samplers are measured with {BATCH} motions per batch, and
+        the loops alone without a network, at batch 1. Values are medians of {size.rounds} alternating rounds.""",
         f"With 10 steps, one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 give "
         f"{64 / ten['64']:.0f} motions per second.",
         {

@@ -1,6 +1,6 @@
-"""Common parts of the benchmarks.
+"""Code shared by the benchmarks.
 
-Each script has a function `measure`, which returns a section of the page.
+Each script has a function `measure`, which returns a page section.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ QUIET = [
     "callbacks.checkpoints.every_n_steps=1000000",
     "logger=csv",
 ]
-"""Settings of runs that only train, for timing their steps."""
+"""Settings for runs that only train, to time their steps."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Settings:
     mdm_repo: str | None = (
         None  # path of a clone of the authors' code, GuyTevet/motion-diffusion-model
     )
-    runs: str | None = None  # folder of trained and evaluated runs, for quality.py
+    runs: str | None = None  # folder with trained and evaluated runs, for quality.py
 
 
 def section(title: str, text: str, summary: str, tables: Mapping[str, Sequence[Row]]) -> Section:
-    """Returns the content of a section of the page."""
+    """Returns the content of a page section."""
     return {
         "title": title,
         "text": " ".join(text.split()),
@@ -98,7 +98,7 @@ def take_turns(
     device: str = "cpu",
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Returns the median seconds of each function.
+    """Returns the median seconds per call of each function.
 
     The functions alternate, so that a busy machine slows down all of them. A first round, which
     warms up, is not counted.

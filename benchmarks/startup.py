@@ -1,4 +1,4 @@
-"""Times the start of commands: `python benchmarks/startup.py`.
+"""Times the startup of commands: `python benchmarks/startup.py`.
 
 Commands answer `--help` and misspelled keys without importing torch. The work itself is minimal
 (one training step, one motion, one replication of eight motions), so that mainly imports and
@@ -49,7 +49,7 @@ WORK: dict[str, tuple[list[str], list[str]]] = {
     "sample": ([CHECKPOINT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
     "evaluate": ([CHECKPOINT, *EVALUATION], ["seed={}", "out=result{}.json"]),
 }
-"""Words of each command. The words in the second list differ from run to run."""
+"""Arguments of each command. The arguments in the second list differ from run to run."""
 TORCH = "python -c 'import torch'"
 
 
@@ -72,7 +72,7 @@ def minimal_work(folder: Path, command: str, numbers: itertools.count) -> None:
 
 
 def measure(settings: Settings) -> Section:
-    """Times the start of commands and returns the section of the page."""
+    """Times the start of commands and returns the page section."""
     commands = ["sample"] if settings.quick else list(WORK)
     rounds = 1 if settings.quick else 3
     with tempfile.TemporaryDirectory() as temporary:
@@ -99,11 +99,11 @@ def measure(settings: Settings) -> Section:
     started = times[f"{commands[0]}, minimal work"] / times[TORCH]
     return section(
         "Start of the commands",
-        f"""From the start of a process to its end, one thread. The work is minimal (one training step, one motion,
-        one replication of eight motions), so that mainly imports are measured. Medians of {rounds} alternating
-        runs; ratios to importing torch.""",
-        f"`--help` answers in {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times the "
-        "time of importing torch.",
+        f"""Times are measured from the start of a process to its end, with one thread. The work is minimal (one
+        training step, one motion, one replication of eight motions), so that mainly imports are measured. Values are
+        medians of {rounds} alternating runs, with ratios to the time of importing torch.""",
+        f"`--help` answers in {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times as "
+        "long as importing torch.",
         {"commands": rows},
     )
 

@@ -2,9 +2,9 @@
 
 The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. It is compared with the
 authors' step, from a clone of their code, and with a plain PyTorch loop, which trains an
-`nn.TransformerEncoder` of the same size. Both get the same clips, padded to 196 frames as in the
-published codes. Further tables contain a step of every network in the size for CPUs and, on the
-CPU, the quickstart in the complete framework. All measurements alternate in one run.
+`nn.TransformerEncoder` of the same size. Both receive the same clips, padded to 196 frames as in the
+published code. Further tables contain a step of every network in its CPU size and, on the CPU, the
+quickstart in the complete framework. All measurements alternate in one run.
 """
 
 import statistics
@@ -32,7 +32,7 @@ from flame_mdm.training.fit import fit
 from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
-TOKENS = 30  # tokens of a caption
+TOKENS = 30  # tokens per caption
 # Rounds of the full-size step. All implementations train on each batch in turn, twice.
 ROUNDS, BATCHES = 2, 8
 BACKBONES = {
@@ -70,7 +70,7 @@ class Peer(nn.Module):
         self.token, self.dropout = nn.Linear(512, width), nn.Dropout(0.1)
 
     def forward(self, x: Tensor, mask: Tensor, cond: Tensor) -> Tensor:
-        """Returns the network's output for a batch in the layout of the authors' code."""
+        """Returns the network's output for a batch, with the layout used in the authors' code."""
         tokens = self.dropout(torch.cat([self.token(cond)[None], self.input(x.transpose(0, 1))]))
         padding = ~torch.cat([mask.new_ones(len(mask), 1), mask], 1)
         return self.output(self.encoder(tokens, src_key_padding_mask=padding))[1:].transpose(0, 1)
@@ -134,7 +134,7 @@ def drawn_lengths(rows: int, batches: int) -> list[np.ndarray]:
 
 
 def full_size(settings: Settings) -> tuple[list[Row], str]:
-    """Returns the rows of the full-size step, and a text about the batches."""
+    """Returns the rows for the full-size step, and a text about the batches."""
     words = ["data.batch_size=16"]
     if settings.quick:
         words = [
@@ -177,7 +177,7 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
 
 
 def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
-    """Returns one row per network of `BACKBONES`, in the size for CPUs."""
+    """Returns one row per network in `BACKBONES`, in its CPU size."""
     rows: list[Row] = []
     lengths = np.random.default_rng(1).integers(36, 61, 32)
     for name in names:
@@ -239,12 +239,12 @@ def summary(rows: Sequence[Row]) -> str:
     reference, fast = (row["times as fast"] for row in rows[-2:])
     return (
         f"At full size, `speed=reference` is {reference:.1f} times as fast as {peer}, "
-        f"and `speed=fast` {fast:.1f} times."
+        f"and `speed=fast` is {fast:.1f} times as fast."
     )
 
 
 def measure(settings: Settings) -> Section:
-    """Times training steps and returns the section of the page."""
+    """Times training steps and returns the page section."""
     warnings.filterwarnings("ignore")
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("high")  # as in training
@@ -256,7 +256,7 @@ def measure(settings: Settings) -> Section:
         memory = torch.cuda.max_memory_allocated() / 2**30
         batches += f"; at most {memory:.1f} GiB of memory for all models together"
     names = ["FLAME", "MFM"] if quick else list(BACKBONES)
-    tables["networks in their size for CPU runs"] = backbones(names, 1 if quick else 15, device)
+    tables["networks in their CPU size"] = backbones(names, 1 if quick else 15, device)
     if device == "cpu":
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
 
@@ -267,12 +267,13 @@ def measure(settings: Settings) -> Section:
     )
     return section(
         "Training steps",
-        f"""The full-size step is a step of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are
-        uniform from 40 to 196 frames, in units of 4, similar to HumanML3D's lengths, and batches are drawn by the
-        framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
-        padded to 196 frames as in the published codes, in float32. All alternate on each of {BATCHES} batches,
-        {ROUNDS} times after one that warms up. The small networks have 32 clips per batch and no text encoder, and
-        alternate 15 times; the quickstart is trained by the complete framework, with its text encoder.""",
+        f"""The full-size step is a step of `humanml3d/mdm` (8 layers of width 512, dropout 0.1) on {batches}. Lengths
+        are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
+        the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
+        padded to 196 frames as in the published code, in float32. All implementations alternate on each of {BATCHES}
+        batches, {ROUNDS} times after one that warms up. The small networks have 32 clips per batch and no text
+        encoder, and alternate 15 times; the quickstart is trained by the complete framework, with its text
+        encoder.""",
         summary(full),
         tables,
     )

@@ -1,6 +1,6 @@
 """Times text encoding with the language model and from the cache: `python benchmarks/text.py`.
 
-The language model is sentence-BERT of the extra `offline`, with tokens, so that nothing is
+The language model is sentence-BERT from the extra `offline`, with tokens, so that nothing is
 downloaded.
 """
 
@@ -24,7 +24,7 @@ PARTS = [
 
 
 def measure(settings: Settings) -> Section:
-    """Times text encoders with and without cached embeddings and returns the section of the page."""
+    """Times text encoders with and without cached embeddings and returns the page section."""
     size, rounds = (2, 1) if settings.quick else (64, ROUNDS)
     condition = compose("quickstart", ["condition=minilm_offline"])["condition"]
     live, cached = (instantiate(condition | {"tokens": True}) for _ in range(2))
@@ -43,8 +43,8 @@ def measure(settings: Settings) -> Section:
 
     return section(
         "Text encoding",
-        f"""A batch of {size} captions, encoded by sentence-BERT (MiniLM, with tokens) or read from the cache of frozen
-        encoders. Medians of {rounds} alternating rounds.""",
+        f"""A batch of {size} captions is encoded by sentence-BERT (MiniLM, with tokens), or read from the cache of
+        frozen encoders. Values are medians of {rounds} alternating rounds.""",
         f"Reading a batch of cached captions is {times['encoded'] / times['cached']:.0f} times as fast as encoding it.",
         {"captions": ratios(times, "cached", "captions", "ms")},
     )

@@ -20,7 +20,7 @@ HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
 
 
 def head(name: str) -> tuple[str, str]:
-    """Returns the head comment of a recipe: what it is (paper, table, row), and its deviations."""
+    """Returns the head comment of a recipe: what it reproduces (paper, table, row), and its deviations."""
     lines = (EXPERIMENTS / f"{name}.yaml").read_text().splitlines()[1:]
     comment = " ".join(
         line.removeprefix("#").strip()
@@ -31,7 +31,7 @@ def head(name: str) -> tuple[str, str]:
 
 
 def _wide(width: int, layers: int) -> list[str]:
-    """Returns the overrides of a wide network, with feed-forward layers four times as wide."""
+    """Returns the overrides for a wide network, with feed-forward layers four times as wide."""
     sizes = {"latent_dim": width, "ff_size": 4 * width, "num_layers": layers}
     return [f"denoiser.{name}={size}" for name, size in sizes.items()]
 
@@ -67,7 +67,7 @@ weight, and checkpoints are selected on validation clips.
 
 
 def published_tables() -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns the papers' hyperparameters: title -> recipe -> dotted key -> value; None = not in the paper."""
+    """Returns the papers' hyperparameters: title -> recipe -> dotted key -> value (None: not in the paper)."""
     published = read_yaml(PUBLISHED)
     tables = {}
     for page in published["hyperparameters"]["pages"]:
@@ -82,7 +82,7 @@ def published_tables() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def printed(text: str) -> Any:
-    """Returns the value of a printed text: 1,000 is a number, "0.9, 0.999" two numbers."""
+    """Returns the value of a printed text: "1,000" is a number, "0.9, 0.999" is two numbers."""
     if ", " in text:
         return tuple(map(printed, text.split(", ")))
     number = text.removesuffix(" words").replace(",", "")
@@ -95,7 +95,8 @@ DEVIATIONS = {
     (
         "humanml3d/mdm_unet",
         "parameters",
-    ): "no code is public; the widths are chosen so that the number is close"
+    ): "the code is not public; the widths are chosen so that the number of parameters is "
+    "close to the paper's"
 }
 """Deviations of recipes from their papers, by (recipe, key), with the reason."""
 
@@ -155,10 +156,10 @@ def _cell(ours: Any, papers: Any) -> str:
 
 
 ROOT = Path(__file__).parent.parent
-FLOOR = "config"  # the room of the picture that stands for all parts on the ground
+FLOOR = "config"  # the room in the picture that represents all parts on the ground
 ROOM, GAP, STOREY, MARGIN = (168, 58), 22, 104, 30  # pixels
 PACKAGES = {"__init__": "flame_mdm", "__main__": "flame-mdm"}
-"""Names in the picture that differ from the names of the modules."""
+"""Names in the picture that differ from the module names."""
 ROOMS = {
     "representations": (0, "motions as features, and back"),
     "schemas": (1, "typed schemas of files"),
@@ -186,7 +187,7 @@ ROOMS = {
 
 
 def import_rules() -> tuple[dict[str, set[str]], set[str]]:
-    """Returns what each part of the code may import, and the parts on the ground, from the test of the rules."""
+    """Returns what each part of the code may import, and the parts on the ground, from the architecture test."""
     tree = ast.parse((ROOT / "tests" / "test_architecture.py").read_text(encoding="utf-8"))
     values: dict[str, Any] = {}
     for node in tree.body:

@@ -14,7 +14,7 @@ texts = [
 ]
 motions = flame_mdm.generate(model, texts, seconds=3, samples=2, seed=0, cleanup=True)
 
-# Two samples of the first text are followed by two samples of the second text.
+# Two samples for the first text are followed by two samples for the second text.
 for number, motion in enumerate(motions):
     print(number, motion.text, motion.joints.shape, "meters, y up")
 

@@ -1,4 +1,4 @@
-"""Motion without an end, whose text changes while it runs."""
+"""Endless motion whose text changes while it runs."""
 
 import sys
 

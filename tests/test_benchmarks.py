@@ -80,10 +80,10 @@ def test_all_sections_are_measured_unless_only_some_are_named(page):
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("only=host,none", "ONLY=none: give some of steps, host, "),
-        ("device=tpu", "DEVICE=tpu: give cpu"),
-        ("only=quality", "ONLY=quality: give RUNS="),
-        ("mdm_repo=/none", "MDM_REPO=/none: no model/mdm.py. Give the path of a clone"),
+        ("only=host,none", "ONLY=none: no such section. Use steps, host, "),
+        ("device=tpu", "DEVICE=tpu: unknown device. Use cpu"),
+        ("only=quality", "ONLY=quality: requires RUNS="),
+        ("mdm_repo=/none", "MDM_REPO=/none: contains no model/mdm.py. Use the path of a clone"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_in_one_line(page, word, message):
@@ -266,12 +266,12 @@ def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
     assert rows[0]["speed=reference"] == "2.0 ± 2.5", "4.303 / sqrt(3)"
     assert rows[0]["fast − reference"].startswith("+0.10 ± 0.00")
     assert rows[1]["fast − reference"] == "-11 ± 27", "11 times as much"
-    assert measured["summary"].startswith("In 1 of 2 figures of quality")
+    assert measured["summary"].startswith("For 1 of 2 quality figures")
     assert measured["summary"].endswith("the others: val/loss (own).")
 
     del runs["b2"]
     (tmp_path / "b2" / "config.yaml").unlink()
-    with pytest.raises(SystemExit, match="needs two or more seeds, the same in both speeds"):
+    with pytest.raises(SystemExit, match="needs two or more seeds, the same at both speeds"):
         quality.measure(settings)
     monkeypatch.setattr(
         quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {})

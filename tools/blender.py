@@ -1,7 +1,7 @@
 """Builds the extension for Blender 4.2 or later: `make blender [PLATFORM=windows-x64]`.
 
 The file is build/flame_mdm-PLATFORM.zip. The extension samples with the model in this package.
-The wheels of onnxruntime come from the package index.
+The wheels for onnxruntime come from the package index.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PLATFORMS = {
     "windows-x64": ("win_amd64",),
     "macos-arm64": ("macosx_14_0_arm64",),
 }
-"""Blender's names of platforms -> the tags of their wheels."""
+"""Blender's platform names -> the tags of their wheels."""
 MODULES = (
     RUNNER,
     *(
@@ -42,7 +42,7 @@ MODULES = (
 
 
 def this_machine() -> str:
-    """Returns Blender's name of this platform, such as linux-x64."""
+    """Returns Blender's name for this platform, such as linux-x64."""
     system = {"Darwin": "macos"}.get(platform.system(), platform.system().lower())
     return f"{system}-{'arm64' if platform.machine().lower() in ('arm64', 'aarch64') else 'x64'}"
 
@@ -63,7 +63,7 @@ def build(model: str, out: Path, target: str) -> None:
         export_onnx(model, folder / "model", half=True)
         (folder / "model" / RUNNER.name).unlink()
         for path in (*MODULES, SOURCE / "__init__.py"):
-            # Inside Blender, the extension is imported under another package name
+            # Inside Blender, the extension is imported under a different package name
             code = re.sub(
                 r"from flame_mdm\.(\w+\.)*(\w+) import",
                 r"from .\2 import",
@@ -85,7 +85,7 @@ def build(model: str, out: Path, target: str) -> None:
 
 
 def fetch_wheels(folder: Path, target: str) -> None:
-    """Downloads the wheels of onnxruntime and its requirements.
+    """Downloads the wheels for onnxruntime and its requirements.
 
     onnxruntime has the version that exported the model.
     """

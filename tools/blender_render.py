@@ -2,7 +2,7 @@
 
 Run `PYTHON blender_render.py JOB.json` with a Python that has the package bpy (Blender 4.2 or
 later). The job contains `width`, `height`, `samples`, and a list of `files`. Each file contains
-`path`; `out`, the beginning of the names of its pictures, which end in _000.png and so on; `every`,
+`path`; `out`, the prefix of its picture names, which end in _000.png and so on; `every`,
 the number of frames between pictures (0 = `count` pictures from the first to the last frame); and
 `bones` (true = the skeleton without the skin).
 """
@@ -17,7 +17,7 @@ import bpy  # pyright: ignore[reportMissingImports]
 import mathutils  # pyright: ignore[reportMissingImports]
 
 OPERATORS = {".fbx": bpy.ops.import_scene.fbx, ".glb": bpy.ops.import_scene.gltf}
-BONE = (0.75, 0.18, 0.03, 1)  # color of the bones
+BONE = (0.75, 0.18, 0.03, 1)  # bone color
 THICK = 0.16  # width of a bone relative to its length
 TILE = 0.5  # size of the floor's squares in meters
 # Distance from the person in meters. The person faces -y in Blender.
@@ -32,7 +32,7 @@ def material(name, color):
 
 
 def stage(job):
-    """Adds light, a floor with squares, and a camera."""
+    """Adds a light, a checkered floor and a camera."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.use_denoising = job["samples"], False
@@ -67,7 +67,7 @@ def stage(job):
 
 
 def heads(armature):
-    """Returns the world positions of the bones' heads in a pose, by name."""
+    """Returns the world positions of the bone heads in a pose, by bone name."""
     return {bone.name: armature.matrix_world @ bone.head for bone in armature.pose.bones}
 
 

@@ -1,6 +1,6 @@
-"""Draws the pictures of docs/engines.md with Blender: `python tools/engine_pictures.py [SET]`.
+"""Draws the pictures in docs/engines.md with Blender: `python tools/engine_pictures.py [SET]`.
 
-`FLAME_MDM_BLENDER` is the path of a Python that has the package bpy. SET is the folder of a set of
+`FLAME_MDM_BLENDER` is the path to a Python that has the package bpy. SET is a folder with a set of
 FBX files. If it is given, every frame of each clip is drawn into SET/frames.
 """
 
@@ -23,8 +23,8 @@ RENDER = Path(__file__).with_name("blender_render.py")
 TEXT = "a person walks forward, then waves with the left hand"
 COUNT = 8  # pictures per row
 SIZE = (108, 150)  # size of one picture
-SMALL = (84, 112)  # size of one picture of a sheet with every frame
-QUALITY = 82  # of the WebP files
+SMALL = (84, 112)  # size of one picture in a sheet with every frame
+QUALITY = 82  # quality of the WebP files
 LABEL = (20, 20, 20)
 CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Turn_90_Left")
 
@@ -32,7 +32,7 @@ CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Tu
 def rendered(
     files: Sequence[Mapping[str, object]], size: tuple[int, int], samples: int, folder: Path
 ) -> list[list[Path]]:
-    """Renders files in Blender. Returns the pictures of each file, in the order of the frames.
+    """Renders files in Blender. Returns the pictures for each file, in frame order.
 
     Args:
         files: the path and the drawing options of each file, as in `blender_render.py`. This
@@ -42,11 +42,11 @@ def rendered(
         folder: the folder for the pictures.
 
     Raises:
-        UserError: If no Python with bpy is named, or if Blender fails.
+        UserError: If `FLAME_MDM_BLENDER` is not set, or if Blender fails.
     """
     python = os.environ.get("FLAME_MDM_BLENDER")
     if python is None:
-        raise UserError("FLAME_MDM_BLENDER is not set. Name a Python that has the package bpy")
+        raise UserError("FLAME_MDM_BLENDER is not set. Use a Python that has the package bpy")
     named = [{**file, "out": str(folder / f"{n:03d}")} for n, file in enumerate(files)]
     job = {"width": size[0], "height": size[1], "samples": samples, "files": named}
     (folder / "job.json").write_text(json.dumps(job))
@@ -72,7 +72,7 @@ def sheet(path: Path, rows: Sequence[Sequence[Path]], labels: Sequence[str]) -> 
 
 
 def draw_files() -> None:
-    """Draws a motion as skinned persons (an FBX and a GLB file), and as the bones of two rigs."""
+    """Draws a motion as skinned characters (an FBX and a GLB file), and as the bones of two rigs."""
     motion = flame_mdm.generate(flame_mdm.load("package"), TEXT)[0]
     versions = {
         "walk.fbx, rig=unreal": (".fbx", "unreal", False),
@@ -91,7 +91,7 @@ def draw_files() -> None:
 
 
 def draw_set() -> None:
-    """Draws some clips of the locomotion set."""
+    """Draws some clips from the locomotion set."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         if main(["sample", "package", "set=locomotion", f"out={folder / 'set'}"]):

@@ -1,9 +1,9 @@
-"""Removes actions from the list of actions that a model file knows, such as actions that the model shows wrongly.
+"""Removes actions from the list of actions that a model file knows, for instance because the model gets them wrong.
 
     python tools/leave_out_actions.py flame_mdm/models/package.safetensors waltz cry
 
-Sentences about these actions are then rejected, and the nearest actions are suggested. The names are
-those in `flame_mdm/conditions/language/actions.yaml`. The weights do not change.
+Sentences about these actions are then rejected, and the nearest actions are suggested. Use the
+action names in `flame_mdm/conditions/language/actions.yaml`. The weights do not change.
 """
 
 import sys
@@ -19,7 +19,7 @@ def main(path: Path, left_out: set[str]) -> None:
     unknown = left_out - actions().keys()
     if unknown:
         raise UserError(
-            f"{', '.join(sorted(unknown))}: not in flame_mdm/conditions/language/actions.yaml. Use its names"
+            f"{', '.join(sorted(unknown))}: not in flame_mdm/conditions/language/actions.yaml. Use names from it"
         )
     content = read_model_file(path)
     facts = content["facts"]
@@ -35,14 +35,14 @@ def main(path: Path, left_out: set[str]) -> None:
 
 
 def named(name: str) -> set[str]:
-    """Returns the actions of the table that a name of an action in a model stands for."""
+    """Returns the actions in the table to which an action name in a model refers."""
     plain = name.replace("_", " ").lower()
     listed = {entry.name for entry in actions().values() if plain in entry.names}
     return listed or mentioned(plain)
 
 
 def mentioned(text: str) -> set[str]:
-    """Returns the actions that a text names."""
+    """Returns the actions that a text mentions."""
     return {mention.action for mention in understand(text).mentions}
 
 

@@ -1,4 +1,4 @@
-"""Models the mannequin of pictures and files: `python tools/mannequin.py`.
+"""Models the mannequin for pictures and files: `python tools/mannequin.py`.
 
 Writes flame_mdm/visualize/mannequin.npz. The figure contains no third-party data. Its parts have
 elliptic cross sections along the bones of `ADULT`, with the widths and depths of an adult of 1.78
@@ -35,13 +35,13 @@ A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankl
 """Rotations of the left side, in degrees about x, y and z, from SMPL's rest pose to the stored pose.
 
 The arms are lowered in the stored pose. In most motions, the arms hang down, so the skin is
-stretched less than from outstretched arms.
+stretched less than from a pose with outstretched arms.
 """
 KNUCKLES, CURL = 0.088, 0.034
-"""Distance of the knuckles from the wrist, and radius of the arc of the fingers, in meters."""
+"""Distance from the wrist to the knuckles, and radius of the finger arc, in meters."""
 CELL = 0.005
 VERTICES = 1150
-"""Number of vertices of a half, before it is mirrored."""
+"""Number of vertices in a half, before it is mirrored."""
 SOLE = -0.981
 """Height of the sole below the pelvis."""
 LIPS, EYES = (192, 138, 120), (92, 74, 64)
@@ -51,7 +51,7 @@ ORIGIN, UP = np.zeros(3), np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
 
 
 def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0) -> Field:
-    """Returns a function: the approximate signed distance from a tube with elliptic cross sections and round ends.
+    """Returns a function for the approximate signed distance from a tube with elliptic cross sections and round ends.
 
     Args:
         origin: the point at length 0.
@@ -366,7 +366,7 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
 
 
 def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
-    """Returns the weights (V, 22) of the joints, for points of the left half."""
+    """Returns the joint weights (V, 22) for points on the left half."""
     joints, turned = pose()
 
     def beyond(name: str, normal: Sequence[float] | np.ndarray, width: float) -> np.ndarray:
@@ -434,7 +434,7 @@ def descendants(joint: int) -> list[int]:
 
 
 def paint(points: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3), 0 to 255, of a half: hair, skin, shirt, trousers and shoes, blended at their borders."""
+    """Returns colors (V, 3), 0 to 255, for a half: hair, skin, shirt, trousers and shoes, blended at their borders."""
     joints, turned = pose()
 
     def mixed(below: np.ndarray, above: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
@@ -461,7 +461,7 @@ def paint(points: np.ndarray) -> np.ndarray:
 
 
 def make() -> dict[str, np.ndarray]:
-    """Returns the arrays of the asset: the left half of the figure and its mirror image."""
+    """Returns the arrays in the asset: the left half of the figure and its mirror image."""
     parts = model()
 
     def distance(points: np.ndarray) -> np.ndarray:

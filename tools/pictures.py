@@ -1,4 +1,4 @@
-"""Draws the pictures next to options, with the model in the package and Chromium: `python tools/pictures.py`."""
+"""Draws the pictures that illustrate options, with the package's model and Chromium: `python tools/pictures.py`."""
 
 import base64
 import io
@@ -73,7 +73,7 @@ def draw_motions() -> None:
 
 
 def draw_stills() -> None:
-    """Draws the demo's pictures of actions that the synthetic set does not have."""
+    """Draws the demo's pictures for actions that the synthetic set lacks."""
     model = flame_mdm.load("package")
     for action in Abilities(model.facts).actions:
         if not set(actions()[action].names) & set(ACTIONS):
@@ -82,7 +82,7 @@ def draw_stills() -> None:
 
 
 def draw_demo() -> None:
-    """Takes pictures of parts of the demo's page, at 60 % of their size and in 128 colors."""
+    """Takes screenshots of parts of the demo page, at 60 % of their size and in 128 colors."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     from support.browser import browser
 

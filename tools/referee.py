@@ -2,21 +2,21 @@
 
 python tools/referee.py data/bandai-humanml-clean-smpl22 data/cmu-humanml-clean-smpl22 ... [figures=FILE.json]
 
-The figures of this repository are in docs/benchmarks/referee_calibration.json;
-`tools/referee_page.py` shows them.
+The figures for this repository are in docs/benchmarks/referee_calibration.json.
+`tools/referee_page.py` writes the page that shows them.
 
 The arguments are prepared data sets with SMPL's 22 joints. A hash of their names splits the
 recordings into two halves. Thresholds are calibrated on one half, and figures are measured on the
 other half. Sums over both halves are "crossed": each half is judged with the thresholds of the
 other half. Procedural motions set no thresholds, and have separate figures.
 
-A claim of a caption counts as true for its motion. A falsified claim counts as false. It states
+A claim in a caption counts as true for its motion. A falsified claim counts as false. It states
 another side, direction or speed, one repetition more or fewer, the reverse order, another duration,
 or the other end of the motion. Captions are sometimes wrong, and the figures include their errors.
 
 Captions hardly ever state durations. If the captions of a recording only state that the body walks,
 runs or stands still, the recording is cut to two, three and four seconds, so that "for three
-seconds" is true for the cut. A walking body is assumed to stand at the start and at the end. Claims
+seconds" is true for the cut. A walking body is assumed to be upright at the start and at the end. Claims
 about durations and ends set no thresholds.
 """
 
@@ -52,7 +52,7 @@ UNCALIBRATED = ("count", "duration", "start", "end")
 LASTING = ("walk", "run", "stand still")
 BESIDE = {"travel", "veer", "pace"}
 """Claims that are compatible with walking or running from the first to the last frame."""
-MOST_SYNTHETIC = 600  # procedural motions of the test split
+MOST_SYNTHETIC = 600  # maximum number of procedural motions, from the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
 # false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
 # are stated by the functions in `postures.py` and `movements.py`; a score is negative if less speaks for the claim.
@@ -72,7 +72,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Case:
-    """A claim about a motion, and the change that falsified it; "" = no change, so the claim is true.
+    """A claim about a motion, and the change that falsified it ("": no change, so the claim is true).
 
     `is_built`: whether the claim comes from `built_cases`, not from a caption.
     """
@@ -102,7 +102,7 @@ def main(folders: Sequence[Path], figures: Path | None) -> None:
 
 
 def read(folder: Path) -> Iterator[Example]:
-    """Yields the motions of a prepared data set, without mirrored and repeated copies."""
+    """Yields the motions in a prepared data set, without mirrored or repeated copies."""
     store = Store(folder)
     files = sorted((EXPERIMENTS / "representation").glob("*.yaml"))
     nodes = {file.stem: read_yaml(file) for file in files}
@@ -130,7 +130,7 @@ def read(folder: Path) -> Iterator[Example]:
 
 
 def cases_of(example: Example) -> list[Case]:
-    """Returns the claims of all captions of a motion and their falsified versions, without duplicates."""
+    """Returns the claims in all captions for a motion and their falsified versions, without duplicates."""
     claims = {str(claim): claim for text in example.captions for claim in read_claims(text)}
     cases = []
     for claim in claims.values():
@@ -172,7 +172,7 @@ def cut(example: Example, seconds: int) -> Example:
 
 
 def calibrate(cases: Sequence[Case]) -> None:
-    """Writes the thresholds of all kinds with enough claims."""
+    """Writes the thresholds for all kinds with enough claims."""
     kinds.FILE.unlink(missing_ok=True)
     kinds.thresholds.cache_clear()
     scores: defaultdict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
@@ -253,7 +253,7 @@ def name_of(claim: Claim) -> str:
 def crossed(
     rows: Sequence[dict[str, Any]], other: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Returns the sums of `tally` over both halves, each judged with the thresholds of the other half."""
+    """Returns the sums of `tally` over both halves, each judged with thresholds from the other half."""
     sums: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(lambda: defaultdict(int))
     for row in (*rows, *other):
         for name, value in row.items():

@@ -22,7 +22,7 @@ this folder.
 The thresholds were set on one half of the recordings, and these figures were measured on the other half. Each claim in
 the caption of a motion counts as true. Falsified claims count as false. They state the other side, direction or speed,
 one repetition more or fewer, the reverse order, another duration, or the other end of the motion. A wrong caption
-counts as an error of the referee. We corrected patterns and measurements after we had seen errors on both halves, so
+counts as an error by the referee. We corrected patterns and measurements after we had seen errors on both halves, so
 expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as kicking with both
 legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the CMU claims would be
 right.
@@ -91,7 +91,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str]:
-    """Returns the figures of both halves of the recordings, each judged with the other half's thresholds."""
+    """Returns the figures for both halves of the recordings, each judged with the other half's thresholds."""
     lines = [
         "",
         "Both halves of the recordings, each judged with thresholds from the other half:",
@@ -116,7 +116,7 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
 
 
 def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the figures of built claims about durations, the start and the end."""
+    """Returns the figures for constructed claims about durations, the start and the end."""
     lines = [
         "",
         "Captions hardly ever state a duration, a start or an end, so these claims were constructed instead. If the",
@@ -152,8 +152,8 @@ def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
     return [
         "",
-        "The targets are right verdicts on 97 % of true claims and 90 % of falsified claims. These kinds miss them: "
-        f"{', '.join(missed)}.",
+        "The targets are right verdicts on 97 % of true claims and 90 % of falsified claims. These kinds of claims "
+        f"miss the targets: {', '.join(missed)}.",
     ]
 
 
@@ -173,7 +173,7 @@ def systems_table(content: Mapping[str, Any]) -> list[str]:
         f"{content['rank_correlation']:.2f}. Generated motions are at most three seconds",
         "long, which is too short for some turns. The model for Bandai-Namco is small and was trained for eleven",
         "minutes on one thread. There is no model for CMU, because only 23 training clips were available.",
-        "[Another table](bandai_small.md) has both values for FLAME, MDM, MFM and DiP models that were trained on",
+        "[Another table](bandai_small.md) shows both values for FLAME, MDM, MFM and DiP models that were trained on",
         "Bandai-Namco for the same time.",
     ]
     groups = ("all", "side", "direction", "count", "movement", "posture", "contact")

@@ -2,7 +2,7 @@
 
     python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ... runs/bandai/mdm_small/default ...]
 
-These systems are compared on clips of the synthetic test split: motions of the shipped models, the
+These systems are compared on clips from the synthetic test split: motions from the shipped models,
 real motions, their mirror images, and real motions with captions of other motions. R-precision is
 `MotionsForText` with the package's motion-CLIP. The arguments add prepared data sets with SMPL's 22
 joints, without R-precision, and models that were trained on them.
@@ -35,7 +35,7 @@ FPS = 20.0
 COUNT = 128  # motions per row
 CLIPS = 1600  # number of synthetic clips; their test split is used
 SHIPPED = ("quickstart", "package", "package_dip")
-LONGEST = 3.0  # duration in seconds of the longest motion of the package's model
+LONGEST = 3.0  # duration in seconds of the longest motion from the package's model
 REAL, MIRRORED, SHUFFLED = "real motions", "mirrored real motions", "captions of other motions"
 
 Joints = Sequence[np.ndarray]
@@ -80,7 +80,7 @@ def main(folders: Sequence[Path]) -> None:
 
 
 def synthetic() -> tuple[list[str], list[np.ndarray], list[str]]:
-    """Returns ids, joints (F, 22, 3) and captions of the test split of the synthetic set."""
+    """Returns ids, joints (F, 22, 3) and captions from the test split of the synthetic set."""
     clips = [clip for clip in Synthetic(clips=CLIPS, seed=0).clips(FPS) if clip.split == "test"]
     clips = clips[:COUNT]
     return (
@@ -91,7 +91,7 @@ def synthetic() -> tuple[list[str], list[np.ndarray], list[str]]:
 
 
 def stored(folder: Path) -> tuple[list[str], list[np.ndarray], list[str]]:
-    """Returns ids, joints and first captions of test clips of a prepared data set."""
+    """Returns ids, joints and first captions of test clips from a prepared data set."""
     store = Store(folder)
     representation = instantiate(read_yaml(EXPERIMENTS / "representation" / "humanml_clean.yaml"))
     clips = [clip for clip in store.clips if clip.split == "test" and clip.id[0] != "M"]
@@ -125,7 +125,7 @@ def sampled(run: Path, joints: Joints, captions: Sequence[str]) -> list[np.ndarr
 
 
 def baselines(joints: Joints, captions: list[str]) -> Mapping[str, tuple[Joints, list[str]]]:
-    """Returns by name real motions, mirrored motions, and real motions with captions of other motions."""
+    """Returns, by name, real motions, mirrored motions, and real motions with captions of other motions."""
     mirrored = [SMPL22.mirror(torch.from_numpy(motion)).numpy() for motion in joints]
     order = np.random.default_rng(0).permutation(len(captions))
     shuffled = list(captions)

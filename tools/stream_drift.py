@@ -2,10 +2,9 @@
 
     python tools/stream_drift.py [MODEL]
 
-In several streams of five minutes, the text changes every ten seconds. The texts are captions of
-single synthetic actions that rules can recognize. The texts of the last minute are the texts of the
-first minute, so that both can be compared. Without MODEL, only the page and the figure are written
-again.
+In several streams of five minutes, the text changes every ten seconds. The texts are captions for
+single synthetic actions that rules can recognize. The last minute repeats the texts of the first
+minute, so that both can be compared. Without MODEL, only the page and the figure are regenerated.
 """
 
 import sys
@@ -42,8 +41,8 @@ SECONDS_PER_TEXT = 10
 TEXTS_PER_MINUTE = 60 // SECONDS_PER_TEXT
 PERIODS = {"0–10 s": (0, 10), "50–60 s": (50, 60), "290–300 s": (290, 300)}
 WINDOW = 2.0  # seconds of the windows whose features are compared
-SHOWN = (2.0, 3.0, 4.0)  # lengths in seconds of the windows in which an action is looked for
-LATEST = 4.0  # seconds from the change of a text to the latest end of these windows
+SHOWN = (2.0, 3.0, 4.0)  # lengths in seconds of the windows that are searched for an action
+LATEST = 4.0  # seconds from a text change to the latest end of these windows
 TOES = [10, 11]
 HEAD = 15
 
@@ -52,20 +51,20 @@ INTRODUCTION = """# Long streams, measured
 
 [Streams](../streams.md) explains how a stream works. `python tools/stream_drift.py {model}` computes the figures.
 
-{streams} streams of {minutes} minutes get a new text every ten seconds, each {texts} texts. The texts are captions of
-single synthetic actions. The last minute has the texts of the first one, so that both can be compared. No frame is
-cleaned up.
+{streams} streams of {minutes} minutes each receive a new text every ten seconds, {texts} texts in total. The texts are
+captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both can be
+compared. No frame is cleaned up.
 
 ## Drift
 
-![Skating, height of the head and jitter of each ten seconds](streams-figure.svg)
+![Skating, head height and jitter for each ten seconds](streams-figure.svg)
 
 {periods}
 
-FID compares windows of two seconds with synthetic motions that the model has not seen, by the package's motion-CLIP;
-another draw of these motions has {real_fid}. The jitter of the first minute is {first} m/s³ and of the last minute
-{last} m/s³, {ratio} times as much. In 99.9 % of the frames, no toe is more than {low} cm below the floor. The lowest
-toe is {lowest} cm below it.
+FID is computed with the package's motion-CLIP between windows of two seconds and synthetic motions that the model has
+not seen. For a second draw of such motions, it is {real_fid}. The jitter is {first} m/s³ in the first minute and
+{last} m/s³ in the last minute, {ratio} times as much. In 99.9 % of the frames, no toe is more than {low} cm below the
+floor. The lowest toe is {lowest} cm below the floor.
 
 ## Seams
 
@@ -91,7 +90,7 @@ def main(model: str | None) -> None:
 
 
 def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
-    """Returns all figures of a model."""
+    """Returns all figures for a model."""
     fps = model.representation.fps
     requests = [texts(number) for number in range(STREAMS)]
     joints, seams = streamed(model, requests)
@@ -129,7 +128,7 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
 
 
 def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
-    """Returns figures for each ten seconds of streams (B, F, 22, 3)."""
+    """Returns figures for every ten seconds of streams (B, F, 22, 3)."""
     length = round(SECONDS_PER_TEXT * fps)
     parts = [joints[:, begin : begin + length] for begin in range(0, joints.shape[1], length)]
     return {
@@ -140,7 +139,7 @@ def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
 
 
 def figure(results: dict[str, Any]) -> Markup | None:
-    """Returns the figure of the streams over time, as SVG."""
+    """Returns a figure that shows the streams over time, as SVG."""
     panels = [
         Panel(
             [Series(name, [(SECONDS_PER_TEXT * number, y) for number, y in enumerate(values)])],
@@ -165,7 +164,7 @@ def texts(stream: int) -> list[tuple[str, Attributes]]:
     posture = "standing"
     requests = []
     for _ in range((MINUTES - 1) * TEXTS_PER_MINUTE):
-        # Nobody who stands can stand up, and nobody who lies on the floor types.
+        # A standing person cannot stand up, and a person lying on the floor cannot type.
         fitting = [name for name in names if STARTS.get(name, "standing") in ("standing", posture)]
         name = str(rng.choice(fitting))
         attributes = ACTIONS[name].draw(rng, name)
@@ -177,7 +176,7 @@ def texts(stream: int) -> list[tuple[str, Attributes]]:
 def streamed(
     model: MotionGenerator, requests: Sequence[Sequence[tuple[str, Attributes]]]
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """Returns the joints (B, F, 22, 3) of streams, and how much they move at seams and inside blocks."""
+    """Returns joints (B, F, 22, 3) from streams, and how much they move at seams and inside blocks."""
     prefix, _ = starting_point(model, None)
     first = [request[0][0] for request in requests]
     streams = Streams(
@@ -219,7 +218,7 @@ def seams_of(joints: np.ndarray, seams: np.ndarray) -> dict[str, float]:
 def in_period(
     joints: np.ndarray, fps: float, extractor: MotionCLIPExtractor, real: torch.Tensor
 ) -> dict[str, float]:
-    """Returns the figures of one period of all streams."""
+    """Returns the figures for one period, over all streams."""
     length = round(WINDOW * fps)
     windows = joints.reshape(-1, length, *joints.shape[2:])
     return {
@@ -232,7 +231,7 @@ def in_period(
 
 
 def encoded(extractor: MotionCLIPExtractor, windows: np.ndarray) -> torch.Tensor:
-    """Returns features (N, E) of windows (N, F, 22, 3), independent of world positions and headings."""
+    """Returns the features (N, E) of windows (N, F, 22, 3), which do not depend on world position or heading."""
     representation = HumanML(variant="clean")
     features = torch.stack([representation.encode(torch.from_numpy(w).float()) for w in windows])
     mask = torch.ones(features.shape[:2], dtype=torch.bool)
@@ -241,7 +240,7 @@ def encoded(extractor: MotionCLIPExtractor, windows: np.ndarray) -> torch.Tensor
 
 
 def real_windows(count: int, length: int, fps: float, seed: int) -> np.ndarray:
-    """Returns windows (N, F, 22, 3) of synthetic motions like the training data, which the model has not seen."""
+    """Returns windows (N, F, 22, 3) from unseen synthetic motions that are similar to the training data."""
     source = SyntheticSequences(clips=10 * count, seed=seed)
     rng = np.random.default_rng(seed)
     windows: list[np.ndarray] = []
@@ -265,7 +264,7 @@ def value(metric: FootSkating | Jitter, joints: np.ndarray) -> float:
 def recognized(
     joints: np.ndarray, requests: Sequence[Sequence[tuple[str, Attributes]]], fps: float
 ) -> dict[str, Any]:
-    """Returns how many requested actions are recognized in a window that begins in time, by action."""
+    """Returns how many requested actions are recognized in a window that ends in time, by action."""
     right: dict[str, list[int]] = {}
     for motion, request in zip(joints, requests, strict=True):
         for number, (_, attributes) in enumerate(request):
@@ -293,7 +292,7 @@ def is_shown(motion: np.ndarray, attributes: Attributes, fps: float) -> bool:
 
 
 def page(results: dict[str, Any]) -> str:
-    """Returns the page of the figures."""
+    """Returns the page that shows the figures."""
     low, seams, shown = results["lowest_toe"], results["seams"], results["recognized"]
     ratio = results["jitter_last_minute"] / results["jitter_first_minute"]
     rows = [

@@ -1,6 +1,6 @@
 """Builds the web page that needs no installation, in build/web: `make web`.
 
-The page runs the model of this package in the browser. onnxruntime-web comes from npm at a pinned
+The page runs the model from this package in the browser. onnxruntime-web comes from npm at a pinned
 version.
 """
 
@@ -56,7 +56,7 @@ from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
 
 SOURCE = Path(__file__).with_suffix("")
-# The page of streams, which the demo may share
+# The stream page's files, which the demo also uses
 LIVE = [Path(flame_mdm.demo.__file__).with_name(name) for name in ("live.js", "live.css")]
 RUNTIME, INTEGRITY = (
     "onnxruntime-web@1.30.0",
@@ -64,21 +64,21 @@ RUNTIME, INTEGRITY = (
 )
 """The npm package, and the SHA-512 of its archive."""
 RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
-STREAM = "stream"  # folder of the stream's model, if it is not the model of single motions
+STREAM = "stream"  # folder for the stream's model, if it is not the model for single motions
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
 )
 
 
 def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None = None) -> None:
-    """Writes the page of a model, and the page with a stream.
+    """Writes the page for a model, and the page with a stream.
 
-    The models must have a learned text encoder, captions of single actions and SMPL's 22 joints.
+    The models must have a learned text encoder, captions for single actions and SMPL's 22 joints.
 
     Args:
-        model: the model of single motions.
+        model: the model for single motions.
         out: the folder.
-        streaming: the model of the stream, which continues frames. Default: `model`, if it
+        streaming: the model for the stream, which continues frames. Default: `model`, if it
             continues frames. Otherwise, there is no page with a stream.
 
     Raises:
@@ -97,7 +97,7 @@ def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None =
         shutil.copy(path, out)
     if stream is None:
         (out / "live.html").unlink()
-    # Folder of the stream's model; null = no stream
+    # Folder that contains the stream's model; null = no stream
     write_text(out / "models.js", f"export const STREAM = {json.dumps(stream)};\n")
     write_text(out / "schema.js", f"export const SCHEMA = {json.dumps(SCHEMA)};\n")
     fetch_runtime(out / "ort")
@@ -132,7 +132,7 @@ def check_captions(model: MotionGenerator) -> None:
 
 
 def write_model(model: MotionGenerator, folder: Path) -> None:
-    """Writes the graphs of a model and `model.json`."""
+    """Writes a model's graphs and `model.json`."""
     write_folder(model, folder, half=True)
     (folder / "runner.py").unlink()
 
@@ -189,7 +189,7 @@ def language_constants() -> dict[str, Any]:
 
 
 def write_pictures(out: Path, actions: Sequence[str]) -> None:
-    """Writes the pictures of actions, and their names to `pictures.json`."""
+    """Writes the pictures of actions, and writes their names to `pictures.json`."""
     (out / "pictures").mkdir(exist_ok=True)
     pictures = {}
     for number, action in enumerate(actions):

@@ -7,9 +7,9 @@ The method is model2vec (Tulkens & van Dongen 2024): each word is encoded separa
 components reduce the outputs to `WIDTH` numbers. Words are encoded after "a person", so that a word
 that is both a verb and a noun has the meaning of the verb. This was checked on the most certain
 third of the words for actions. For 83 % of them, the nearest word means the same action; without "a
-person", for 69 %. Frequent words have less weight in a mean of several words (smooth inverse
-frequency, Arora et al. 2017). `flame_mdm.conditions.language.vectors` computes the weight from the
-rank of a word. Vectors have length 1, and 8 bits per number.
+person", this holds for 69 %. Frequent words have less weight in a mean of several words (smooth
+inverse frequency, Arora et al. 2017). `flame_mdm.conditions.language.vectors` computes the weight
+from the rank of a word. Vectors have length 1 and 8 bits per number.
 
 The words are the first `FREQUENT` whole words of BERT's vocabulary, which is sorted by frequency,
 and the words of `actions.yaml`, `phrases.yaml` and `MOTION`. Model and vocabulary are licensed
@@ -69,7 +69,7 @@ def main(out: Path) -> None:
         for name, array in {"words": text, "vectors": quantized}.items():
             buffer = io.BytesIO()
             np.save(buffer, array)
-            # A fixed time, so that the same words and model result in the same bytes
+            # A fixed time, so that the same words and model yield the same bytes
             file.writestr(
                 zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)),
                 buffer.getvalue(),
@@ -81,7 +81,7 @@ def main(out: Path) -> None:
 
 
 def listed(model: Pretrained) -> list[str]:
-    """Returns the words of the table: frequent words by frequency, then words for motion and things."""
+    """Returns the words in the table: frequent words by frequency, then words for motion and things."""
     ranks = model.tokenizer.get_vocab()
     frequent = sorted((word for word in ranks if WORD.fullmatch(word)), key=ranks.__getitem__)[
         :FREQUENT

@@ -27,10 +27,10 @@ POOL = ThreadPoolExecutor(1)
 
 @dataclass
 class Sampled:
-    """A sampled motion of SMPL's joints: positions, rotations and offsets.
+    """A sampled motion for SMPL's joints: positions, rotations and offsets.
 
     Attributes:
-        unknown: words of the sentence that the model does not know.
+        unknown: words in the sentence that the model does not know.
     """
 
     joints: np.ndarray
@@ -151,8 +151,8 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
         armature: the armature.
         name: name of the action.
         motion: the motion.
-        own: whether `new_armature` created the armature. If so, every joint gets its position in
-            the motion.
+        own: whether `new_armature` created the armature. If so, every joint is moved to its
+            position in the motion.
     """
     pose, size = read_armature(armature)
     if own:
@@ -215,7 +215,7 @@ class Settings(bpy.types.PropertyGroup):
         ),
         "seconds": FloatProperty(name="Seconds", default=3, min=0.1, step=10, precision=1),
         "seed": IntProperty(
-            name="Seed", description="Another seed gives another motion", default=0
+            name="Seed", description="A different seed gives a different motion", default=0
         ),
         "in_place": BoolProperty(
             name="In place", description="Leave out the path of the hips over the floor"

@@ -10,7 +10,7 @@ const TYPES = {
   number: Number.isFinite,
 };
 
-export function faults(value, schema, name = "") { // dotted names of values that a JSON schema refuses
+export function faults(value, schema, name = "") { // dotted names of values that a JSON schema rejects
   const { type, minimum, maximum, pattern, minItems = 0, maxItems, items, properties = {}, required } = schema;
   if (!TYPES[type](value)) return [name];
   if (minimum !== undefined && !(minimum <= value && value <= maximum)) return [name];
@@ -39,7 +39,7 @@ export function check(content) { // throws an error if the page cannot sample wi
   if (wrong.length) throw new Error(`model.json is damaged: ${wrong.join(", ")}`);
 }
 
-const LONGEST = 600; // seconds of a motion of a model that continues frames
+const LONGEST = 600; // maximum length in seconds for a model that continues frames
 
 export function longestOf({ fps, max_frames: longest, start }) { // frames
   return start ? Math.round(LONGEST * fps) : longest;

@@ -1,5 +1,5 @@
-// FBX: the person of template.fbx with another animation. flame_mdm/formats/fbx_writer.py wrote the template, binary FBX
-// 7.4 in centimeters; what each program needs is explained there. The rest of the file is copied as it is.
+// FBX: the person in template.fbx with another animation. flame_mdm/formats/fbx_writer.py wrote the template, binary FBX
+// 7.4 in centimeters, and explains what each program needs. The rest of the file is copied unchanged.
 // A record is { name, properties, children }. Properties are encoded values; children are null if there is no list.
 import { angles, localRotations } from "./figure.js";
 
@@ -45,7 +45,7 @@ function linked(figure, objects, connections) {
   return { byId, joints, targets };
 }
 
-// Gives the skeleton and the skin the motion's bone lengths, also in the pose in which the skin is bound: Blender connects
+// Gives the skeleton and the skin the motion's bone lengths, including in the bind pose of the skin: Blender connects
 // bones in this pose, and connected bones cannot move.
 async function resize(figure, motion, { byId, joints }) {
   const records = [...byId.values()];
@@ -70,8 +70,8 @@ async function resize(figure, motion, { byId, joints }) {
   first(geometry, "Vertices").properties = [doubles(vertices)];
 }
 
-// Changes the pose; returns matrices in the world by joint, and how far the joints move. The last four of the 16 numbers of
-// a matrix hold its translation.
+// Changes the pose; returns world matrices by joint, and how far the joints move. The last four of the 16 numbers in a
+// matrix are its translation.
 async function boundPose(figure, motion, pose, joints) {
   const matrices = [], shifts = [];
   for (const node of pose.children.filter(({ name }) => name === "PoseNode")) {

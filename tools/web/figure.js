@@ -8,7 +8,7 @@ function times([a, b, c, d], [w, x, y, z]) {
   return [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w];
 }
 
-// Rotations in the world of the mannequin's 22 joints in a frame: its soles are flat, its head level, its toes bend on the floor.
+// World rotations of the mannequin's 22 joints in a frame: its soles are flat, its head is level, its toes bend on the floor.
 function posed(figure, { joints, quaternions }, frame) {
   const world = [], { toes: [near, far, most], parents } = figure;
   for (const [j, parent] of parents.entries()) {
@@ -46,7 +46,7 @@ export function angles([w, x, y, z], before) {
   return choices[other < distance ? 1 : 0];
 }
 
-export function shown(figure, motion) { // the motion as data of the player
+export function shown(figure, motion) { // the motion as data for the player
   const { joints, frames } = motion, ends = [0, 1, 2].map((k) => joints.filter((_, i) => i % 3 === k)).map((c) => [c.reduce((a, b) => Math.min(a, b)), c.reduce((a, b) => Math.max(a, b))]);
   const center = ends.map(([least, most]) => (least + most) / 2), step = Math.max(0.001, ...ends.map(([least, most]) => (most - least) / 65534));
   const turns = new Uint32Array(frames * figure.stored.length);
@@ -87,7 +87,7 @@ export function bvh(figure, { joints, quaternions, offsets, frames }, fps) { // 
   return `HIERARCHY\n${hierarchy(0, "")}MOTION\nFrames: ${frames}\nFrame Time: ${(1 / fps).toFixed(8)}\n${lines.join("\n")}\n`;
 }
 
-export function glb(figure, template, motion, fps, text) { // the mannequin of template.glb with another animation
+export function glb(figure, template, motion, fps, text) { // the mannequin in template.glb with another animation
   const view = new DataView(template), size = view.getUint32(12, true), begin = 20 + size + 8;
   const document = JSON.parse(new TextDecoder().decode(new Uint8Array(template, 20, size))), parts = [new Uint8Array(template, begin, document.buffers[0].byteLength)];
   let end = parts[0].length;

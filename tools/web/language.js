@@ -1,16 +1,16 @@
-// What was understood of a text, as chips: flame_mdm/demo/chips.py in JavaScript. language_words.js,
+// The recognized meaning of a text, as chips: flame_mdm/demo/chips.py in JavaScript. language_words.js,
 // language_sentences.js and language_reading.js understand the text.
 import { download, json } from "./sampling.js";
 import { actions, constant, useTables } from "./language_words.js";
 import { mentionsOf, understand } from "./language_sentences.js";
 import { Reader, attributeWords, caption, predicate } from "./language_reading.js";
 
-/** Returns the tables of the language, the vectors of its words, and the names of the pictures. */
+/** Returns the language tables, the word vectors, and the names of the pictures. */
 export function languageFiles() {
   return Promise.all([json("language.json"), download("language.bin"), json("pictures.json")]);
 }
 
-/** Returns the reader of a model, and a function that returns the picture of the action in a caption. */
+/** Returns the reader for a model, and a function that returns the picture for the action in a caption. */
 export function openLanguage(model, [tables, bytes, pictures]) {
   useTables(tables, bytes);
   const picture = (text) => {
@@ -44,7 +44,7 @@ export function chips(abilities, { steps, ignored }, choose) {
   return [...rows, ...crossed];
 }
 
-/** Returns the chips of an action; `changed` returns the text with another action. */
+/** Returns the chips for an action; `changed` returns the text with another action. */
 function selects(abilities, mention, changed, choose) {
   const names = [mention.action, ...abilities.actions.filter((name) => name !== mention.action)];
   const others = names.map((name) => [changed(withAction(mention, name)), actionLabel(name)]);
@@ -60,7 +60,7 @@ function selects(abilities, mention, changed, choose) {
   return listed;
 }
 
-/** Returns the words for an action without the usual direction, which a chip beside it may contradict. */
+/** Returns the words for an action without its usual direction, which another chip may contradict. */
 function actionLabel(action) {
   const words = predicate({ action });
   const usual = ` ${actions().get(action).usual}`;

@@ -29,7 +29,7 @@ export function predicate({ action, attributes = {} }) {
 
 const times = (count) => lookUp("times", count) ?? `${count} times`;
 
-/** Returns the caption of actions at the same time: "a person walks forward while waving". */
+/** Returns the caption for simultaneous actions: "a person walks forward while waving". */
 export function caption(step) {
   const [first, ...others] = step.map(predicate);
   return [`${constant("who")} ${first}`, ...others.map(participle)].join(" while ");
@@ -66,7 +66,7 @@ export class Abilities {
     this.actions = this.listed(names);
   }
 
-  /** Whether some caption of the model has two actions at the same time. */
+  /** Whether any caption of the model describes two simultaneous actions. */
   get isSimultaneous() {
     this.simultaneous ??= this.captions
       .filter((text) => text.includes(" while ") || text.includes(" at the same time"))
@@ -90,7 +90,7 @@ export class Abilities {
     return words.every((word) => this.vocabulary.has(word));
   }
 
-  /** Returns whether the model knows a value of an attribute of an action. */
+  /** Returns whether the model knows a value for an attribute of an action. */
   supports(action, name, value) {
     const key = JSON.stringify([action, name, value]);
     if (!this.supported.has(key)) this.supported.set(key, this.states(action, name, value));
@@ -121,7 +121,7 @@ export class Abilities {
       .filter(([, values]) => values.length);
   }
 
-  /** Returns the actions that the model knows, ordered by how near their meaning is. */
+  /** Returns the actions that the model knows, nearest meaning first. */
   ranked(action) {
     const scores = new Map(this.actions.map((other) => [other, similarity(action, other)]));
     return [...this.actions].sort((one, other) => scores.get(other) - scores.get(one));
@@ -138,7 +138,7 @@ export class Abilities {
 
 // ---- what a model reads ----
 
-/** A sentence that is refused; `nearest` are captions with similar meanings. */
+/** A sentence that is rejected; `nearest` contains captions with similar meanings. */
 export class NotUnderstood extends Error {
   constructor(message, nearest = []) {
     super(message);
@@ -146,7 +146,7 @@ export class NotUnderstood extends Error {
   }
 }
 
-/** Reads sentences for a model whose captions name one of a list of actions each. */
+/** Reads sentences for a model in which every caption names one of a list of actions. */
 export class Reader {
   constructor(facts) {
     this.abilities = new Abilities(facts);
@@ -231,7 +231,7 @@ export class Reader {
     return like ? [like.action, like.attributes] : [undefined, {}];
   }
 
-  /** Returns the step, or its actions one after the other if the model knows no actions at the same time. */
+  /** Returns the step, or its actions one after the other if the model does not know simultaneous actions. */
   possible(step, notes) {
     const several = distinctActions(step);
     if (several.length === 1 || this.abilities.isSimultaneous) return [several];
@@ -284,13 +284,13 @@ function joinedSteps(steps, names) {
   return joined;
 }
 
-/** Returns the caption of a step: the words of the sentence if the model knows one that no table explains. */
+/** Returns the caption for a step: the words of the sentence if the model knows one that no table explains. */
 function captionOf(step, words, special) {
   const isSpecial = words.toLowerCase().split(/\s+/u).some((word) => special.has(word));
   return isSpecial ? words : caption(step);
 }
 
-/** Returns a sentence without "in limp style" at its end, which adapters teach, and that ending. */
+/** Returns a sentence without a final "in limp style", which adapters teach, and this ending. */
 function withoutStyle(text) {
   const trimmed = text.replace(/[ .]+$/, "");
   const at = trimmed.lastIndexOf(" in ");

@@ -38,7 +38,7 @@ export function understand(text) {
 
 export const mentionsOf = (understood) => understood.steps.flat();
 
-/** Returns whether a word is in a table of words that are no actions. */
+/** Returns whether a word is in a table of words that are not actions. */
 function isExplained(word) {
   if (isNumber(word) || word === "x" || numbersOf("numbers").has(word) || numbersOf("times").has(word)) return true;
   if (wordValues("direction").has(word) || wordValues("speed").has(word)) return true;
@@ -85,7 +85,7 @@ function matchOf(phrase, used, weak) {
   return { phrase, used, isWeak: weak, first: used[0], last: used.at(-1) };
 }
 
-/** Returns the positions of the words of a phrase from a token on; undefined if they are not there. */
+/** Returns the positions of a phrase's words from a token on; undefined if they are not there. */
 function matchAt(tokens, start, words) {
   if (!words.length) return [];
   if (words[0] === GAP) {
@@ -168,7 +168,7 @@ function connectorAt(tokens, number) {
   });
 }
 
-/** Returns clauses with an action each; words without an action belong to the clause before, or after if first. */
+/** Returns clauses with one action each; words without an action belong to the previous clause, or to the next if first. */
 function joinedClauses(clauses) {
   const merged = [];
   let waiting = [];
@@ -362,7 +362,7 @@ function numberOf(digits) {
 
 // ---- the sentence ----
 
-/** The actions of a sentence, from its tokens and the phrases for actions in them. */
+/** The actions in a sentence, from its tokens and the phrases for actions in them. */
 class Sentence {
   constructor(text, tokens, matches) {
     Object.assign(this, { text, tokens });
@@ -375,7 +375,7 @@ class Sentence {
     this.clauses = joinedClauses(clauses);
   }
 
-  /** Returns the actions in their order. */
+  /** Returns the actions in order. */
   steps() {
     let steps = [];
     let during = []; // "While walking," before the clause that it belongs to
@@ -504,7 +504,7 @@ class Sentence {
     };
   }
 
-  /** Returns the action before with the attributes of a clause without an action: "then faster". */
+  /** Returns the previous action with the attributes from a clause without an action: "then faster". */
   again(clause, steps) {
     if (steps.at(-1)?.length !== 1) return [];
     const [before] = steps.at(-1);
@@ -516,7 +516,7 @@ class Sentence {
     return [[{ ...stating(before, stated), text, typed: "" }]];
   }
 
-  /** Returns whether a clause says what happens during the one before: "stands still, waving". */
+  /** Returns whether a clause says what happens during the previous clause: "stands still, waving". */
   isManner(clause, steps) {
     if (clause.link || !clause.afterComma || !clause.matches.length) return false;
     const [before] = steps.at(-1);
@@ -547,7 +547,7 @@ function isSame(step, other) {
   return Object.keys(first).every((name) => !(name in second) || first[name] === second[name]);
 }
 
-/** Returns a step without "stands still", if another action happens at the same time, and without repetitions. */
+/** Returns a step without "stands still", if another action happens at the same time, and without duplicates. */
 function withoutIdle(step) {
   const moving = step.filter((mention) => mention.action !== "idle");
   return distinctActions(moving.length ? moving : step.slice(0, 1));

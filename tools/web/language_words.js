@@ -12,7 +12,7 @@ const listOf = (text) => text.split(WORDS_AND_SPACES).filter(Boolean);
 const distinct = (values) => [...new Set(values)];
 const byCodePoint = (words) => [...words].sort();
 
-/** Takes the tables of the language. `bytes` has vectors of 8-bit numbers, then the words, one per line. */
+/** Sets the language tables. `bytes` contains vectors of 8-bit numbers, then the words, one per line. */
 export function useTables(content, bytes) {
   tables = content;
   cached = new Map();
@@ -24,7 +24,7 @@ export function useTables(content, bytes) {
   tables.numbers = new Int8Array(bytes, 0, size);
 }
 
-/** Returns the value that a function computes, computed once per key. */
+/** Returns the value of a function, computed only once per key. */
 export function once(key, compute) {
   if (!cached.has(key)) cached.set(key, compute());
   return cached.get(key);
@@ -33,12 +33,12 @@ export function once(key, compute) {
 export const constant = (name) => tables.constants[name];
 export const phrases = () => tables.phrases;
 
-/** Returns the words of a list in `phrases.yaml`. */
+/** Returns the words in a list in `phrases.yaml`. */
 export function wordsOf(...keys) {
   return once(`words of ${keys}`, () => new Set(listOf(keys.reduce((entry, key) => entry[key], phrases()))));
 }
 
-/** Returns the value that each word of a table states: wordValues("speed").get("slowly") is "slow". */
+/** Returns the value that each word in a table states: wordValues("speed").get("slowly") is "slow". */
 export function wordValues(key) {
   return once(`values of ${key}`, () => {
     const rows = Object.entries(phrases()[key]);
@@ -46,7 +46,7 @@ export function wordValues(key) {
   });
 }
 
-/** Returns the number that each word of a table means, such as "numbers". */
+/** Returns the number that each word in a table means, such as "numbers". */
 export function numbersOf(key) {
   return once(`numbers of ${key}`, () => new Map(Object.entries(phrases()[key])));
 }
@@ -162,7 +162,7 @@ export function distance(first, second, most) {
 
 const sortedLetters = (word) => [...word].sort().join("");
 
-/** Returns the words of the tables that a misspelled word may mean, all equally near; [] if none is near. */
+/** Returns the words in the tables that a misspelled word may mean, all equally near; [] if none is near. */
 export function corrections(word) {
   return once(`corrections of ${word}`, () => {
     const shortest = constant("never_corrected");
@@ -295,7 +295,7 @@ function ranked(vector) {
   return rows.sort((one, other) => other[1] - one[1]);
 }
 
-/** Returns the vectors of the single words of each action, and their mean. */
+/** Returns the vectors of the single words for each action, and their mean. */
 function actionVectors() {
   return once("action vectors", () => {
     const vectors = new Map();
@@ -341,7 +341,7 @@ function isKnown(word) {
   return baseForms(word).some((form) => has(form) && (form === word || form.length > 3));
 }
 
-/** Returns whether a sentence is in another language than English. */
+/** Returns whether a sentence is in a language other than English. */
 export function isForeign(tokens) {
   const words = tokens.filter((token) => token.isWord).map((token) => token.word);
   if (!words.length) return false;
@@ -363,7 +363,7 @@ function isEnglish(word) {
   return baseForms(word).some((form) => listedWords().has(form)) || corrections(word).length > 0;
 }
 
-/** Returns the tokens with typos corrected: unknown words for which few similar words come into question. */
+/** Returns the tokens with typos corrected: unknown words with only a few similar candidates. */
 export function corrected(tokens) {
   return tokens.map((token) => {
     if (!token.isWord || isKnown(token.word)) return token;
@@ -389,7 +389,7 @@ export function correctedToAction(tokens, free) {
   return tokens;
 }
 
-/** Returns the words of all tables, with the forms of verbs and nouns. */
+/** Returns the words in all tables, with the forms of verbs and nouns. */
 function listedWords() {
   return once("listed words", () => {
     const words = new Set(actionWords());

@@ -1,8 +1,8 @@
-// The page of a stream that is sampled on the visitor's device.
+// The page for a stream that is sampled on the visitor's device.
 import { Live } from "./live.js";
 import { languageFiles, openLanguage } from "./language.js";
 
-const WALK = "a person walks forward"; // what the person does on the path to a waypoint
+const WALK = "a person walks forward"; // what the person does on the way to a waypoint
 
 const worker = new Worker("live_worker.js", { type: "module" }), waiting = new Map();
 worker.addEventListener("message", ({ data: { id, result, error } }) => {
@@ -36,7 +36,7 @@ const source = {
   file: (ending) => call("file", { ending }),
 };
 
-/** Returns the caption that the model has for walking; null if it has none, or if its path cannot bend. */
+/** Returns the model's caption for walking; null if there is none, or if the model's path cannot bend. */
 function walking(read, content) {
   try {
     return content.root ? read(WALK) : null;

@@ -1,4 +1,4 @@
-// The page: form, player, downloads, and a link that holds the request.
+// The page: form, player, downloads, and a link that contains the request.
 import { Sampler, json, words } from "./sampling.js";
 import { longestOf } from "./check.js";
 import { STREAM } from "./models.js";
@@ -46,7 +46,7 @@ function understood(text) {
   return reading;
 }
 
-/** Shows why a text is refused, and the actions with the nearest meanings. */
+/** Shows why a text is rejected, and the actions with the nearest meanings. */
 function refuse(error) {
   const { message, nearest } = error;
   say(nearest.length ? `${message}. Nearest in meaning:` : message, "error");
@@ -63,7 +63,7 @@ async function generate() {
   element("understood").inert = true;
   try {
     const reading = understood(text);
-    // A single action has the noise that `flame_mdm.generate` draws for the text as typed.
+    // A single action uses the noise that `flame_mdm.generate` draws for the text as typed.
     const shownText = reading.captions.length === 1 ? text : reading.texts[0];
     const [read] = reading.captions;
     const begin = performance.now();

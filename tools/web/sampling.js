@@ -1,4 +1,4 @@
-// Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed give the same motion.
+// Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed yield the same motion.
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { check, frameCount } from "./check.js";
 import { bends, reached } from "./waypoints.js";
@@ -124,7 +124,7 @@ export class Sampler {
     return x.slice(0, frames * features);
   }
 
-  // Normalized features (padded * D) of frames that are sampled together, from noise of a key. `guide` changes clean estimates.
+  // Normalized features (padded * D) of frames that are sampled together, from the noise for a key. `guide` changes clean estimates.
   async sample(text, padded, frames, key, more = {}, progress = () => {}, guide = () => {}) {
     const { features, steps, clip_x0: clip, buckets, max_words: most } = this.content;
     const seen = new Set(this.content.vocabulary);
@@ -169,7 +169,7 @@ export class Sampler {
 
 const HELD = 4; // blocks that can be replaced
 
-// A motion without an end: flame_mdm/sampling/streams.py in JavaScript. Frames that were not shown yet can be replaced.
+// An endless motion: flame_mdm/sampling/streams.py in JavaScript. Frames that have not been shown yet can be replaced.
 export class Stream {
   constructor(sampler, seed, name) {
     const { start, max_frames: longest, features } = sampler.content;
@@ -191,7 +191,7 @@ export class Stream {
     return x;
   }
 
-  // Joints of the next block in the world, which leads to waypoints, and the numbers of the frames that reach them.
+  // World joints of the next block, which leads to waypoints, and the numbers of the frames that reach them.
   async block(text, points = [], progress = undefined) {
     const { width, world: before, frames } = this, last = this.prefix.slice(-width);
     const guide = points.length ? await this.#guide(points) : undefined;
@@ -216,7 +216,7 @@ export class Stream {
     };
   }
 
-  // Heading and place of the root in the first frame of the next block: one step after the last frame.
+  // Heading and position of the root in the first frame of the next block: one step after the last frame.
   async #start() {
     const { width, world, sampler } = this, last = this.prefix.slice(-width), [[mean, std]] = sampler.content.root;
     if (!world) return { heading: 0, place: [0, 0] };
@@ -225,7 +225,7 @@ export class Stream {
     return { heading: turnTo(joints.subarray(0, one), world).turn + mean + std * last[0], place: [next[0], next[2]] };
   }
 
-  // Drops the frames from a frame on: the next block continues the frames before.
+  // Drops the frames from a frame on: the next block continues the frames before it.
   goBack(frame) {
     if (frame === this.frames) return;
     while (this.blocks.length && this.blocks.at(-1).begin >= frame) this.blocks.pop();
@@ -259,7 +259,7 @@ function joined(before, x, width, fade) {
   return moved;
 }
 
-// The turn about the vertical that moves a pose to a pose of the world, and the centers of both.
+// The turn about the vertical that moves a pose to a pose in the world, and the centers of both.
 function turnTo(pose, world) {
   const mean = (joints, k) => joints.reduce((sum, value, i) => (i % 3 === k ? sum + value : sum), 0) / (joints.length / 3);
   const [ax, az, bx, bz] = [mean(pose, 0), mean(pose, 2), mean(world, 0), mean(world, 2)];
@@ -272,7 +272,7 @@ function turnTo(pose, world) {
   return { turn: Math.atan2(sine, cosine), from: [ax, az], to: [bx, bz] };
 }
 
-// Joints of frames whose first one is moved, about the vertical and over the floor, to a pose of the world.
+// Joints of frames whose first frame is moved, about the vertical and over the floor, to a pose in the world.
 function inPlace(joints, one, world) {
   const { turn, from: [ax, az], to: [bx, bz] } = turnTo(joints.subarray(0, one), world), [s, c] = [Math.sin(turn), Math.cos(turn)];
   const placed = new Float32Array(joints);

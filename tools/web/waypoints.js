@@ -1,7 +1,7 @@
 // Bends the path of a stream toward waypoints on the floor: flame_mdm/sampling/waypoints.py in JavaScript, with the same numbers.
 export const NEAR = 0.3; // meters from the root at which a waypoint is reached
 const FASTEST = 1.3; // radians per second
-const TIGHTEST = 0.7; // meters, the least radius of a bend
+const TIGHTEST = 0.7; // meters, the minimum radius of a bend
 const ROOM = 1.2; // a waypoint inside a circle larger by this factor is approached from farther away
 const PATIENCE = 0.4; // seconds
 const SMOOTHING = 0.3; // share of a frame in the average of steps

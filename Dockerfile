@@ -1,14 +1,14 @@
-# The versions of constraints.txt. Build and use: docs/clusters.md.
+# Installs the versions in constraints.txt. Build and use: docs/clusters.md.
 #   docker build -t flame-mdm .
 #   docker build -t flame-mdm:cpu --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu .
 #   docker build -t flame-mdm --build-arg BASE=python:3.11-slim-bookworm@sha256:... .  (docker buildx imagetools inspect)
 ARG BASE=python:3.11-slim-bookworm
 FROM $BASE
 
-# PyPI has torch for CUDA, whose libraries come with it.
+# PyPI has torch for CUDA, which includes the CUDA libraries.
 ARG TORCH_INDEX=https://pypi.org/simple
 
-# Compiled kernels of torch.compile need a C compiler.
+# Kernels compiled by torch.compile need a C compiler.
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends gcc libc6-dev \
@@ -16,8 +16,8 @@ RUN apt-get update \
 
 WORKDIR /flame_mdm
 COPY constraints.txt ./
-# The index of torch holds packages of other names in other versions, so it is asked for torch alone. What torch needs
-# is installed below, from PyPI.
+# The torch index contains other versions of unrelated packages, so only torch is installed from it. The packages that
+# torch needs are installed from PyPI below.
 RUN pip install --no-cache-dir --no-deps -c constraints.txt --index-url "$TORCH_INDEX" torch
 COPY pyproject.toml README.md LICENSE ./
 COPY flame_mdm flame_mdm

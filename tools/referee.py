@@ -11,7 +11,7 @@ other half. Sums over both halves are "crossed": each half is judged with the th
 other half. Procedural motions set no thresholds, and have separate figures.
 
 A claim in a caption counts as true for its motion. A falsified claim counts as false. It states
-another side, direction or speed, one repetition more or fewer, the reverse order, another duration,
+another side, direction or speed, one repetition more or less, the reverse order, another duration,
 or the other end of the motion. Captions are sometimes wrong, and the figures include their errors.
 
 Captions hardly ever state durations. If the captions of a recording only state that the body walks,

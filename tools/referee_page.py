@@ -21,7 +21,7 @@ this folder.
 
 The thresholds were set on one half of the recordings, and these figures were measured on the other half. Each claim in
 the caption of a motion counts as true. Falsified claims count as false. They state the other side, direction or speed,
-one repetition more or fewer, the reverse order, another duration, or the other end of the motion. A wrong caption
+one repetition more or less, the reverse order, another duration, or the other end of the motion. A wrong caption
 counts as an error by the referee. We corrected patterns and measurements after we had seen errors on both halves, so
 expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as kicking with both
 legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the CMU claims would be
@@ -122,8 +122,8 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         "Captions hardly ever state a duration, a start or an end, so these claims were constructed instead. If the",
         "captions of a recording only state that the body walks, runs or stands still, the recording is cut to two,",
         "three and four seconds. Falsified claims state twice or half the duration. In recordings of walks, the person",
-        "is assumed to stand upright at the start and at the end. Claims that the person lies at the start or at the",
-        "end are therefore used as falsified claims. The other tables do not contain these claims.",
+        "is assumed to be standing upright at the start and at the end. Claims that the person is lying at the start",
+        "or at the end are therefore used as falsified claims. The other tables do not contain these claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",

@@ -51,8 +51,8 @@ INTRODUCTION = """# Long streams, measured
 
 [Streams](../streams.md) explains how a stream works. `python tools/stream_drift.py {model}` computes the figures.
 
-{streams} streams of {minutes} minutes each receive a new text every ten seconds, {texts} texts in total. The texts are
-captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both can be
+{streams} streams of {minutes} minutes each receive a new text every ten seconds, {texts} texts per stream. The texts
+are captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both can be
 compared. No frame is cleaned up.
 
 ## Drift

@@ -20,6 +20,7 @@ from sections import QUIET, Section, Settings, ratios, section, show
 CLIPS = 16  # number of clips per step
 SMALL = [
     "data.source.clips=60",
+    "condition.pretrain_steps=0",
     "denoiser.latent_dim=128",
     "denoiser.ff_size=256",
     "denoiser.num_layers=4",

@@ -25,6 +25,7 @@ TINY = [
     "denoiser.num_layers=1",
     "denoiser.num_heads=2",
     "condition.features=16",
+    "condition.pretrain_steps=0",
     "process.num_train_timesteps=10",
     "task.num_inference_steps=5",
     "trainer.accelerator=cpu",

@@ -34,7 +34,7 @@ from flame_mdm.training.speed import accelerate
 WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens per caption
 # Rounds of the full-size step. All implementations train on each batch in turn, twice.
-ROUNDS, BATCHES = 2, 8
+ROUNDS, BATCHES = 2, 6
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
     "MDM, decoder": ["synthetic/mdm_decoder"],
@@ -213,6 +213,7 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
             f"data_root={name}/data",
             f"data.source.clips={clips}",
             f"trainer.max_steps={steps}",
+            "condition.pretrain_steps=0",
         ]
         words.append(f"trainer.log_every_n_steps={max(1, steps // 15)}")
         for speed in SPEEDS * rounds:

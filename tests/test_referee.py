@@ -55,6 +55,9 @@ FPS = 20.0
         ("walks back to where he started", ["walk", "return place"]),
         ("stands still for about five seconds", ["stand still", "stand still: for 5 s"]),
         ("dances kicking his legs", ["kick"]),
+        ("a woman sneaks and takes a sip left-handed", ["walk", "hand to head"]),
+        ("a guy walks while drunk", ["walk"]),
+        ("raises both hands over their head", ["raise hand: both", "hand above head: both"]),
         ("holds still for a moment at the end of the road", []),
     ],
 )  # fmt: skip
@@ -333,6 +336,21 @@ def test_the_start_is_told_from_the_end(subtests):
             assert last - first == pytest.approx(0.6)
     always = Motion(np.repeat(motion.joints[-1:], 60, 0), FPS)
     assert answers(always, text)[claim] == "cannot tell"
+
+
+def test_a_change_of_height_that_cannot_be_seen_is_left_undecided(subtests):
+    squat = synthetic("squat").joints
+    lowest = int(squat[:, 0, 1].argmin())
+    crouched = Motion(np.repeat(squat[lowest : lowest + 1], 40, axis=0), FPS)
+    low, again = "a person crouches down", "a person bends forward and stands up again"
+    for motion, text, kind, answer in (
+        (crouched, low, "get down", "cannot tell"),
+        (synthetic("stand"), low, "get down", "no"),
+        (synthetic("bow"), again, "stand up", "cannot tell"),
+        (synthetic("stand"), again, "stand up", "no"),
+    ):
+        with subtests.test(kind=kind, answer=answer):
+            assert answers(motion, text)[kind] == answer
 
 
 def test_a_body_that_walks_off_has_not_returned_to_its_start():

@@ -1,5 +1,7 @@
 """Measurements of postures, and of contacts between parts of the body. `kinds.py` lists them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from flame_mdm.representations.skeleton import SMPL22
@@ -24,6 +26,12 @@ SIDES = ("left", "right")
 MOVING = 0.25
 # Height of the pelvis of a standing body of the usual size, in meters
 STANDING = 0.9
+# Smallest change in height, in meters, that counts as standing up or getting down without doubt
+RISE = 0.25
+# Distance in meters below `STANDING` at which the pelvis of a body that has already crouched begins
+LOW = 0.1
+# Change of the angle of the trunk, in degrees, by which a person straightens up
+STRAIGHTENED = 30
 
 
 def thighs(body: Body) -> np.ndarray:
@@ -95,13 +103,26 @@ def hand_down(body: Body, claim: Claim) -> Reading:
 
 
 def stand_up(body: Body, claim: Claim) -> Reading:
-    """Measures the largest rise of the pelvis."""
-    return _change(body.height[:, PELVIS])
+    """Measures the largest rise of the pelvis.
+
+    A person who straightens up after a bow also "stands up", so that claim is left undecided.
+    """
+    reading = _change(body.height[:, PELVIS])
+    straightened = _change(-body.tilt)
+    if reading.score < RISE and straightened.score > STRAIGHTENED:
+        return replace(reading, score=np.nan)
+    return reading
 
 
 def get_down(body: Body, claim: Claim) -> Reading:
-    """Measures the largest descent of the pelvis."""
-    return _change(-body.height[:, PELVIS])
+    """Measures the largest descent of the pelvis.
+
+    If the body is low from the beginning, the claim is left undecided.
+    """
+    reading = _change(-body.height[:, PELVIS])
+    if reading.score < RISE and STANDING - body.height[0, PELVIS] > LOW:
+        return replace(reading, score=np.nan)
+    return reading
 
 
 def _change(signal: np.ndarray) -> Reading:

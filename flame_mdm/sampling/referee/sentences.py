@@ -255,7 +255,7 @@ def _way(text: str) -> str | None:
     ways = set()
     for match in re.finditer(r"\b(left|right|clockwise|counterclockwise)\b", text):
         after = text[match.end() :].split()[:1]
-        if after and re.fullmatch(rf"(?:{_sided_words()})s?", after[0]):
+        if after and re.fullmatch(rf"(?:{_sided_words()})(?:s|ed)?", after[0]):
             continue
         ways.add(match[1])
     if "bothsides" in text or "sidetoside" in text:

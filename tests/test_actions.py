@@ -104,7 +104,7 @@ def test_anything_else_is_refused_before_it_runs(named: str, tmp_path: Path, sub
         with subtests.test(protocol=protocol):
             path = written(tmp_path / "x.pkl", ATTACKS[named](tmp_path / "run"), protocol)
             with pytest.raises(
-                ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}"
+                ValueError, match=rf"x\.pkl: cannot be read as a pickle: it refers to .*{named}"
             ) as error:
                 restricted_pickle.read(path)
             assert "\n" not in str(error.value)
@@ -261,9 +261,9 @@ def test_smpls_offsets_come_from_its_file_without_running_code(
     for path in paths:
         with subtests.test(path=path.name):
             np.testing.assert_allclose(load_offsets(path), offsets)
-            with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
+            with pytest.raises(ValueError, match=r"it refers to (scipy|copy_?reg)"):
                 restricted_pickle.read(path)
-    attack, wrong = Attack(os.mkdir, str(tmp_path / "run")), "not a SMPL model of 24 joints"
+    attack, wrong = Attack(os.mkdir, str(tmp_path / "run")), "not an SMPL model with 24 joints"
     wrongs = {"J_regressor": np.ones((52, 50)), "v_template": 3, "kintree_table": np.zeros((2, 24))}
     for name, value, message in (
         ("v_template", attack, "not read as"),

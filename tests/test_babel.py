@@ -93,7 +93,7 @@ def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
         "transitions": 21,
         "labels that end before they start": 42,
         "labels without a time": 21,
-        "labels too near to the end of the motion": 21,
+        "labels too close to the end of the motion": 21,
         "labels that reach past the motion": 21,
         "labels without a frame": 21,
     }
@@ -135,7 +135,7 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     assert len({(window.label.motion, window.split) for window in source.windows}) == 60, (
         "a motion in two splits"
     )
-    assert source.excluded == {"labels of the val part on motions of the train part": 1}
+    assert source.excluded == {"labels in the val part for motions in the train part": 1}
     flames = Counter(
         w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows
     )

@@ -102,7 +102,7 @@ def test_clips_have_their_motion_captions_and_splits(folder, subtests):
     }
     assert clips["M000002@0.5-2.75"].captions == ["the right arm swings"]
     assert clips["kit00001"].source != clips["000002"].source
-    assert store.info["excluded"] == {"clips of HumanML3D without their recording": 1}
+    assert store.info["excluded"] == {"HumanML3D clips whose recording is missing": 1}
     assert store.info["counts"]["clips of HumanML3D"] == 3
     recording = asf.read(folder / "motions/02/02_02.amc", 120)
     tree, fields = cmu.standardize(recording)
@@ -253,7 +253,7 @@ def test_captions_of_ones_own(folder, capsys):
         "swing",
         "dance",
     ]
-    assert store.info["excluded"]["parts in captions.csv without their recording"] == 1
+    assert store.info["excluded"]["parts in captions.csv whose recording is missing"] == 1
     assert clips["02_01"].split == "train"
     assert clips["60_01"].length > 100, "60 frames per second, without the T-pose"
     tree, fields = cmu.standardize(asf.read(folder / "motions/02/02_02.amc", 120))
@@ -274,17 +274,17 @@ def test_captions_of_ones_own(folder, capsys):
         ),
         (
             "02_01,3,1,a,b,",
-            "captions.csv, line 2: begin '3', end '1': expected the beginning and the end of a part, in seconds",
+            "captions.csv, line 2: begin '3', end '1': expected times in seconds, with 0 <= begin < end",
         ),
-        ("02_01,x,1,a,b,", "begin 'x', end '1': not numbers of seconds"),
-        ("02_01,nan,1,a,b,", "begin 'nan', end '1': not numbers of seconds"),
+        ("02_01,x,1,a,b,", "begin 'x', end '1': not times in seconds"),
+        ("02_01,nan,1,a,b,", "begin 'nan', end '1': not times in seconds"),
         ("02_01,,,a,b,tset", "captions.csv, line 2: unknown split 'tset'"),
         ("02_01,,,,b,\n02_02,,,a,b,", "1 of 2 parts have no text, such as 02_01"),
         (
             "02_01,,,a,b,\n02_01,,,a,c,",
-            "captions.csv, line 3: 02_01 has two values of split, source or action",
+            "captions.csv, line 3: 02_01 has conflicting values for split, source or action",
         ),
-        ("99_01,,,a,b,", "no captions of the recordings in"),
+        ("99_01,,,a,b,", "no captions for the recordings in"),
     ],
 )
 def test_faults_in_captions_of_ones_own_are_named(row: str, message: str, folder):
@@ -296,7 +296,7 @@ def test_faults_in_captions_of_ones_own_are_named(row: str, message: str, folder
 def test_wrong_folders_get_one_line(folder, subtests):
     for path, captions, message in [
         ("none", "clone", "contains no recording such as 02_01.bvh or 02_01.amc; clone https"),
-        ("motions", "none", "none: not found; it is the folder of the captions"),
+        ("motions", "none", "none: not found; it is the folder with the captions"),
         ("motions", "motions", "index.csv"),
     ]:
         with (
@@ -311,7 +311,7 @@ def test_wrong_folders_get_one_line(folder, subtests):
     with pytest.raises(UserError, match=r"data\.source\.exclude: .* has no 99_99"):
         _ = source(folder, exclude=["99_99"]).files
     (folder / "clone/kitml.json").write_text("[1]")
-    with pytest.raises(UserError, match=r"kitml\.json: not KIT-ML's captions of AMASS"):
+    with pytest.raises(UserError, match=r"kitml\.json: not KIT-ML's captions for AMASS"):
         _ = source(folder).kit
 
 

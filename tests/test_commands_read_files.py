@@ -154,18 +154,18 @@ def test_a_character_that_is_compressed_is_refused(tmp_path: Path, capsys, subte
 FOLDERS = {
     "f02_folder": ("2 clips can be prepared", 0, ["a", "b"], 0),
     "f07_check_rc": (
-        r"bad\.bvh, line 164: .* 1 of 2 motions of .* cannot be prepared",
+        r"bad\.bvh, line 164: .* 1 of 2 motions in .* cannot be prepared",
         1,
         ["good"],
         1,
     ),
     "f07_one_frame": (
-        r"rest\.bvh: 1 frames at 20 .* 1 of 2 motions of .* cannot be prepared",
+        r"rest\.bvh: only 1 frames at 20 .* 1 of 2 motions in .* cannot be prepared",
         1,
         ["rest", "walk"],
         0,
     ),
-    "f08_batch": (r"b\.bvh, line 4: .* 1 of 3 motions of .* cannot be prepared", 1, ["a", "c"], 1),
+    "f08_batch": (r"b\.bvh, line 4: .* 1 of 3 motions in .* cannot be prepared", 1, ["a", "c"], 1),
     "f08_macos": ("1 clips can be prepared", 0, ["a"], 0),
 }
 

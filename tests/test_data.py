@@ -363,7 +363,8 @@ def test_what_fits_into_free_memory_is_kept(root, option, share, devices, kept, 
         assert data.choose_device(more=size) is None
     monkeypatch.setattr(datamodule, "free_memory", lambda device: 2**20)
     with pytest.raises(
-        UserError, match=r"data\.resident=true: .* take \d+\.\d of 0\.0 GiB that cpu has free"
+        UserError,
+        match=r"data\.resident=true: .* take \d+\.\d GiB, but only 0\.0 GiB are free on cpu",
     ):
         module(root, CROPS[0], resident=True).setup("fit")
 

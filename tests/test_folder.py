@@ -242,7 +242,7 @@ BAD = {
     ),
     "two splits": (
         lambda f: write_table(f, [{"id": "one", "split": split} for split in ("val", "test")]),
-        "line 3: one has two values of split: val and test",
+        "line 3: one has two values for split: val and test",
     ),
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
     "up": (
@@ -374,7 +374,7 @@ def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
         r"error: .*b\.bvh: the legs are.*",
         r"error: .*c\.bvh: unknown skeleton\. Mixamo is the nearest .*; missing: Spine2\. .*",
         r"error: .*d\.bvh, line 1: .*",
-        r"error: 3 of 4 motions of .* cannot be prepared",
+        r"error: 3 of 4 motions in .* cannot be prepared",
     )
     assert re.fullmatch("\n".join(expected), "\n".join(Folder(str(tmp_path)).check(20)))
 
@@ -443,7 +443,10 @@ def test_what_a_folder_lacks_is_reported(tmp_path: Path, monkeypatch, capsys):
     write_table(tmp_path / "mine", [{"id": str(n), "text": "walks"} for n in range(10)])
     later = time.time() + 10
     os.utime(tmp_path / "mine" / "captions.csv", (later, later))
-    assert "mine: captions.csv changed since. Prepare with force=true to read them" in prepared()
+    assert (
+        "mine: captions.csv changed since the data set was prepared. Prepare it again with force=true"
+        in prepared()
+    )
     assert not re.search("changed since|no captions", prepared("force=true"))
 
 

@@ -208,10 +208,10 @@ def test_a_processed_folder_becomes_a_store_and_says_what_was_left_out(folder, t
     assert store.info["excluded"] == {
         "texts without a motion (000099)": 1,
         "captions of parts that are too short or too long": 2,
-        "names of train shorter than 40 frames": 2,
-        "names of train of 200 frames or more": 2,
-        "names of train without a caption": 2,
-        "names of train with captions of unfit parts only": 2,
+        "names in train shorter than 40 frames": 2,
+        "names in train with 200 frames or more": 2,
+        "names in train without a caption": 2,
+        "names in train whose captions all describe parts that are too short or too long": 2,
     }
     counts = {
         "motions": 8,
@@ -242,7 +242,8 @@ def test_texts_may_stay_packed(folder):
     assert [(c.id, c.captions) for c in HumanML3D(str(folder)).clips(20.0)] == unpacked
     (folder / "texts.zip").unlink()
     with pytest.raises(
-        FileNotFoundError, match=r"texts\.zip: not found; nor is the folder texts there; clone"
+        FileNotFoundError,
+        match=r"texts\.zip: not found; and there is no folder texts either; clone",
     ):
         HumanML3D(str(folder)).count()
 
@@ -479,7 +480,7 @@ def body_of_55_joints(root):
         (lambda r: shutil.rmtree(r / "amass"), r"amass: not found; register at https://amass"),
         (
             body_of_55_joints,
-            r"male/model\.npz: not a SMPL\+H model of 52 joints: J_regressor has shape \(55, 80\)",
+            r"male/model\.npz: not an SMPL\+H model with 52 joints: J_regressor has shape \(55, 80\)",
         ),
         (lambda r: (r / "HumanML3D/index.csv").unlink(), r"index\.csv: not found"),
         (

@@ -35,7 +35,7 @@ def test_a_processed_folder_becomes_a_store(tmp_path):
         "3": "val",
         "M3": "val",
     }
-    assert store.info["excluded"] == {"names of train shorter than 24 frames": 2}
+    assert store.info["excluded"] == {"names in train shorter than 24 frames": 2}
     assert source.counts().keys() >= published("kit").keys()
 
 
@@ -56,9 +56,9 @@ def test_temos_motions_become_a_store(mmm, tmp_path):
     assert {name: clip.length for name, clip in clips.items()} == lengths
     assert kit.count() == len(clips)
     assert store.info["excluded"] == {
-        "motions of train without a caption": 1,
-        "motions of train shorter than 10 frames": 1,
-        "motions of train longer than 500 frames": 1,
+        "motions in train without a caption": 1,
+        "motions in train shorter than 10 frames": 1,
+        "motions in train longer than 500 frames": 1,
     }
     assert store.info["clips"] == {"train": 2, "val": 1, "test": 2}
     assert len(clips["00001"].captions) == 2

@@ -315,7 +315,7 @@ def test_bad_motions_and_options(subtests):
             if isinstance(representation, HumanML):
                 with pytest.raises(UserError, match=f"motion 1: .*{message}"):
                     representation.encode_many([wander(), motion])
-    with pytest.raises(UserError, match="bone_lengths: 2 numbers, but smpl22 has 22 joints"):
+    with pytest.raises(UserError, match="bone_lengths: got 2 numbers, but smpl22 has 22 joints"):
         HumanML(bone_lengths=[1.0, 2.0])
     with pytest.raises(UserError, match=r"smpl23.*smpl22"):
         HumanML("smpl23")

@@ -431,7 +431,7 @@ PICKLES = {
     "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "is not text"),
     "complex": (
         pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4),
-        "it names builtins.complex",
+        "it refers to builtins.complex",
     ),
     "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "a set"),
     "old dictionary": (b"((I1\nI2\ntI3\nd.", "is not text"),

@@ -1,4 +1,4 @@
-"""Data sets: reading of published releases, packing into stores, and batches."""
+"""Data sets: readers for published releases, stores of packed clips, and batches."""
 
 import hashlib
 import math
@@ -29,8 +29,8 @@ class Clip:
 
     # Unique name. The name of a mirrored copy is `M` + the name of its original.
     id: str
-    # Input of the representation, at its frame rate. Representations of joints take positions
-    # (F, J, 3) in meters, y up, in the joint order of the skeleton.
+    # Input to the representation, at its frame rate. Joint representations take positions (F, J, 3)
+    # in meters, y up, in the joint order of the skeleton.
     motion: np.ndarray
     # Descriptions of the entire motion. Empty for data sets that only have action labels.
     captions: list[str]
@@ -61,21 +61,21 @@ class MotionSource(ABC):
     """A data set in its published form."""
 
     name: str
-    # Whether the recipe names the data set in `data.name`, because the files are the user's own
+    # Whether the data set takes its name from `data.name`, because the files are the user's own
     named_by_recipe: bool = False
     options: Mapping[str, Any] = {}
-    """Arguments of the constructor that define the data, as JSON values.
+    """Constructor arguments that define the data, as JSON values.
 
-    Paths and numbers of workers are left out. The arguments are saved in the store, and commands
+    Paths and worker counts are left out. The arguments are saved in the store, and commands
     compare them with the recipe.
     """
-    # Names of the action labels, in the order of their numbers
+    # Names of the action labels, in the order of their indices
     actions: tuple[str, ...] = ()
     # All forms of the verbs in the captions. Sentences are split into actions at these verbs.
     # Empty = sentences are not split.
     verbs: tuple[str, ...] = ()
     license: str = ""
-    """License of all motions, a key of `licenses.yaml` such as "MIT".
+    """License of all motions, a key in `licenses.yaml` such as "MIT".
 
     It is empty if the license is unknown, or if clips have individual licenses.
     """
@@ -95,7 +95,7 @@ class MotionSource(ABC):
     failures: Sequence[str] = ()
     """One line per motion that could not be read and was left out.
 
-    The list is complete after `clips` has ended. Commands then exit with code 1, because the user
+    The list is complete once `clips` is exhausted. Commands then exit with code 1, because the user
     should correct the files.
     """
     # Number of processes that read and encode; 0 = one per core, 1 = only this process
@@ -107,7 +107,7 @@ class MotionSource(ABC):
     def excluded(self) -> Counter[str]:
         """Number of clips or labels left out, by reason; saved in the store.
 
-        It is complete after `clips` has ended.
+        It is complete once `clips` is exhausted.
         """
         return Counter()
 
@@ -128,21 +128,21 @@ class MotionSource(ABC):
         return {name: value for name, value in named.items() if name not in self.exclude}
 
     def counts(self) -> Mapping[str, float]:
-        """Returns statistics of the raw data under the names of `published.yaml`.
+        """Returns statistics of the raw data, under the names used in `published.yaml`.
 
-        They are saved after `clips` has ended.
+        They are saved once `clips` is exhausted.
         """
         return {}
 
     def findings(self) -> list[str]:
-        """Returns lines to print about the motions. The lines are complete after `clips` has ended."""
+        """Returns lines to print about the motions. They are complete once `clips` is exhausted."""
         return []
 
     def changed(self, store: Path) -> list[str]:
         """Returns a line if files were added or changed after the store was prepared.
 
         Args:
-            store: a file of the store.
+            store: a file in the store.
         """
         return []
 
@@ -237,7 +237,7 @@ def some(names: Iterable[str]) -> str:
 
 
 def name_hash(name: str) -> int:
-    """Returns 160 bits that depend only on the name, so that random draws are the same on every machine."""
+    """Returns a 160-bit hash of the name, so that random draws are the same on every machine."""
     return int(hashlib.sha1(name.encode()).hexdigest(), 16)
 
 

@@ -37,10 +37,11 @@ KEPT = "prior/"  # prefix of the names of the known clips
 class Lesson(MotionSource):
     """Clips in the user's folder, with mirrored copies, and clips that the model already knows.
 
-    All clips in the folder are for training unless its table states otherwise. Clips are normalized
+    All clips in the folder are used for training unless the caption table says otherwise. Clips are
+    normalized with the statistics of the known clips' store.
 
     Args:
-        path: the user's folder of motions.
+        path: the user's motion folder.
         prior: folder of the store with clips that the model was trained on.
         motion: "joints" for representations of joint positions, "smpl" for representations of
             rotations.
@@ -69,7 +70,7 @@ class Lesson(MotionSource):
     def count(self) -> int:
         """Returns the number of clips.
 
-        Puts the user's clips into the training split unless their table names a split.
+        The user's clips go into the training split unless the caption table specifies a split.
         """
         self.folder.splits = {
             name: note.split or "train" for name, note in self.folder.notes.items()
@@ -169,7 +170,7 @@ class LessonBatches(Sampler[list[Draw]]):
 
 
 class LessonData(MotionDataModule):
-    """Data module of a `Lesson`: half of each batch are the user's clips, and half are prior clips."""
+    """Data module for a `Lesson`: half of each batch are the user's clips, half are prior clips."""
 
     def halves(self) -> list[np.ndarray]:
         """Returns the indices of the user's training clips, and the indices of the prior store's clips."""
@@ -181,10 +182,10 @@ class LessonData(MotionDataModule):
         return [np.flatnonzero(~is_kept), np.flatnonzero(is_kept)]
 
     def counts(self, store: Store) -> list[str]:
-        """Returns a line with the numbers of training clips of both halves."""
+        """Returns a line with the numbers of training clips in both halves."""
         taught, kept = map(len, self.halves())
         return [
-            f"clips: {taught} of {self.source.name}, mirrored copies included; {kept} that the model already knows"
+            f"clips: {taught} from {self.source.name}, including mirrored copies; {kept} that the model already knows"
         ]
 
     def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:

@@ -78,7 +78,7 @@ class Recording(NamedTuple):
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:
-        """Returns the parameters of FLAME, (F, 75) float32.
+        """Returns FLAME's parameters, (F, 75) float32.
 
         A frame contains the translation and the axis-angle vectors of 24 joints.
         """
@@ -89,9 +89,9 @@ def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
     Returns None if the path belongs to no subset. A subset may have different names in index files,
-    archives and folders; all of them result in the same key. Case is ignored, and spaces are
-    replaced by underscores, as in later releases. A file from the SMPL-X release has the same key as
-    the SMPL+H file.
+    archives and folders; they all map to the same key. Case is ignored, and spaces are replaced by
+    underscores, as in later releases. A file from the SMPL-X release has the same key as the SMPL+H
+    file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -123,7 +123,8 @@ def read(file: Path | bytes, name: str) -> Recording:
             or gender.size != 1
         ):
             raise UserError(
-                f"{RELEASE}: shapes of poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)"
+                f"{RELEASE}: poses has shape {poses.shape} and trans has shape "
+                f"{translation.shape}, not (F, 156) and (F, 3)"
             )
         if any(
             array.dtype.kind not in "fiu" or not np.isfinite(array).all()
@@ -204,8 +205,8 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # An archive takes minutes. Therefore, this process does not work on archives before the
-        # worker processes do.
+        # Reading an archive takes minutes. Therefore, the number of workers is always set: they
+        # start immediately, instead of after some work in this process.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
         ):
@@ -234,7 +235,7 @@ def _run(
 
 
 def _members(archive: Path, keys: Collection[str]) -> Iterator[tuple[str, str, bytes]]:
-    """Yields the key, name and content of recordings in an archive."""
+    """Yields the key, name and content of each recording in an archive."""
     left = set(keys)
     for name, content in archives.members(
         archive, lambda name: name.endswith(".npz") and key_of(name) in left

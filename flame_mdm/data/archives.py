@@ -97,7 +97,7 @@ def _zip_members(
         check_expansion(sum(info.file_size for info in archive.infolist()), size)
         for info in archive.infolist():
             name = info.filename
-            if not name:  # `zipfile` cuts names at a null character
+            if not name:  # `zipfile` truncates names at a null character
                 raise UserError("it contains a file without a name")
             # macOS adds a folder __MACOSX with the attributes of the files
             if not info.is_dir() and "__MACOSX" not in name and is_wanted(name):
@@ -135,7 +135,7 @@ def _tar_members(
 
 def _check_size(name: str, size: int) -> None:
     if size > MEMBER_LIMIT:
-        raise UserError(f"{name}: {size:,} bytes are too large for a motion")
+        raise UserError(f"{name}: its size, {size:,} bytes, is too large for a motion")
 
 
 class _Member(tarfile.TarInfo):
@@ -146,13 +146,13 @@ class _Member(tarfile.TarInfo):
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:
-            raise UserError(f"{self.name}: a sparse file")
+            raise UserError(f"{self.name}: it is a sparse file")
         if self.type in _HEADERS and self.size > HEADER_LIMIT:
-            raise UserError(f"a header has {self.size:,} bytes, which is too many")
+            raise UserError(f"a header has a size of {self.size:,} bytes, which is too large")
         return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _proc_gnusparse_10(self, *_: Any) -> None:
-        raise UserError(f"{self.name}: a sparse file")
+        raise UserError(f"{self.name}: it is a sparse file")
 
 
 class _Bounded:

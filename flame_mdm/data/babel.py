@@ -20,7 +20,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.safe_io import naming, read_json
 
 FPS = 20.0
-# Number of frames of a clip, and between windows of the same label
+# Number of frames in a clip, and between the starts of windows for the same label
 LENGTH, STRIDE = 128, 10
 # Words, categories, start and end
 Segment = tuple[str, list[str] | None, float | None, float | None]
@@ -38,7 +38,7 @@ class Label(NamedTuple):
 
     motion: str  # key of the AMASS recording, as returned by `amass.key_of`
     text: str
-    start: float | None  # in seconds, like `end`; None if BABEL states no times
+    start: float | None  # in seconds, like `end`; None if BABEL gives no times
     end: float | None
     kind: Literal["words", "category"]  # the annotator's words, or the category of the action
 
@@ -118,9 +118,7 @@ class Babel(MotionSource):
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
         measured = self.amass.map(keys, _measure, self.workers)
-        lengths = dict(
-            ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions")
-        )
+        lengths = dict(ProgressBar(measured, "measuring AMASS motions", len(keys), unit=" motions"))
         windows, trained = [], {label.motion for label in labels["train"]}
         for part in PARTS:
             number = 0
@@ -128,7 +126,7 @@ class Babel(MotionSource):
                 starts, reason = _starts(label, lengths[label.motion])
                 is_trained = part == "val" and label.motion in trained
                 if starts and is_trained and not self.published_split:
-                    reason = "labels of the val part on motions of the train part"
+                    reason = "labels in the val part for motions in the train part"
                 if reason:
                     self.leave_out(reason)
                 else:
@@ -142,7 +140,7 @@ class Babel(MotionSource):
         """Returns the labels of a part ("train" or "val") in FLAME's order.
 
         For each file, the annotators' words come first, followed by the categories. Empty and
-        repeated labels (same text, motion, start and end) are dropped.
+        duplicate labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
@@ -192,7 +190,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip of a label, or the reason why the label has no clip.
+    """Returns the first frame of each clip for a label, or the reason why there is no clip.
 
     `frames` is the number of frames of the motion.
     """
@@ -211,7 +209,7 @@ def _starts(label: Label, frames: int) -> tuple[range, str]:
     if last - first > LENGTH:
         return range(first, last - LENGTH + 1, STRIDE), ""
     if first + LENGTH >= frames:
-        return none, "labels too near to the end of the motion"
+        return none, "labels too close to the end of the motion"
     return range(first, first + 1), ""
 
 

@@ -38,7 +38,7 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""The files' joint for each SMPL joint, in order. spine1 lies between Hips and Spine."""
+"""Joint in the files for each SMPL joint, in order. spine1 lies between Hips and Spine."""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
 _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's left foot
@@ -84,7 +84,7 @@ REST = {
     **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
     **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
 }
-# Converts between y up and AMASS's z up: (-x, z, y). The SMPL representation converts back in
+# Converts between y up and AMASS's z up: (-x, z, y). The SMPL representation converts back when
 # decoding.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
@@ -92,7 +92,7 @@ WORDS = read_package_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styl
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Numbers of the published takes of data set 2, by content in the order of `STYLES_2`.
+"""Number of published takes per style in data set 2, by content; styles as in `STYLES_2`.
 
 Splits are drawn from these numbers, so that they do not depend on which files exist.
 """

@@ -29,7 +29,12 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
             No code in the .pkl is run.
     """
     with naming(
-        path, KeyError, TypeError, IndexError, ValueError, prefix="not a SMPL model of 24 joints: "
+        path,
+        KeyError,
+        TypeError,
+        IndexError,
+        ValueError,
+        prefix="not an SMPL model with 24 joints: ",
     ):
         if path.suffix == ".npz":
             model: Any = read_npz(path, only=ARRAYS)
@@ -39,7 +44,7 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
         if isinstance(regressor, dict):  # the state of a sparse matrix
             parts = (regressor[name] for name in ("data", "indices", "indptr"))
             regressor = csc_matrix(tuple(parts), shape=regressor["_shape"]).toarray()
-        if isinstance(template, dict):  # the state of an array of chumpy
+        if isinstance(template, dict):  # the state of a chumpy array
             template = template["x"]
         joints = _rest_joints(regressor, template, model["kintree_table"], 24, SMPL24.parents)
     offsets = joints - np.concatenate([np.zeros((1, 3)), joints[list(SMPL24.parents[1:])]])
@@ -52,7 +57,7 @@ def _rest_joints(
     """Returns the rest joints (J, 3) of a model.
 
     Raises:
-        ValueError: If its first joints do not have `parents`.
+        ValueError: If the parents of its first joints are not `parents`.
     """
     regressor, vertices = np.asarray(regressor, np.float64), np.asarray(vertices, np.float64)
     numbers = np.asarray(tree)[0, 1 : len(parents)].tolist()
@@ -63,11 +68,11 @@ def _rest_joints(
     ):
         raise ValueError(
             f"J_regressor has shape {regressor.shape}, v_template has shape {vertices.shape}, or the "
-            "tree of joints differs"
+            "kinematic tree differs"
         )
     rest = regressor @ vertices
     if not np.isfinite(rest).all():
-        raise ValueError("non-finite numbers")
+        raise ValueError("it contains non-finite numbers")
     return rest
 
 
@@ -114,7 +119,7 @@ def load_body(folder: Path, gender: str) -> Body:
         TypeError,
         IndexError,
         ValueError,
-        prefix="not a SMPL+H model of 52 joints: ",
+        prefix="not an SMPL+H model with 52 joints: ",
     ):
         regressor, template, tree, directions = (
             read_npz(path, only=ARRAYS)[name] for name in ARRAYS

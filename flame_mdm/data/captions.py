@@ -1,4 +1,4 @@
-"""Tables of captions written by users: `captions.csv`, with one line per caption."""
+"""Caption tables written by users: `captions.csv`, with one line per caption."""
 
 import csv
 import io
@@ -12,13 +12,13 @@ from flame_mdm.safe_io import naming, read_text
 
 TABLE = "captions.csv"
 COLUMNS = ("id", "text", "action", "split", "source", "license")
-SPLITTABLE = 10  # from this number of motions on, each split has at least one motion
+SPLITTABLE = 10  # with this many motions or more, each split has at least one motion
 
 
 def table_rows(
     path: Path, columns: Collection[str] = COLUMNS
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yields the rows of a table of captions.
+    """Yields the rows of a caption table.
 
     A row consists of its file and line, for error messages, and its cells by column.
 

@@ -34,7 +34,7 @@ from flame_mdm.safe_io import naming, read_json, read_package_yaml
 
 FACTS: dict[str, Any] = read_package_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
-# Endings of the files that are unpacked from an archive
+# Extensions of the files that are unpacked from an archive
 SUFFIXES = (
     ".amc",
     ".asf",
@@ -51,9 +51,9 @@ RATES = (120.0, 60.0)
 SLACK = 0.05
 # Minimum number of feature rows of a clip, as in HumanML3D
 SHORTEST = 40
-# Number of frames after the T-pose of a Daz-friendly file that are blended with the T-pose
+# Number of frames after the T-pose in a Daz-friendly file that are blended with it
 BLENDED = 3
-# Columns of a table of the user's captions
+# Columns of the user's caption table
 COLUMNS = (
     "id",
     "begin",
@@ -63,8 +63,7 @@ COLUMNS = (
     "split",
     "source",
 )
-# Number of frames that is assumed for a recording of unknown length; any number above `SHORTEST`
-# works
+# Number of frames assumed for a recording of unknown length; any number above `SHORTEST` works
 UNKNOWN = 1000
 # The arguments `seconds`, `last` and `is_sixty` of `decide_rate`
 Evidence = tuple[float | None, int | None, bool]
@@ -74,14 +73,14 @@ _HIP, _KNEE, _ANKLE, _HEAD = (
 )
 ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
 GET_IT = (
-    "clone https://github.com/una-dinosauria/cmu-mocap or unpack ASF/AMC files of http://mocap.cs.cmu.edu, clone "
+    "clone https://github.com/una-dinosauria/cmu-mocap or unpack ASF/AMC files from http://mocap.cs.cmu.edu, clone "
     "https://github.com/EricGuo5513/HumanML3D, and give SOURCE=/path/to/the/motions "
     "data.source.captions=/path/to/HumanML3D"
 )
 
 
 class Item(NamedTuple):
-    """Captions of a recording, or of its part from frame `start` to frame `end` at 20 fps.
+    """Captions for a recording, or for its part from frame `start` to frame `end` at 20 fps.
 
     `action` is the label of a part in `captions.csv`. `is_own` is True for such parts, and False
     for captions from HumanML3D and KIT-ML.
@@ -117,7 +116,7 @@ class CMU(MotionSource):
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
             subfolders; or an archive of such a folder.
         captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a
-            folder with `captions.csv`. Default: `path`. KIT-ML's captions of AMASS, kitml*.json,
+            folder with `captions.csv`. Default: `path`. KIT-ML's captions for AMASS (kitml*.json)
             are used if they are in either folder.
         motion: "joints", or "smpl" for SMPL's rotations, which are computed from the joints.
     """
@@ -141,12 +140,12 @@ class CMU(MotionSource):
 
     @cached_property
     def path(self) -> Path:
-        """Folder of the recordings. An archive is unpacked into a temporary folder."""
+        """Folder with the recordings. An archive is unpacked into a temporary folder."""
         return archives.as_folder(self.archive, self, lambda name: name.lower().endswith(SUFFIXES))
 
     @property
     def captions(self) -> Path:
-        """Folder of the captions."""
+        """Folder with the captions."""
         return self.path if self._captions is None else Path(self._captions)
 
     @cached_property
@@ -172,8 +171,8 @@ class CMU(MotionSource):
 
     @cached_property
     def table(self) -> Path | None:
-        """The table of the user's captions; None if there is no table."""
-        required(self.captions, f"it is the folder of the captions: {GET_IT}")
+        """The user's caption table; None if there is no table."""
+        required(self.captions, f"it is the folder with the captions: {GET_IT}")
         path = self.captions / TABLE
         return path if path.exists() else None
 
@@ -187,7 +186,7 @@ class CMU(MotionSource):
         """
         if self.table:
             return [], {}, {}
-        required(self.captions, f"it is the folder of the captions: {GET_IT}")
+        required(self.captions, f"it is the folder with the captions: {GET_IT}")
         if files := sorted(self.captions.glob("humanml3d_test_captions*.json")):
             rows = read_index(self.captions / "humanml3d_index_cmu.csv")
             texts = _test_captions(files[0])
@@ -224,7 +223,7 @@ class CMU(MotionSource):
             KeyError,
             TypeError,
             ValueError,
-            prefix="not KIT-ML's captions of AMASS: ",
+            prefix="not KIT-ML's captions for AMASS: ",
         ):
             return [
                 (
@@ -251,9 +250,9 @@ class CMU(MotionSource):
                 name for name in (row.name, f"M{row.name}") if name in splits and texts.get(name)
             ]
             if trial not in files:
-                self.leave_out("clips of HumanML3D without their recording")
+                self.leave_out("HumanML3D clips whose recording is missing")
             elif not names:
-                self.leave_out("clips of HumanML3D without captions")
+                self.leave_out("HumanML3D clips without captions")
             else:
                 items[trial] += [
                     Item(n, splits[n], row.name, texts[n], row.start, row.end, n[0] == "M")
@@ -271,13 +270,15 @@ class CMU(MotionSource):
         if self.table:
             parts = _parts(self.table)
             present = {name: part for name, part in parts.items() if part.trial in files}
-            self.leave_out(f"parts in {TABLE} without their recording", len(parts) - len(present))
+            self.leave_out(
+                f"parts in {TABLE} whose recording is missing", len(parts) - len(present)
+            )
             items.update(_own_items(present))
         captioned = {trial: items[trial] for trial in files if items[trial]}
         self.leave_out("recordings without a caption", len(files) - len(captioned))
         if not captioned:
             raise UserError(
-                f"{self.captions}: no captions of the recordings in {self.path}; {GET_IT}"
+                f"{self.captions}: no captions for the recordings in {self.path}; {GET_IT}"
             )
         return captioned
 
@@ -314,7 +315,7 @@ class CMU(MotionSource):
                 continue
             for item, motion in zip(self.items[trial], motions, strict=True):
                 if not (kept := item.cuts(len(motion) - 1)):
-                    longest = "" if item.is_own else f" or of {MAX_LENGTH} or more"
+                    longest = "" if item.is_own else f" or with {MAX_LENGTH} or more"
                     self.leave_out(f"motions shorter than {SHORTEST} frames{longest}")
                 for cut in kept:
                     if item.end and not item.mirrored and not item.is_own:
@@ -327,7 +328,7 @@ class CMU(MotionSource):
             raise UserError(f"{self.path}: no recording can be read; {self._errors[0]}")
 
     def counts(self) -> Mapping[str, float]:
-        """Returns the numbers of clips and captions of HumanML3D that were read."""
+        """Returns how many HumanML3D clips and captions were read."""
         return self._counts
 
     def findings(self) -> list[str]:
@@ -337,7 +338,7 @@ class CMU(MotionSource):
 
 @dataclass
 class _Part:
-    """A part of a recording in a table of captions: frames `start` to `end` at 20 fps."""
+    """A part of a recording in a caption table: frames `start` to `end` at 20 fps."""
 
     name: str
     trial: str
@@ -352,7 +353,7 @@ class _Part:
 def _parts(table: Path) -> dict[str, _Part]:
     """Returns the parts of recordings in a table, by name.
 
-    Rows that name the same part are captions for one clip.
+    Rows for the same part contain captions for the same clip.
     """
     parts: dict[str, _Part] = {}
     for where, cells in table_rows(table, COLUMNS):
@@ -360,7 +361,7 @@ def _parts(table: Path) -> dict[str, _Part]:
             part = _part_in_table(cells)
             before = parts.setdefault(part.name, part)
             if replace(before, texts=[]) != replace(part, texts=[]):
-                raise UserError(f"{part.name} has two values of split, source or action")
+                raise UserError(f"{part.name} has conflicting values for split, source or action")
             before.texts += [text] if (text := cells.get("text")) else []
     for kind in ("texts", "action"):
         bare = [name for name, part in parts.items() if not getattr(part, kind)]
@@ -375,8 +376,8 @@ def _parts(table: Path) -> dict[str, _Part]:
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
     """Returns the parts of each recording.
 
-    Their splits are stated in the table, or drawn by the source or, without a source, by the
-    subject.
+    Their splits are stated in the table. Otherwise, they are drawn by source or, without a source,
+    by subject.
     """
     sources = {
         name: part.source or f"CMU subject {part.trial.partition('_')[0]}"
@@ -403,7 +404,7 @@ def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
 
 
 def _part_in_table(cells: Mapping[str, str]) -> _Part:
-    """Returns the part of a recording that a row names, without its captions."""
+    """Returns the part of a recording that a row describes, without its captions."""
     trial, begin, end = cells["id"], cells.get("begin", ""), cells.get("end", "")
     if not re.fullmatch(r"\d{2,3}_\d{2,3}", trial):
         raise UserError(f"id {trial!r} is not the name of a recording, such as 02_01")
@@ -412,13 +413,13 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
         f"begin {begin!r}, end {end!r}",
         ValueError,
         OverflowError,
-        prefix="not numbers of seconds: ",
+        prefix="not times in seconds: ",
     ):
         first = round(float(begin) * FPS) if begin else 0
         last = round(float(end) * FPS) if end else None
     if first < 0 or (last is not None and last <= first):
         raise UserError(
-            f"begin {begin!r}, end {end!r}: expected the beginning and the end of a part, in seconds"
+            f"begin {begin!r}, end {end!r}: expected times in seconds, with 0 <= begin < end"
         )
     name = f"{trial}@{begin or 0}-{end or 'end'}" if begin or end else trial
     split = known_split(cells["split"]) if cells.get("split") else None
@@ -428,7 +429,7 @@ def _part_in_table(cells: Mapping[str, str]) -> _Part:
 
 
 def _is_in(fact: str, trial: str) -> bool:
-    """Returns whether a list of `cmu.yaml` contains a recording or its subject."""
+    """Returns whether a list in `cmu.yaml` contains a recording or its subject."""
     return not {trial, trial.partition("_")[0]}.isdisjoint(FACTS[fact])
 
 
@@ -452,9 +453,7 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
     `segment` is the described part, in seconds.
     """
     texts: defaultdict[str, list[Description]] = defaultdict(list)
-    with naming(
-        path, KeyError, TypeError, ValueError, prefix="not a list of captions of HumanML3D: "
-    ):
+    with naming(path, KeyError, TypeError, ValueError, prefix="not a list of HumanML3D captions: "):
         for entry in read_json(path):
             begin, end = map(float, entry["segment"] or (0, 0))
             name = f"M{entry['base']}" if entry["mirrored"] else entry["base"]
@@ -467,7 +466,7 @@ def _test_captions(path: Path) -> dict[str, list[Description]]:
 def decide_rate(
     frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool
 ) -> float:
-    """Returns the frame rate of a recording of `frames` frames.
+    """Returns the frame rate of a recording with `frames` frames.
 
     Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. The
     next source is CMU's list. The `header` of the file has the lowest priority, because conversions
@@ -521,7 +520,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     if "lfemur" not in tree.joints:
         return tree, {}
     # A first frame without rotation is the T-pose. In Daz-friendly files, the next few frames
-    # blend it with the motion. These frames get the pose of the first frame after them.
+    # blend it with the motion. These frames take the pose of the first frame after them.
     if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
         frames = tree.frames[1:].copy()
         frames[:blended, 6:] = frames[blended, 6:]

@@ -37,7 +37,7 @@ class Crop(ABC):
     max_frames: int
 
     def longest(self) -> int:
-        """Returns the maximum number of frames of a sample."""
+        """Returns the maximum number of frames in a sample."""
         return self.max_frames
 
     @abstractmethod
@@ -68,9 +68,9 @@ class Crop(ABC):
 class Units(Crop):
     """The rule for HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
 
-    In one of three draws, the sample is one unit shorter than possible. If a clip is longer than
+    One time in three, the sample is one unit shorter than the clip allows. If a clip is longer than
     `max_frames`, the sample is a window at a random position. Without a generator, the longest
-    window that starts at the first frame is taken.
+    window that starts at the first frame is used.
     """
 
     min_frames: int = 40
@@ -110,7 +110,7 @@ class Whole(Crop):
 class Fixed(Crop):
     """The rule for ACTOR's action data sets: always `frames` frames.
 
-    Short clips repeat their last frame. From long clips, a window is taken. As in ACTOR's code, the
+    Short clips repeat their last frame. Long clips are cropped to a window. As in ACTOR's code, the
     window never starts at the last possible frame. Without a generator, the first window is used.
     """
 
@@ -199,7 +199,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """Index (clips,) of each clip's caption in evaluation, chosen by the id of the clip."""
+        """Caption index (clips,) of each clip in evaluation, derived from the clip's id."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

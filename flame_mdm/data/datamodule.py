@@ -1,7 +1,7 @@
 """Training and evaluation batches from a packed store.
 
 Every batch is a function of (seed, step, rank). Therefore, no generator state is saved, and a
-resumed run gets the same batches as an uninterrupted run.
+resumed run sees the same batches as an uninterrupted run.
 """
 
 import re
@@ -26,10 +26,10 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError, say
 from flame_mdm.representations import Representation
 
-# Maximum number of frames of a sample. One hour at 20 frames per second has 72,000 frames.
+# Maximum number of frames in a sample. One hour at 20 frames per second has 72,000 frames.
 MAX_FRAMES = 100_000
-# Permitted names of a data set. The data set's folder name starts with this name, so the pattern
-# ensures that the folder is inside `root` and not hidden.
+# Pattern for data set names. The name of the data set's folder starts with this name, so the
+# pattern ensures that the folder is inside `root` and not hidden.
 NAME = r"\w[\w .-]*"
 Loader = DataLoader[Sample] | ResidentLoader
 
@@ -87,7 +87,8 @@ class MotionDataModule(LightningDataModule):
     """Prepares a data set, unless it is already prepared, and provides its batches.
 
     Args:
-        representation: representation that encodes the clips. It gets the statistics of the store.
+        representation: representation that encodes the clips. It receives the statistics of the
+            store.
         root: folder of all prepared data sets.
         name: name of the data set. The name of its folder in `root` starts with this name.
         batch_size: clips per rank and step.
@@ -97,7 +98,8 @@ class MotionDataModule(LightningDataModule):
             gathered on the device, without workers. "auto" = only if the data set takes at most a
             quarter of the free memory.
         pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
-            networks see few shapes. Padding never exceeds the longest sample of the crop rule.
+            networks see only a few shapes. Padding never exceeds the longest sample of the crop
+            rule.
     """
 
     def __init__(
@@ -119,7 +121,7 @@ class MotionDataModule(LightningDataModule):
         is_crop = all(type(number) is int and 1 <= number <= MAX_FRAMES for number in frames)
         for key, value, is_valid, remedy in (
             ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
-            ("num_workers", num_workers, num_workers >= 0, "give 0 or more"),
+            ("num_workers", num_workers, num_workers >= 0, "use 0 or more"),
             (
                 "name",
                 name,
@@ -248,7 +250,9 @@ class MotionDataModule(LightningDataModule):
         if self.trainer and device.type == "cpu":
             free //= self.trainer.num_devices
         if self.resident is True and size > free:
-            numbers = f"{size / 2**30:.1f} of {free / 2**30:.1f} GiB that {device} has free"
+            numbers = (
+                f"{size / 2**30:.1f} GiB, but only {free / 2**30:.1f} GiB are free on {device}"
+            )
             raise UserError(
                 f"data.resident=true: {self.folder} and its captions take {numbers}. Set data.resident=auto"
             )

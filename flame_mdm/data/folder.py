@@ -49,7 +49,7 @@ class MotionFile(NamedTuple):
 
 @dataclass
 class Note:
-    """Captions and labels of a motion."""
+    """Captions and labels for a motion."""
 
     texts: list[str] = field(default_factory=list)
     action: str | None = None
@@ -74,12 +74,12 @@ class Folder(MotionSource):
         exclude: motions to leave out, by their path in the folder without extension.
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about as many. Each clip
-            occurs at most 16 times. 0 = no repetition.
-        license: license of the motions for which the table states no license, a key of
-            `licenses.yaml`. Empty = unknown.
-        prefixes: words that are inserted before captions, each with the actions to whose captions
-            the word applies. A model can then distinguish these motions from the motions with the
-            same name in another data set.
+            occurs at most 16 times. 0 = clips are not repeated.
+        license: license for motions without a license in the table; a key in `licenses.yaml`. Empty
+            = unknown.
+        prefixes: words to insert before captions, each with a list of actions: the word is inserted
+            before the captions of these actions. A model can then distinguish these motions from
+            motions with the same action name in another data set.
     """
 
     name = "folder"
@@ -236,10 +236,10 @@ class Folder(MotionSource):
         ]
 
     def failure_lines(self) -> list[str]:
-        """Returns one line per motion that cannot be prepared, and a line with their number."""
+        """Returns one line per motion that cannot be prepared, and a line that counts them."""
         if not self.failures:
             return []
-        summary = f"error: {len(self.failures)} of {len(self.files)} motions of {self.path} cannot be prepared"
+        summary = f"error: {len(self.failures)} of {len(self.files)} motions in {self.path} cannot be prepared"
         return [*(f"error: {failure}" for failure in self.failures), summary]
 
     def require_all(self) -> None:
@@ -252,7 +252,7 @@ class Folder(MotionSource):
     def files(self) -> dict[str, MotionFile]:
         """Files by their path in the folder without extension, sorted.
 
-        If a file has several animations, each animation is `PATH/ANIMATION`.
+        If a file has several animations, each animation is named `PATH/ANIMATION`.
         """
         files: dict[str, MotionFile] = {}
         for path in motions_in(self.path):
@@ -283,7 +283,9 @@ class Folder(MotionSource):
         ]
         newer = [str(path.relative_to(self.path)) for path in files]
         return (
-            [f"{self.path}: {some(newer)} changed since. Prepare with force=true to read them"]
+            [
+                f"{self.path}: {some(newer)} changed since the data set was prepared. Prepare it again with force=true"
+            ]
             if newer
             else []
         )
@@ -327,7 +329,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
     Args:
         prefixes: the word, by action.
         notes: captions and labels of all motions.
-        table: the file that names the actions, for the message.
+        table: the file that contains the actions, for the message.
 
     Raises:
         UserError: If no motion has one of the actions.
@@ -336,7 +338,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
     if unknown:
         raise UserError(
             f"data.source.prefixes: no motion has the action {some(sorted(unknown))}; "
-            f"{table} names the actions"
+            f"{table} lists the actions"
         )
     for note in notes:
         if word := prefixes.get(note.action or ""):
@@ -358,14 +360,14 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
 
 
 def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
-    """Yields a clip and its repetitions, which share the frames of the clip in the store."""
+    """Yields a clip and its copies, which share the frames of the clip in the store."""
     yield clip
     for number in range(2, copies + 1):
         yield replace(clip, id=f"{clip.id}~{number}")
 
 
 def _animations(name: str, path: Path) -> Iterator[tuple[str, MotionFile]]:
-    """Yields the names of the motions in a file, and the motions.
+    """Yields the name and the location of each motion in a file.
 
     If there are several animations, each animation gets its own name.
     """
@@ -393,7 +395,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
     """Adds the cells of a row of the table to the note of its motion."""
     name, split = cells["id"], cells.get("split")
     if name not in notes:
-        raise UserError(f"no motion {name!r}; ids are paths in the folder without extension")
+        raise UserError(f"unknown motion {name!r}; ids are paths in the folder, without extension")
     if split:
         known_split(split)
     note = notes[name]
@@ -402,7 +404,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
         if value := cells.get(key):
             if getattr(note, key) not in (None, value):
                 raise UserError(
-                    f"{name} has two values of {key}: {getattr(note, key)} and {value}. Keep one "
+                    f"{name} has two values for {key}: {getattr(note, key)} and {value}. Keep one "
                     "of them"
                 )
             setattr(note, key, value)
@@ -438,7 +440,7 @@ def _read(
             raise UserError(f"{path}: {doubts.jump}")
         if len(joints) < SHORTEST:
             raise UserError(
-                f"{path}: {len(joints)} frames at {fps:g} fps, but a motion needs at least {SHORTEST} frames"
+                f"{path}: only {len(joints)} frames at {fps:g} fps, but a motion needs at least {SHORTEST} frames"
             )
         notes = [note for note in recording.motion.notes if note not in doubts.lines]
         of_kit = representation is not None and representation.skeleton is KIT21

@@ -31,7 +31,7 @@ BLOCK = 10
 
 
 class HumanAct12(MotionSource):
-    """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
+    """The clips in `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
     The file names neither subjects nor recordings. The project's own split (70 % train, 10 % val,
     20 % test of each action) keeps neighboring clips together. The published split uses all clips
@@ -136,7 +136,7 @@ def find(path: Path, name: str) -> Path:
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns lists of a pickled dictionary by name, after checking that they have equal length."""
+    """Returns lists from a pickled dictionary, by name. Checks that they have equal length."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (

@@ -57,12 +57,12 @@ def read_index(path: Path) -> list[IndexedClip]:
     """Reads `index.csv`.
 
     Raises:
-        UserError: If the file has another layout, or names an unknown recording.
+        UserError: If the file has a different layout, or refers to an unknown recording.
     """
-    required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
+    required(path, "it is index.csv from https://github.com/EricGuo5513/HumanML3D")
     rows = []
     with naming(
-        path, csv.Error, KeyError, TypeError, ValueError, prefix="not HumanML3D's index of clips: "
+        path, csv.Error, KeyError, TypeError, ValueError, prefix="not HumanML3D's clip index: "
     ):
         for line in csv.DictReader(read_text(path).splitlines()):
             source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
@@ -74,7 +74,7 @@ def read_index(path: Path) -> list[IndexedClip]:
 
 
 def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
-    """Returns the clips of each recording of AMASS."""
+    """Returns the clips of each AMASS recording."""
     recordings = defaultdict(list)
     for row in rows:
         if not row.humanact12:
@@ -141,7 +141,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def rows(self) -> list[IndexedClip]:
-        """The clips of `index.csv` that are not excluded."""
+        """The clips in `index.csv` that are not excluded."""
         return [
             row for row in read_index(self._beside("index.csv")) if row.name not in self.exclude
         ]
@@ -183,7 +183,7 @@ class HumanML3D(T2MFolder):
         return missing
 
     def _make(self, amass: Amass) -> None:
-        """Creates the motions that do not exist yet, so that an interrupted command can be continued."""
+        """Creates the motions that do not exist yet, so that an interrupted command can be resumed."""
         if todo := self._todo():
             _ = self.names, self.texts  # raises an error if they are missing
             if missing := self._missing(amass, todo):
@@ -221,7 +221,7 @@ class HumanML3D(T2MFolder):
             name for name, (_, features) in shapes.items() if features != representation.features
         ]:
             raise UserError(
-                f"{self.path}: these files have a wrong number of features: {some(wrong)}. Delete "
+                f"{self.path}: these files have the wrong number of features: {some(wrong)}. Delete "
                 "them and prepare again"
             )
         count = sum(frames for frames, _ in shapes.values())

@@ -45,7 +45,7 @@ class KITTemos(MotionSource):
 
     name = "kit-temos"
     shortest, longest = 10, 500
-    get_it = "get datasets/kit-splits of https://github.com/Mathux/TEMOS"
+    get_it = "get datasets/kit-splits from https://github.com/Mathux/TEMOS"
     get_motions = "get KIT-ML at https://motion-annotation.humanoids.kit.edu/dataset and the joints as in docs/kit.md"
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
@@ -109,13 +109,13 @@ class KITTemos(MotionSource):
         self.check_fps(fps, 12.5)
         for name, split in self.names.items():
             if name not in self.texts:
-                self.leave_out(f"motions of {split} without a caption")
+                self.leave_out(f"motions in {split} without a caption")
             elif not self._fits(name):
                 is_short = self.frames[name] < self.shortest
                 limit = (
                     f"shorter than {self.shortest}" if is_short else f"longer than {self.longest}"
                 )
-                self.leave_out(f"motions of {split} {limit} frames")
+                self.leave_out(f"motions in {split} {limit} frames")
         names = [name for name in self.frames if self._fits(name)]
         tasks = [
             (self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8)

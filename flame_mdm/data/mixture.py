@@ -21,7 +21,7 @@ def known_licenses() -> dict[str, dict[str, str]]:
 
 
 class Mixture(MotionSource):
-    """Clips of several data sets, one data set after the other.
+    """Clips from several data sets, one data set after the other.
 
     Args:
         parts: the data sets, by a name of your choice.
@@ -37,7 +37,7 @@ class Mixture(MotionSource):
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
         if not parts:
-            raise UserError("data.source.parts is empty. Name at least one data set")
+            raise UserError("data.source.parts is empty. Specify at least one data set")
         if use not in ("any", "research"):
             raise UserError(f"data.source.use={use!s:.40}: unknown. Use any or research")
         self.parts, self.use = dict(parts), use
@@ -75,7 +75,7 @@ class Mixture(MotionSource):
                 label = f"license {license}" if license else "an unknown license"
                 raise UserError(
                     f"data.source.parts.{name}: has motions with {label}, but data.source.use=any. Leave them out, or "
-                    "set data.source.use=research for a model that is for research only"
+                    "set data.source.use=research for a research-only model"
                 )
 
     def clips(self, fps: float) -> Iterator[Clip]:

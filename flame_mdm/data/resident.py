@@ -1,6 +1,6 @@
 """Data sets kept on the training device.
 
-Batches are gathered on the device, without workers and copies.
+Batches are gathered on the device, without workers or copies.
 """
 
 import os
@@ -110,7 +110,7 @@ class ResidentLoader:
     def _gathered(self, planned: list[list[Draw]]) -> Iterator[MotionBatch]:
         """Draws the crops of several batches at once, and yields the batches."""
         rows = np.array([index for draws in planned for index, _ in draws])
-        # All clips of a batch are drawn with the number of the first clip.
+        # All clips in a batch share the batch number of the first clip.
         numbers = [draws[0][1] for draws in planned for _ in draws]
         first, length, caption = self.clips.draw(rows, numbers)
         sizes = [len(draws) for draws in planned]
@@ -147,7 +147,7 @@ class ResidentLoader:
             )
 
     def _features(self, rows: Tensor, mask: Tensor) -> Tensor:
-        """Returns the normalized features (B, F, D) in rows (B, F) of all frames."""
+        """Returns the normalized features (B, F, D) at rows (B, F) of `features`."""
         x = F.embedding(rows, self.features)
         if not adapts_cuts(self.clips.representation):
             return x

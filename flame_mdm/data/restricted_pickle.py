@@ -1,9 +1,9 @@
 """Restricted reader for pickles.
 
 This module reads arrays, numbers, text, lists, tuples and dictionaries with text keys. A pickle can
-name any function and have it called. This reader calls no function. It keeps the arguments and the
-state of each object, and creates arrays from the bytes among them. NumPy's own functions are not
-used for this, because a wrong byte in a dtype makes them crash.
+refer to any function and have it called. This reader calls no function. It keeps the arguments and
+the state of each object, and creates arrays from the bytes among them. NumPy's own functions are
+not used for this, because a wrong byte in a dtype makes them crash.
 
 Python's C unpickler allocates any amount of memory that a file declares, even for a file of ten
 bytes. Therefore, this reader is based on the Python version of the unpickler. No read may request
@@ -44,7 +44,7 @@ ARRAY, SCALAR, BUFFER, BYTES = ALLOWED = (
     "_codecs.encode",
 )
 KINDS = {name: type(name, (_Object,), {}) for name in (*ALLOWED, "numpy.ndarray", "numpy.dtype")}
-"""All globals that a pickle may name, and the class of their objects."""
+"""All globals that a pickle may refer to, and the class of their objects."""
 BASES = (
     "copy_reg._reconstructor",
     "copyreg._reconstructor",
@@ -105,8 +105,8 @@ class _Unpickler(pickle._Unpickler):
         if self.opaque and name.startswith((*self.opaque, *BASES)):
             return _Object
         raise pickle.UnpicklingError(
-            f"it names {name[:200]}, but only arrays, numbers, text and plain containers are read (anything else could "
-            "run code); download the file from its owners"
+            f"it refers to {name[:200]}, but only arrays, numbers, text and plain containers are read (anything "
+            "else could run code); download the file from its owners"
         )
 
     def plain(self, value: Any) -> Any:
@@ -191,7 +191,7 @@ def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     state.
 
     Raises:
-        UserError: If the file is damaged, or names other globals.
+        UserError: If the file is damaged, or refers to other globals.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -200,4 +200,4 @@ def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
             return unpickler.plain(unpickler.load())
         except Exception as error:  # a damaged pickle can cause any error
             reason = "nested too deeply" if isinstance(error, RecursionError) else first_line(error)
-            raise UserError(f"{path}: not read as a pickle: {reason}") from error
+            raise UserError(f"{path}: cannot be read as a pickle: {reason}") from error

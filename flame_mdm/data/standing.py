@@ -1,4 +1,4 @@
-"""A motion of a person who stands still, with which streams start by default."""
+"""A motion of a person standing still, with which streams start by default."""
 
 import numpy as np
 from torch import Tensor
@@ -11,7 +11,7 @@ from flame_mdm.representations.skeleton import SMPL22
 
 
 def standing(representation: Representation, frames: int) -> Motion:
-    """Returns a motion of a person who stands still, with the features of a representation.
+    """Returns a motion of a person standing still, with its features in a representation.
 
     The motion is taken from the synthetic motions, so no data is needed.
     """

@@ -79,7 +79,7 @@ class Entry:
 
 
 class Contents(Schema):
-    """The values of store.json that commands rely on."""
+    """The values in store.json that commands rely on."""
 
     format: Literal[1]
     dataset: str
@@ -159,7 +159,7 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns, for each license, its name and the clips, minutes and actions of its motions.
+        """Returns the name of each license, with the clips, minutes and actions of its motions.
 
         The list is empty if the data set states no licenses. Copies of a clip are counted once.
         """

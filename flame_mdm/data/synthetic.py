@@ -56,8 +56,8 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")
 def content() -> dict[str, Any]:
     """Returns the grammars of both groups of actions as one grammar.
 
-    Lists of keys for captions are split into single keys. Verb forms are stored by their infinitive.
-    `core_verbs` contains the infinitives of the core actions.
+    Caption entries that list several keys are split into one entry per key. Verb forms are stored
+    by their infinitive. `core_verbs` contains the infinitives of the core actions.
     """
     grammar = read_package_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_package_yaml(Path(__file__).with_name("synthetic_more.yaml"))
@@ -85,7 +85,8 @@ def draw_captions(
 ) -> tuple[list[str], Attributes]:
     """Draws `count` different captions for a clip. Also returns the attributes that they state.
 
-    If `incomplete` and the grammar contains such captions, all of them omit the same attributes.
+    If `incomplete`, all captions omit the same attributes, provided that the grammar contains such
+    captions.
     """
     everything = {
         name
@@ -283,7 +284,7 @@ class Synthetic(MotionSource):
     def described(
         self, name: str, motion: np.ndarray, attributes: Attributes, words: np.random.Generator
     ) -> Clip:
-        """Returns the clip of a motion (F, 22, 3).
+        """Returns the clip for a motion (F, 22, 3).
 
         `words` draws the captions of the clip, and its name determines its split.
         """
@@ -335,9 +336,9 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 
 
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a motion of three seconds with at least the given attributes.
+    """Returns the joints (F, 22, 3) of a three-second motion with at least the given attributes.
 
-    For example, these are the attributes of a prompt.
+    The attributes may, for example, be those of a prompt.
     """
     name = str(attributes["action"])
     drawn = attributes

@@ -23,7 +23,7 @@ from flame_mdm.safe_io import naming, read_npy, read_text
 # Frames per second with which the tags `from` and `to` are converted to frames. The published code
 # also uses 20 for KIT-ML, although its motions have 12.5 frames per second.
 TAG_FPS = 20
-MAX_LENGTH = 200  # motions and cuts with this number of frames or more are left out
+MAX_LENGTH = 200  # motions and cuts with this many frames or more are left out
 MAX_TOKENS = 20
 
 
@@ -139,7 +139,7 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 
 
 class T2MFolder(MotionSource):
-    """A processed folder. Cuts and mirrored copies are in the split of their motion, their source.
+    """A processed folder. Cuts and mirrored copies are in the same split as their motion.
 
     The attribute `tokens` contains the words with their parts of speech, one list per caption. A
     mirrored copy has its own name, by which it can be excluded.
@@ -165,7 +165,7 @@ class T2MFolder(MotionSource):
         folder = self.path / "texts"
         if not folder.is_dir():
             archive = required(
-                self.path / "texts.zip", f"nor is the folder texts there; {self.get_it}"
+                self.path / "texts.zip", f"and there is no folder texts either; {self.get_it}"
             )
             folder = archives.as_folder(archive, self, lambda name: name.endswith(".txt"))
         return {
@@ -218,7 +218,7 @@ class T2MFolder(MotionSource):
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the statistics of `published.yaml`, which do not count mirrored copies."""
+        """Returns the statistics listed in `published.yaml`, which do not count mirrored copies."""
         texts = [
             text for name, texts in self.texts.items() if not name.startswith("M") for text in texts
         ]
@@ -260,13 +260,13 @@ class T2MFolder(MotionSource):
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:
-            reason = f"of {MAX_LENGTH} frames or more"
+            reason = f"with {MAX_LENGTH} frames or more"
         elif not self.texts[name]:
             reason = "without a caption"
         elif not items:
-            reason = "with captions of unfit parts only"
+            reason = "whose captions all describe parts that are too short or too long"
         else:
             lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in items)
             self.leave_out("captions of parts that are too short or too long", lost)
             return
-        self.leave_out(f"names of {self.names[name]} {reason}")
+        self.leave_out(f"names in {self.names[name]} {reason}")

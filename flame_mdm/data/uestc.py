@@ -26,12 +26,12 @@ TRAIN_SUBJECTS = (
     107, 108, 112, 113,
 )
 # fmt: on
-"""Training subjects of the cross-subject protocol: 51 of 118. The other 67 are for testing."""
+"""Training subjects of the cross-subject protocol: 51 of 118. The other 67 are used for testing."""
 # Number of training subjects that the project's own split uses for validation
 VAL_SUBJECTS = 5
 # Minimum length of a training clip: three quarters of 60
 MIN_FRAMES = 45
-# Index of the middle of the hips in VIBE's 49 joints; ACTOR uses it as the root
+# Index of the mid-hip joint among VIBE's 49 joints; ACTOR uses it as the root
 ROOT = 8
 # Focal length and image size in pixels that ACTOR assumes, because VIBE estimates only a scale
 FOCAL_LENGTH = 500.0
@@ -40,7 +40,7 @@ NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 
 class Video(NamedTuple):
-    """Fields of a video's file name. `index` is its position in the lists."""
+    """Fields in a video's file name. `index` is its position in the lists."""
 
     index: int
     id: str
@@ -85,12 +85,12 @@ class UESTC(MotionSource):
 
     @cached_property
     def poses(self) -> Path:
-        """The file of the poses."""
+        """The file with the poses."""
         return find(self.path, "vibe_cache_refined.pkl")
 
     @cached_property
     def videos(self) -> list[Video]:
-        """All videos, in the order of the file of poses.
+        """All videos, in the order of the pose file.
 
         Raises:
             UserError: If a name cannot be parsed.

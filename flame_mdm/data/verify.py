@@ -1,4 +1,4 @@
-"""Verification report of a prepared data set: contents, published figures and anomalies."""
+"""Verification report for a prepared data set: contents, published figures and anomalies."""
 
 import json
 from collections import Counter, defaultdict
@@ -124,7 +124,7 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns figures of the store and of its raw data.
+    """Returns figures for the store and for its raw data.
 
     If a figure exists for both, the figure of the raw data is returned.
     """

@@ -49,7 +49,7 @@ class Representation(nn.Module, ABC):
 
     Args:
         name: name in stores and checkpoints. Features with different names are never combined.
-        features: D, the number of features of a frame.
+        features: D, the number of features per frame.
         fps: frames per second, 1 to 1000.
         skeleton: the skeleton of the decoded joints.
 
@@ -76,7 +76,7 @@ class Representation(nn.Module, ABC):
     #: (D,) standard deviation of the features.
     std: Tensor
     #: Name of a longer representation that begins with these features, so that its features can be
-    #: cut to them.
+    #: truncated to them.
     part_of: str = ""
     #: Whether the root is encoded as steps between frames. If so, any window of frames is a motion.
     relative: bool = True
@@ -88,7 +88,7 @@ class Representation(nn.Module, ABC):
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         super().__init__()
         if not isinstance(fps, int | float) or not 1 <= fps <= 1000:
-            raise UserError(f"representation.fps={fps}: expected frames per second from 1 to 1000")
+            raise UserError(f"representation.fps={fps}: expected 1 to 1000 frames per second")
         self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
         self.pose = slice(0, features)
         self.register_buffer("mean", torch.zeros(features))
@@ -141,7 +141,7 @@ class Representation(nn.Module, ABC):
     def contacts(self, features: Features) -> Features | None:
         """Returns the columns (..., F, N) for contacts of `skeleton.feet` with the floor.
 
-        The values are about 0 to 1. Returns None if the features contain no contacts.
+        The values range from about 0 to 1. Returns None if the features contain no contacts.
         """
         columns = self.slices.get("contacts")
         return None if columns is None else features[..., columns]
@@ -174,7 +174,7 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
     if not motion.isfinite().all():
         frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
         raise UserError(
-            f"{name}: frame {frame} contains numbers that are not finite. Leave the motion out"
+            f"{name}: frame {frame} contains numbers that are not finite. Exclude the motion"
         )
 
 

@@ -34,20 +34,20 @@ class HumanML(Representation):
     | positions | 3 (J - 1) | joints except the root, in body coordinates: root at x = z = 0, facing +z |
     | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the previous one; shortest arcs, not SMPL's |
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
-    | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves to the next frame |
+    | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves until the next frame |
 
     The heading is 0 when the body faces +z, and increases as the body turns left, toward +x.
     Motions are first made canonical: the lowest joint is at y = 0, and in the first frame, the
     root is at x = z = 0 and the body faces +z.
 
-    The variant "legacy" equals the published data with all its peculiarities. The direction across the
-    body is the direction across the shoulders minus the direction across the hips, instead of their
-    sum. In the first frame, the heading is 0,
-    although the smoothed heading is not. `turn` is half the turn to the right, and changes its sign
-    where the heading crosses 180 degrees. The root velocity is in the body coordinates of the next
-    frame. Rotations are world rotations of the bones relative to the inverse heading, also at the
-    shoulders. `decode` is the published decoding. If a bone is exactly opposite to its rest
-    direction, the published code returns NaN. In this implementation, the rotation is a half turn.
+    The variant "legacy" equals the published data with all its peculiarities. The direction across
+    the body is the direction across the shoulders minus the direction across the hips, instead of
+    their sum. In the first frame, the heading is 0, although the smoothed heading is not. `turn` is
+    half the turn to the right, and changes its sign where the heading crosses 180 degrees. The root
+    velocity is in the body coordinates of the next frame. Rotations are world rotations of the
+    bones relative to the inverse heading, also at the shoulders. `decode` is the published
+    decoding. If a bone is exactly opposite to its rest direction, the published code returns NaN.
+    In this implementation, the rotation is a half turn.
 
     The variant "clean" has none of these peculiarities. Headings are unwrapped before smoothing.
     They are also padded point-symmetrically at both ends, which preserves steady turns and the
@@ -95,7 +95,7 @@ class HumanML(Representation):
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
             raise UserError(
-                f"bone_lengths: {len(bone_lengths)} numbers, but {skeleton} has {joints} joints"
+                f"bone_lengths: got {len(bone_lengths)} numbers, but {skeleton} has {joints} joints"
             )
         widths = {"turn": 1, "root_velocity": 2, "root_height": 1, "positions": 3 * (joints - 1)}
         name = f"humanml-{variant}-{skeleton}"
@@ -195,7 +195,7 @@ class HumanML(Representation):
                 )
             if len(motion) < 3:
                 raise UserError(
-                    f"{name}: {len(motion)} frames, but encoding needs at least 3. Leave the motion out"
+                    f"{name}: it has only {len(motion)} frames, but encoding needs at least 3. Exclude it"
                 )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]

@@ -23,7 +23,7 @@ class Motion272(Representation):
     | turn | 6 | rotation about y from the previous frame's body coordinates to this frame's, 6D rows |
     | positions | 66 | joints in body coordinates: the root is at x = z = 0, the lowest joint of the motion at y = 0 |
     | velocities | 66 | differences of `positions` from the previous frame, without the root's displacement and turn |
-    | rotations | 132 | SMPL's rotations as 6D rows, of the root in body coordinates |
+    | rotations | 132 | SMPL's rotations as 6D rows; the root's rotation is in body coordinates |
 
     In the first row, `turn` is the identity, and velocities are 0. The heading is computed from the
     root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z. Raw
@@ -52,7 +52,9 @@ class Motion272(Representation):
         """Encodes a raw motion (F >= 2, 3 + 3 K) of `smpl.read_pose` as (F, 272) float32."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
-            raise UserError("motion: 1 frame, but encoding needs at least 2. Leave the motion out")
+            raise UserError(
+                "motion: it has only 1 frame, but encoding needs at least 2. Exclude it"
+            )
         # Z up -> y up
         axes = torch.tensor(
             [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64
@@ -64,7 +66,7 @@ class Motion272(Representation):
         return self.features_of(joints, rotations)
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
-        """Returns features (F, 272) float32 of joints (F, 22, 3) and rotations (F, 22, 3, 3).
+        """Returns features (F, 272) float32 for joints (F, 22, 3) and rotations (F, 22, 3, 3).
 
         Both have y up and face +z.
         """

@@ -26,7 +26,7 @@ class Rifke(Representation):
 
     | columns | content |
     |---|---|
-    | 0 | y of the root above the floor |
+    | 0 | height of the root above the floor |
     | 1:61 | joints except the root, in body coordinates: root at x = z = 0, facing +z; y above the floor |
     | 61 | heading change since the previous frame, radians, 0 in the first frame |
     | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |

@@ -1,4 +1,4 @@
-"""Actions for games: dodging, ducking, blocking, being hit, and a stroke with a sword."""
+"""Actions for games: dodging, ducking, blocking, being hit, and striking with a sword."""
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def duck(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def hit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Is struck from the front: head and trunk snap back, and a foot steps behind."""
+    """Is struck from the front: head and trunk snap back, and a foot steps back."""
     start, side = rng.uniform(0.3, 0.6), int(rng.integers(2))
     sign, snap = SIGN[side], rng.uniform(0.8, 1.1)
     jerk = pulse(t, start, start + 0.14, start + 0.2, start + 0.8)

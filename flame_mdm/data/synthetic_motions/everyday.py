@@ -13,7 +13,7 @@ def hold(rng: np.random.Generator, t: np.ndarray, seconds: float = 0.5) -> np.nd
 
 
 def idle(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Breathes visibly, shifts the weight from one leg to the other and glances to a side."""
+    """Breathes visibly, shifts the weight from one leg to the other and glances to one side."""
     breath = beat(t, rng.uniform(0.3, 0.4), rng.random())
     body.spine[0] += 0.04 * breath
     body.shoulders += 0.06 * breath
@@ -100,7 +100,7 @@ def pray(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def cry(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Hides the face in the hands, bent, with shaking shoulders."""
+    """Hides the face in the hands, bent over, with shaking shoulders."""
     down = ease(t, rng.uniform(0.05, 0.2), rng.uniform(0.7, 0.9))
     sob = down * beat(t, rng.uniform(2.2, 2.8))
     for side, sign in enumerate(SIGN):
@@ -267,7 +267,7 @@ def talk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def stay_seated(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Sits during the whole clip and looks aside once."""
+    """Sits during the whole clip and looks to the side once."""
     seat(body, np.ones_like(t), np.zeros_like(t))
     body.head[1] += rng.uniform(-0.4, 0.4) * pulse(t, 0.3, 0.9, 1.4, 2.0)
 

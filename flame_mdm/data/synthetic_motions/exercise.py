@@ -18,7 +18,7 @@ LYING_HEEL = 1.35  # angle of a foot on its toes behind the lying body, in radia
 
 
 def stretch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Reaches up with both arms, on the toes, or bends to a side with the arms overhead."""
+    """Reaches up with both arms, on tiptoe, or bends to one side with the arms overhead."""
     start = rng.uniform(0.05, 0.2)
     up = pulse(t, start, start + rng.uniform(0.7, 0.9), t[-1] - 0.7, t[-1])
     for side in (0, 1):

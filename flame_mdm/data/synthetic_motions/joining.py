@@ -24,15 +24,14 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
 
     The changes during the second motion are added to the end of the first motion. The difference
     between the end of the first and the beginning of the second motion is faded out, except for the
-    position in the world. A foot that has another position at the beginning of the second motion
-    takes a step to this position.
+    position in the world. A foot that has a different position at the beginning of the second
+    motion takes a step to this position.
 
     Args:
         first: a body at evenly spaced times.
         second: a body at times with the same spacing.
-        overlap: number of seconds by which the second motion begins before the end of the first
-            motion.
-        blend: seconds after the end of the first motion in which the difference is faded out.
+        overlap: how many seconds before the end of the first motion the second one begins.
+        blend: how many seconds the difference takes to fade out after the end of the first motion.
     """
     spacing = second.t[1] - second.t[0]
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1

@@ -199,7 +199,7 @@ def swing_arms(body: Body, apart: np.ndarray, size: float) -> None:
 
 
 def turn(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Turns in place by a quarter or a half, with small steps."""
+    """Turns in place by a quarter or half turn, with small steps."""
     sign = 1 if requested["direction"] == "left" else -1
     low, high = (160, 195) if requested["amount"] == "half" else (75, 110)
     angle = sign * np.radians(rng.uniform(low, high))

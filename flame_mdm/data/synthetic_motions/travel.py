@@ -26,7 +26,7 @@ RISE, TREAD = 0.17, 0.29  # height and depth of a stair in meters
 
 
 def sneak(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Walks bent and slowly, with the hands in front.
+    """Walks slowly and bent over, with the hands in front.
 
     Feet are lifted high and land on the toes.
     """
@@ -174,7 +174,7 @@ def carry_box(body: Body, rng: np.random.Generator, t: np.ndarray, requested: At
 
 
 def push(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Leans against something heavy and walks it forward in short steps."""
+    """Leans against something heavy and pushes it forward in short steps."""
     gait = Gait(rng.uniform(0.56, 0.66), 0.8, 0.07, 0.6, 0.0, 0.1, 0.0)
     walk_along(body, rng, gait, rng.uniform(0.4, 0.55), straight(0, 1), RIGHT)
     effort = ease(t, -0.1, 0.4)

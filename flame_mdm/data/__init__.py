@@ -34,7 +34,7 @@ class Clip:
     motion: np.ndarray
     # Descriptions of the entire motion. Empty for data sets that only have action labels.
     captions: list[str]
-    # Split. Mirrored copies and cuts of a take are in the split of the take.
+    # Split. Mirrored copies and cuts of a take are in the same split as the take.
     split: Split
     # The take that the clip comes from. All clips from one source are in the same split.
     source: str
@@ -90,7 +90,7 @@ class MotionSource(ABC):
     version: int = 1
     """Version of the code that reads the motions.
 
-    The version is part of the fingerprint. Stores written by another version are not used.
+    The version is part of the fingerprint. Stores written by a different version are not used.
     """
     failures: Sequence[str] = ()
     """One line per motion that could not be read and was left out.

@@ -106,7 +106,7 @@ def read(file: Path | bytes, name: str) -> Recording:
 
     Args:
         file: path or content of the .npz file.
-        name: name of the file in error messages.
+        name: file name for error messages.
 
     Raises:
         UserError: If the file is not a motion from the SMPL+H G release, or if a number is not
@@ -190,7 +190,7 @@ class Amass:
         Yields (key, result), sorted by key.
 
         Args:
-            arguments: argument of the function for each recording, by the key of the recording.
+            arguments: argument of the function for each recording, by the recording's key.
                 Keys and arguments must be picklable.
             function: called as `function(argument, recording)`. It must be picklable.
             workers: number of processes; 0 = one per core.

@@ -59,8 +59,8 @@ class Babel(MotionSource):
     """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
 
     Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
-    start) to floor(20 end) - 1. A label that is longer than a clip results in one window every
-    `STRIDE` frames. If a label is shorter than a clip, the clip continues past the end of the label. The
+    start) to floor(20 end) - 1. A label that is longer than a clip yields one window every `STRIDE`
+    frames. If a label is shorter than a clip, the clip continues past the end of the label. The
     label is left out if the motion ends before the clip.
 
     Both splits train on BABEL's entire train part, and test on 20 % of its val part. The project's
@@ -181,7 +181,7 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the used fields of a label. Raises `TypeError` if a field has another type."""
+    """Returns the used fields of a label. Raises `TypeError` if a field has the wrong type."""
     text, kinds, times = label["proc_label"], label["act_cat"], (label["start_t"], label["end_t"])
     are_texts = all(isinstance(value, str | None) for value in (text, *(kinds or ())))
     if not are_texts or not all(time is None or -1e6 < time < 1e6 for time in times):

@@ -1,4 +1,4 @@
-"""The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes of three actors.
+"""The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes by three actors.
 
 The actors perform 25 contents in 19 styles. Source: Kobayashi et al., arXiv 2306.08861, 2023;
 CC BY-NC 4.0. `docs/bandai.md` describes the data set and its preparation.
@@ -56,7 +56,7 @@ def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the axes of a joint of the left limb and, mirrored, of the right limb.
+    """Returns the axes of a joint in the left limb and, mirrored, in the right limb.
 
     In the right limb, the bone points along -x.
     """
@@ -224,7 +224,7 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
         kind: "joints", or "smpl" for the motion (F, 75) of `smpl_motion`.
 
     Raises:
-        UserError: If the file has another skeleton, or if a joint jumps.
+        UserError: If the file has a different skeleton, or if a joint jumps.
     """
     recording = read_recording(file, fps, standard=_standard)
     if recording.doubts.jump:

@@ -110,7 +110,7 @@ class CMU(MotionSource):
     captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
     in the test (val) split if a test (val) clip of HumanML3D is cut from it. If HumanML3D has no
     clip of the recording, the subject determines the split. If there is a table `captions.csv`, its
-    rows are the only captions, and each part of a recording that it names is one clip.
+    rows are the only captions, and each part of a recording that it lists is one clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -504,8 +504,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
             offsets=offsets,
             joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints),
         )
-    # The Daz-friendly conversion moves another figure. Its rotations are kept, and its bones are
-    # replaced by the bones of a person.
+    # The Daz-friendly conversion animates a different figure. Its rotations are kept, and its bones
+    # are replaced by the bones of a person.
     elif "lButtock" in tree.joints:
         tree, unit, blended = _added(tree, upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
         rows = [

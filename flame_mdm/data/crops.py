@@ -80,8 +80,8 @@ class Units(Crop):
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
             raise UserError(
-                f"data.crop={self}: must have 1 <= unit <= min_frames <= max_frames, and "
-                "max_frames must be a multiple of unit"
+                f"data.crop={self}: expected 1 <= unit <= min_frames <= max_frames, and "
+                "max_frames a multiple of unit"
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:

@@ -120,7 +120,7 @@ class MotionDataModule(LightningDataModule):
         frames = (crop.min_frames, crop.longest()) if isinstance(crop, Crop) else (None,)
         is_crop = all(type(number) is int and 1 <= number <= MAX_FRAMES for number in frames)
         for key, value, is_valid, remedy in (
-            ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
+            ("batch_size", batch_size, batch_size >= 1, "use at least one clip per batch"),
             ("num_workers", num_workers, num_workers >= 0, "use 0 or more"),
             (
                 "name",
@@ -181,7 +181,7 @@ class MotionDataModule(LightningDataModule):
 
         Raises:
             FileNotFoundError: If the data set is not prepared.
-            UserError: If the store is damaged, or was prepared with other options.
+            UserError: If the store is damaged, or was prepared with different options.
         """
         store = Store(self.folder)
         recipe = {

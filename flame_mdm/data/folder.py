@@ -250,7 +250,7 @@ class Folder(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, MotionFile]:
-        """Files by their path in the folder without extension, sorted.
+        """Files, sorted, by their path in the folder without extension.
 
         If a file has several animations, each animation is named `PATH/ANIMATION`.
         """
@@ -392,7 +392,7 @@ def _read_table(path: Path, notes: dict[str, Note], exclude: Collection[str]) ->
 
 
 def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
-    """Adds the cells of a row of the table to the note of its motion."""
+    """Adds the cells of a table row to the note of its motion."""
     name, split = cells["id"], cells.get("split")
     if name not in notes:
         raise UserError(f"unknown motion {name!r}; ids are paths in the folder, without extension")

@@ -91,7 +91,7 @@ class HumanML3D(T2MFolder):
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked, from which missing
             motions are created. This also requires `index.csv` and HumanAct12's joints,
             `pose_data/humanact12.zip`, in the folder or next to it.
-        body_models: folder of the extended SMPL+H model.
+        body_models: folder with the extended SMPL+H model.
         bone_lengths: 22 bone lengths, in meters, of the skeleton to which all motions are
             retargeted.
         workers: number of processes; 0 = one per core.
@@ -168,7 +168,7 @@ class HumanML3D(T2MFolder):
     def _bodies(self) -> dict[str, Body]:
         if not self.body_models:
             raise FileNotFoundError(
-                "data.source.body_models is not set. Set it to the folder of the extended SMPL+H model"
+                "data.source.body_models is not set. Set it to the folder with the extended SMPL+H model"
             )
         return {gender: load_body(self.body_models, gender) for gender in ("male", "female")}
 

@@ -46,7 +46,10 @@ class KITTemos(MotionSource):
     name = "kit-temos"
     shortest, longest = 10, 500
     get_it = "get datasets/kit-splits from https://github.com/Mathux/TEMOS"
-    get_motions = "get KIT-ML at https://motion-annotation.humanoids.kit.edu/dataset and the joints as in docs/kit.md"
+    get_motions = (
+        "get KIT-ML at https://motion-annotation.humanoids.kit.edu/dataset and the joints as "
+        "described in docs/kit.md"
+    )
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
         self.path, self.splits, self.workers = Path(path), Path(splits), workers
@@ -66,7 +69,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def texts(self) -> dict[str, list[str]]:
-        """Captions of each motion in the splits. Motions without captions are left out."""
+        """Captions for each motion in the splits. Motions without captions are left out."""
         names, texts = self.names, {}
         required(self.path, self.get_motions)
         for name in names:

@@ -185,7 +185,7 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
-    """Returns the content of a pickle of protocol 0 to 5.
+    """Returns the content of a pickle with protocol 0 to 5.
 
     Objects whose names begin with one of `opaque` are also permitted. They are replaced by their
     state.

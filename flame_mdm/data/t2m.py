@@ -67,7 +67,7 @@ class Cut(NamedTuple):
 def parse(text: str, where: str) -> list[Description]:
     """Parses the descriptions in a text file. As in the published code, a NaN tag means 0.
 
-    `where` names the file in error messages.
+    `where` identifies the file in error messages.
     """
     descriptions = []
     for number, line in enumerate(map(str.strip, text.splitlines()), 1):
@@ -84,11 +84,11 @@ def parse(text: str, where: str) -> list[Description]:
 
 
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
-    """Returns the items of a motion of `frames` frames, in the published order.
+    """Returns the items of a motion with `frames` frames, in the published order.
 
-    The description of a part results in a separate item, NAME@from-to, and a second description of
-    the same part in NAME@from-to#2. As in the published code, a motion that is too short or too long
-    results in no items, even if parts of it would fit.
+    The description of a part yields a separate item, NAME@from-to, and a second description of the
+    same part in NAME@from-to#2. As in the published code, a motion that is too short or too long
+    yields no items, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []

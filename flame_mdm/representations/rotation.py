@@ -89,9 +89,9 @@ def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15).
 
-    Every finite pair of vectors results in a rotation. If one vector has no direction, it is
-    replaced by the basis vector that is least parallel to the other vector. If the vectors are
-    parallel, such a basis vector replaces the second one. Two zero vectors result in the identity.
+    Every finite pair of vectors yields a rotation. If one vector has no direction, it is replaced
+    by the basis vector that is least parallel to the other vector. If the vectors are parallel,
+    such a basis vector replaces the second one. Two zero vectors yield the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
     # No branches, because neither exported graphs nor torch.func.vmap, used in guidance, can

@@ -133,7 +133,7 @@ def run_in_place(
 def _tread(
     body: Body, frequency: float, lift: float, ahead: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lifts the feet in turn in place, the left foot first.
+    """Lifts the feet alternately in place, the left foot first.
 
     A foot is lifted by `lift` meters and moves `ahead` meters in the air. Returns two curves (F,).
     The first is a wave that is 1 when the left foot is up and -1 when the right foot is up. The
@@ -258,7 +258,7 @@ def climb_stairs(
 
 
 def _smooth(count: np.ndarray) -> np.ndarray:
-    """Returns a count (F,) that grows evenly, but more slowly between two steps."""
+    """Returns a count (F,) that grows at a nearly even pace, slowing between two steps."""
     return count - 0.05 * np.sin(2 * np.pi * count)
 
 

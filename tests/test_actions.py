@@ -266,7 +266,7 @@ def test_smpls_offsets_come_from_its_file_without_running_code(
     attack, wrong = Attack(os.mkdir, str(tmp_path / "run")), "not an SMPL model with 24 joints"
     wrongs = {"J_regressor": np.ones((52, 50)), "v_template": 3, "kintree_table": np.zeros((2, 24))}
     for name, value, message in (
-        ("v_template", attack, "not read as"),
+        ("v_template", attack, "cannot be read as"),
         *((*item, wrong) for item in wrongs.items()),
     ):
         with (

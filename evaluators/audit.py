@@ -267,7 +267,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Signs of the values that judge pairs of motion and text by features: 1, or -1 if lower is better."""
+        """Signs of the values that judge motion-text pairs by their features: 1, or -1 if lower is better."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -346,11 +346,12 @@ def _agreement(
     scores: Sequence[Mapping[str, np.ndarray]],
     perturbations: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, float | None]]:
-    """Returns how well metrics of pairs agree with exact attributes, by metric.
+    """Returns how well metrics that judge pairs agree with the exact attributes, by metric.
 
     "auc" is the probability that a pair with every requested attribute has a better score than a
-    pair that lacks an attribute. Its pairs are real motions and the strongest perturbations of the
-    meaning. "correlation" is Spearman's rank correlation, over these perturbations at all grades.
+    pair that lacks an attribute. It is computed from pairs with real motions and pairs with the
+    strongest perturbations of the meaning. "correlation" is Spearman's rank correlation over these
+    perturbations at all grades.
     Returns {} if the exact attributes are unknown.
     """
     truth = measure.truth

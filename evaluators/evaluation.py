@@ -34,8 +34,9 @@ SKIPPED = {"extractor": "extractor=none: metrics that need features were not com
 def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files from another system or a baseline, and writes the result file.
 
-    Real motions are measured first. If they do not have the values that the protocol expects, the
-    data or the extractor is wrong, and nothing is generated. The guide is `docs/evaluation.md`.
+    Real motions are measured first. If their values differ from the values that the protocol
+    expects, the data or the extractor is wrong, and nothing is generated. The guide is
+    `docs/evaluation.md`.
 
     Args:
         request: the keys of `flame-mdm evaluate`.
@@ -217,7 +218,7 @@ class Evaluation:
         return self.evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Returns a line for each value of real motions of the test split that differs from its expected value."""
+        """Returns a line for each value of the real test motions that differs from its expected value."""
         if not values or self.protocol.resized_samples or self.protocol.cuts_motions:
             return []
         lines = []
@@ -227,7 +228,7 @@ class Evaluation:
             if mean is None:
                 if not self.evaluator.skip_features:
                     lines.append(
-                        f"{metric} of real motions, expected {expected:g}, could not be computed"
+                        f"{metric} of real motions could not be computed (expected: {expected:g})"
                     )
             elif not abs(mean - expected) <= tolerance:
                 lines.append(
@@ -253,7 +254,7 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns notes that restrict the meaning of the values.
+        """Returns notes that limit how the values can be interpreted.
 
         The notes concern repeated clips, and unchecked values of real motions.
         """
@@ -261,12 +262,12 @@ class Evaluation:
         clips = len(self.protocol.selected(self.clips))
         drawn = {
             "motions": self.protocol.samples,
-            "real motions for comparisons of sets": self.protocol.real_samples,
+            "real motions for set comparisons": self.protocol.real_samples,
         }
         for purpose, count in drawn.items():
             if count is not None and count > clips:
                 lines.append(
-                    f"{count} {purpose} of {clips} clips: clips are repeated, which changes the "
+                    f"{count} {purpose} from {clips} clips: clips are repeated, which changes the "
                     f"distances between sets"
                 )
         if self.protocol.resized_samples and self._expected():
@@ -305,7 +306,8 @@ class Evaluation:
         if len(set(counts)) > 1:
             numbers = ", ".join(map(str, counts))
             warnings.append(
-                f"replications have {numbers} motions: values that depend on this number are mixed"
+                f"the replications have different numbers of motions ({numbers}), which affects "
+                "values that depend on this number"
             )
         return Outcome(scores, resampled, warnings, costs)
 

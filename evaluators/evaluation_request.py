@@ -36,7 +36,7 @@ class EvaluationKeys:
     )
     smpl: str | None = option(
         lambda: os.environ.get("FLAME_MDM_SMPL"),
-        "SMPL's model file (.pkl or .npz), from which the skeleton of the joints is taken",
+        "SMPL's model file (.pkl or .npz), which provides the skeleton of the joints",
     )
     from_samples: str | None = option(
         None,
@@ -50,7 +50,7 @@ class EvaluationKeys:
     split: Literal["train", "val", "test"] = option("test", "split to evaluate: train, val or test")
     seed: int = option(0, "seed of the noise and of the random choice of motions")
     replications: int | None = option(
-        None, "repetitions of the evaluation, instead of the protocol's number; noted in the result"
+        None, "number of replications, instead of the protocol's number; noted in the result"
     )
     samples: int | None = option(
         None, "motions per replication, instead of the protocol's number; noted in the result"
@@ -120,7 +120,7 @@ class EvaluationRequest(EvaluationKeys):
         ]
         if len(subjects) != 1:
             raise UserError(
-                "use exactly one of ckpt=FILE, from_samples=FOLDER and baseline=NAME, such as shuffled"
+                "use exactly one of ckpt=FILE, from_samples=FOLDER or baseline=NAME, such as shuffled"
             )
         if subjects != ["ckpt"] and not self.data:
             raise UserError(

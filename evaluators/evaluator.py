@@ -28,7 +28,7 @@ from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.seeds import key
 
-# Motions per update of a metric. More motions do not fit into a processor's cache.
+# Motions per update of a metric. More motions would not fit into the CPU cache.
 CHUNK = 64
 # Inputs of metrics that come from an extractor
 FEATURES = {"generated", "real", "text", "logits"}
@@ -74,7 +74,7 @@ class Evaluator:
     """Computes metrics of motions, with one feature pass for all metrics.
 
     For the same features, all values are bit-identical for any batch size and order. If there are
-    several processes, they share the feature pass. Each process gets whole batches, so that
+    several processes, they share the feature pass. Each process receives whole batches, so that
     features do not depend on the number of processes. The first process computes the metrics.
 
     Example:
@@ -206,7 +206,7 @@ class Evaluator:
     ) -> tuple[dict[str, float | None], dict[str, str]]:
         """Computes all metrics of generated motions and of their paired real motions, in the same order.
 
-        Comparisons of sets use `real`, a separate draw, because the distance of a set from itself
+        Comparisons of sets use `real`, a separate draw, because the distance from a set to itself
         is 0. Returns the values by name (`metric` or `metric/part`), and the reasons for missing
         values by metric. A value that cannot be computed is None. Both mappings are empty in all
         processes except the first. Raises `UserError` if the motions lack an input that a metric
@@ -270,7 +270,7 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name, whose declared properties can be read."""
+        """The metrics by name; their declared properties can be read."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:

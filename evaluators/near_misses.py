@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from flame_mdm.data.store import Entry
 
-# Names of the attribute for the action; clips without it have no near misses
+# Names of the attribute that states the action; clips without it have no near misses
 ACTION = (
     "action",
     "content",

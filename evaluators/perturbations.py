@@ -116,7 +116,7 @@ def crop(joints: Joints, percent: float) -> Joints:
 
 
 def drop_repetition(joints: Joints, count: int) -> Joints:
-    """Cuts one of `count` repetitions out of a motion, which becomes shorter.
+    """Cuts one of `count` repetitions out of a motion, which shortens it.
 
     The cut joins two frames with similar poses: the nearest poses whose distance in time is within
     20 % of one period. The second part continues at the position where the first part ends.

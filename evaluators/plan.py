@@ -122,13 +122,13 @@ class Plan:
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
     """Returns the prepared data with the representation of its store.
 
-    Raises `UserError` if no data set is named, the data set is not prepared, or the model
+    Raises `UserError` if no data set is given, the data set is not prepared, or the model
     generates another representation.
     """
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
         if "data" not in model.config:
-            raise UserError(f"{request.ckpt}: its recipe names no data set. Add data=NAME")
+            raise UserError(f"{request.ckpt}: its recipe specifies no data set. Add data=NAME")
         module, encoding = model.config["data"], model.config["representation"]
         trust({"data": module})
         root = module.get("root")
@@ -142,7 +142,7 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
     data = instantiate(module | {"root": root}, representation=representation, seed=0)
     if not isinstance(data, MotionDataModule):
         raise UserError(
-            f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME"
+            f"{request.ckpt}: its recipe specifies {type(data).__name__} as the data set. Add data=NAME"
         )
     data.setup("test")
     return data

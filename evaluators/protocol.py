@@ -47,7 +47,7 @@ class DrawnClip:
     caption: int | None
     #: Name shared by all motions with the same caption and length.
     prompt: str
-    #: Indices of the frames that the model gets as context and continues. They are not measured.
+    #: Indices of the frames that the model receives as context and continues. They are not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
@@ -82,7 +82,7 @@ class Multimodality(ClosedSchema):
     prompts: Int | None
     #: Motions per prompt.
     samples: Int
-    #: Number of repetitions.
+    #: Number of replications.
     replications: Int
     #: Mappings with the `_target_` of a metric, by name.
     metrics: dict[str, Config]
@@ -106,11 +106,11 @@ class Protocol(ClosedSchema):
     #: Condition of the generated motions.
     condition: Literal["text", "action", "none"]
     #: Mapping with the `_target_` of an `Extractor`, and its `path`. The path is left out if the
-    #: user must give it.
+    #: user must provide it.
     extractor: Config | None
     #: Mappings with the `_target_` of a metric, by name.
     metrics: dict[str, Config]
-    #: Number of repetitions of the evaluation.
+    #: Number of replications.
     replications: Count
     #: Motions per replication, from randomly drawn clips. None = each clip once.
     samples: Count | None = None
@@ -126,11 +126,11 @@ class Protocol(ClosedSchema):
     smoothing: Number | None = None
     #: Motions per batch, if the protocol measures time. The first batch is not timed.
     batch_size: Count | None = None
-    #: Frames that a model that continues frames gets as context. "drawn": the first of the drawn
-    #: frames, which are not measured. "start": as in DiP's code, frames of the clip that begin at
-    #: one of its first five frames; the motion that follows is as long as the drawn frames.
+    #: Frames that a model that continues frames receives as context. "drawn": the first of the
+    #: drawn frames, which are not measured. "start": as in DiP's code, frames of the clip that begin
+    #: at one of its first five frames; the motion that follows is as long as the drawn frames.
     context: Literal["drawn", "start"] = "drawn"
-    #: Number of context frames that the model gets; `open_protocol` sets it.
+    #: Number of context frames that the model receives; `open_protocol` sets it.
     context_frames: Int = 0
     #: Attributes that evaluated clips must have. {} = all clips of the split.
     only: dict[str, Any] = Field({})
@@ -215,7 +215,7 @@ class Protocol(ClosedSchema):
 
     @property
     def cuts_motions(self) -> bool:
-        """Whether the first frames of motions, which the model gets as context, are cut off before measuring."""
+        """Whether the first frames, which the model receives as context, are cut off before measuring."""
         return self.context_frames > 0 and self.context == "drawn"
 
     @property
@@ -339,7 +339,7 @@ def protocol_config(name: str) -> Config:
             raise UserError(f"protocol {name} has variants. Choose one of {', '.join(protocols)}")
     names = protocol_names(path.parent)
     raise UserError(
-        f"no protocol is called '{name}'.{did_you_mean(path.stem, names)} Available: {', '.join(names) or 'none'}"
+        f"unknown protocol '{name}'.{did_you_mean(path.stem, names)} Available: {', '.join(names) or 'none'}"
     )
 
 
@@ -392,7 +392,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
         for metric in bounds:
             if metric not in values:
                 raise UserError(
-                    f"protocol {name}: expected: no value is called {metric}.{did_you_mean(metric, values)}"
+                    f"protocol {name}: expected: unknown value {metric}.{did_you_mean(metric, values)}"
                 )
     return protocol
 

@@ -38,7 +38,7 @@ class Scores:
     reasons: Mapping[str, str]
     # Number of motions
     count: int
-    # Numbers of real motions in comparisons of sets, by the names of the values
+    # Numbers of real motions in set comparisons, by the names of the values
     real_counts: Mapping[str, int]
     units: Mapping[str, str]  # units of the values by name
 

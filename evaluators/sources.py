@@ -127,7 +127,7 @@ class Generator:
     def _read(self, path: Path, rows: list[DrawnClip]) -> dict[str, np.ndarray]:
         content = read_samples(path)
         if content["ids"].tolist() != [row.id for row in rows]:
-            raise UserError(f"{path}: contains motions of other clips. Delete this file")
+            raise UserError(f"{path}: contains motions for other clips. Delete this file")
         self.bar.update(len(rows))
         return content
 
@@ -150,7 +150,7 @@ class Generator:
         seconds = time.perf_counter() - begin
         for row, motion in zip(rows, motions, strict=True):
             if not np.isfinite(motion).all():
-                raise UserError(f"the model returned a motion that is not finite for {row.id}")
+                raise UserError(f"the model returned a non-finite motion for {row.id}")
         self.bar.update(len(rows))
         return motions, calls, seconds
 
@@ -214,8 +214,8 @@ class SampleFolder:
       meters, y up, at the data's frame rate.
     - `captions` (N,): only if the motions were generated for captions other than those that the protocol draws.
 
-    Raises `UserError` if the folder contains no such files, or if a file is damaged, names a clip
-    that is not in the split, or repeats a clip.
+    Raises `UserError` if the folder contains no such files, or if a file is damaged, lists a clip
+    that is not in the split, or lists a clip twice.
     """
 
     def __init__(self, folder: Path, representation: Representation):
@@ -229,7 +229,7 @@ class SampleFolder:
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of the rows from one file.
 
-        Raises `UserError` if the file names other clips.
+        Raises `UserError` if the file lists other clips.
         """
         path = self.files[replication]
         content = read_samples(path)
@@ -238,7 +238,7 @@ class SampleFolder:
         unknown = sorted(index.keys() - {row.id for row in rows})
         if unknown:
             raise UserError(
-                f"{path}: names {len(unknown)} clips that are not in the split, such as {unknown[0]}"
+                f"{path}: lists {len(unknown)} clips that are not in the split, such as {unknown[0]}"
             )
         if len(index) < len(ids):
             raise UserError(
@@ -396,7 +396,9 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
         or lengths.min() < 1
         or any(len(x) != sum(lengths.tolist()) for x in frames.values() if x.ndim)
     ):
-        raise UserError(f"{path}: ids, lengths, captions and frames do not match. Write it again")
+        raise UserError(
+            f"{path}: ids, lengths, captions and frames do not match. Write the file again"
+        )
     for name, array in frames.items():
         if (
             array.dtype.kind not in "fiu"
@@ -405,7 +407,7 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
         ):
             shape = "(frames, joints, 3)" if name == "joints" else "(frames, features)"
             raise UserError(
-                f"{path}: {name} is not an array {shape} of real numbers. Write it again"
+                f"{path}: expected {name} as an array {shape} of real numbers. Write the file again"
             )
     return content
 

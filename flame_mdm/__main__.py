@@ -15,7 +15,7 @@ COMMANDS = {
     "demo": "ask for motions in the browser",
     "edit": "keep part of a motion and resample the rest",
     "evaluate": "evaluate a checkpoint under a protocol",
-    "audit": "audit an evaluator: which perturbations its metrics detect, and from which strength",
+    "audit": "audit an evaluator: which perturbations its metrics detect, and at which strength",
     "tables": "render tables and figures from results",
     "benchmark": "train, evaluate and tabulate a set of small models",
     "prepare": "convert a data set to a packed store, or verify a store",

@@ -95,7 +95,7 @@ class Condition:
     target_mask: Tensor | None = None
 
     def drop(self, drop: Tensor) -> Condition:
-        """Replaces the conditions of some samples by the null condition.
+        """Replaces the conditions of some samples with the null condition.
 
         Only the text or action is replaced. The prefix and the target are kept.
 
@@ -179,7 +179,7 @@ class Edit:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature of this frame.
         mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t"
-            replaces the kept part of the noisy sample by the known motion with the same amount of
+            replaces the kept part of the noisy sample with the known motion with the same amount of
             noise (FLAME, RePaint). "trajectory" overwrites the early part of the flow's path
             (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
@@ -231,7 +231,7 @@ Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
 """
 
 Noise = Callable[[int], Tensor]
-"""Function that maps a draw's number 0, 1, 2, ... to the noise (B, F, D) for a sampling run.
+"""Function that maps the draw index (0, 1, 2, ...) to the noise (B, F, D) for a sampling run.
 
 Sampling starts from draw 0.
 """
@@ -294,7 +294,7 @@ class Constant:
     def on(self, device: torch.device) -> Tensor:
         """Returns the tensor on a device. Only the first call for a device waits for a copy."""
         if device not in self.tensors:
-            # The first call may happen in validation, whose inference tensors cannot be used in training.
+            # The first call may happen during validation, whose inference tensors training cannot use.
             with torch.inference_mode(False):
                 self.tensors[device] = torch.tensor(self.values, device=device)
         return self.tensors[device]

@@ -131,7 +131,7 @@ def renamed_names(module: str, names: Mapping[str, str], since: str) -> Callable
     def get(name: str) -> Any:
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
-        message = f"{module}.{name} is called {names[name]} since version {since}"
+        message = f"{module}.{name} was renamed to {names[name]} in version {since}"
         warnings.warn(message, DeprecationWarning, stacklevel=2)
         return getattr(sys.modules[module], names[name])
 

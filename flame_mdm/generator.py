@@ -71,7 +71,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames of which all lengths in training are multiples."""
+    """Returns the number of frames of which all training lengths are multiples."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -219,10 +219,10 @@ class MotionGenerator(Model, nn.Module):
             batch: conditions, `mask` and `ids` of B motions; its `x` is ignored.
             options: sampler options. For an option that is None, the recipe's value is used.
             seed: seed of the noise.
-            replication: number of the repetition, to sample several motions per id.
+            replication: index of the replication, to sample several motions per id.
             edit: part of a motion to keep.
-            windows: windows that cover motions longer than the motions in training. The
-                conditions of the windows replace the conditions of the batch.
+            windows: windows that cover motions longer than the training motions. The conditions of
+                the windows replace the conditions of the batch.
             prefix: (B, C, D) normalized features of the frames before the motions. Required by a
                 model with `context_frames` C. Such a model continues the prefix block by block and
                 accepts no edit, windows or trajectory.
@@ -333,7 +333,7 @@ class Blocks:
     """Motions that are generated in blocks; each block continues the last frames of the previous one.
 
     Source: Tevet et al. 2025, "CLoSD". The noise of a block is a function of (seed, replication,
-    id, number of the block). A change of a condition therefore changes only the later blocks.
+    id, block index). Changing a condition therefore changes only the later blocks.
 
     Args:
         model: a model whose denoiser has `context_frames` C.
@@ -341,7 +341,7 @@ class Blocks:
         prefix: (B, C, D) normalized features of the frames before the first block.
         options: sampler options; none of them is None.
         seed: seed of the noise.
-        replication: number of the repetition, to sample several motions per id.
+        replication: index of the replication, to sample several motions per id.
         unconditioned: whether the conditions are null conditions, so that no guidance is needed.
         fade: number of frames after a seam over which a jump between two blocks is faded out; see
             `joined`. 0 = no fading, as in DiP's code.
@@ -372,7 +372,7 @@ class Blocks:
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
         self.fade = fade
-        self.number = 0  # number of the next block
+        self.number = 0  # index of the next block
 
     @torch.no_grad()
     def sample(

@@ -72,7 +72,7 @@ def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> T
 
 
 class MotionLosses(nn.Module):
-    """Weighted geometric losses of MDM, and a loss of bone lengths.
+    """Weighted geometric losses of MDM, and a bone-length loss.
 
     Sources: Tevet et al. 2022, eq. 3-5, and Liang et al. 2024, InterGen. All losses are means
     over real frames and entries: the norms in the paper are divided by the number of entries per

@@ -25,7 +25,7 @@ A million steps, logged every 50 steps, take about 20 MiB.
 
 
 class RunConfig(Schema):
-    """The keys of a run's configuration that pages read."""
+    """The keys of a run's configuration that the report pages use."""
 
     experiment: str | None
     name: Annotated[str | Int | Number, Field(validation_alias=AliasPath("run", "name"))] = (
@@ -73,10 +73,10 @@ class Fault(Schema):
 
 
 def made_by(path: str | Path) -> str:
-    """Returns a text about how to obtain a missing checkpoint or extractor.
+    """Returns a text that explains how to obtain a missing checkpoint or extractor.
 
-    The text is the command that creates the file or, if no command creates it, names the page that
-    states where to find it.
+    The text is the command that creates the file or, if no command creates it, the page that states
+    where to find it.
     """
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)

@@ -69,7 +69,7 @@ class SamplerOptions:
             type(step) is int and least <= step <= MAX_STEPS for step in listed
         ):
             raise UserError(
-                f"num_inference_steps={steps}: expected a number of steps, or a list, up to {MAX_STEPS:,}"
+                f"num_inference_steps={steps}: expected a number of steps, or a list of steps, up to {MAX_STEPS:,}"
             )
         object.__setattr__(
             self, "num_inference_steps", tuple(steps) if isinstance(steps, list) else steps

@@ -49,7 +49,7 @@ class ClosedSchema(Schema):
 
 EXPECTED = {
     **{
-        "string": "a text",
+        "string": "a string",
         "bool": "true or false",
         "int": "a whole number",
         "float": "a number",
@@ -58,7 +58,7 @@ EXPECTED = {
     **{"less": "a smaller number", "greater": "a larger number", "none": "null"},
     **{"dict": "a mapping", "model": "a mapping", "list": "a list"},
     **{
-        "string_too_short": "a non-empty text",
+        "string_too_short": "a non-empty string",
         "too_short": "a longer list or mapping",
         "too_long": "a shorter list",
     },
@@ -122,7 +122,7 @@ def _first_error(error: ValidationError, content: Any) -> str:
             keys.append(str(key))
     name = ".".join(keys) or "the file"
     if first["loc"] and first["loc"][-1] == "[key]":
-        return f"{name}: a key is not a text. Put it in quotes"
+        return f"{name}: a key is not a string. Put it in quotes"
     if kind == "missing":
         return f"{name} has no {first['loc'][-1]}"
     if kind == "value_error":

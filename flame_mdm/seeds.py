@@ -34,7 +34,7 @@ def key(*parts: str | int) -> int:
 
 
 def seed_generator(number: int, device: torch.device) -> None:
-    """Seeds torch's generators of the processor and of `device`.
+    """Seeds torch's generators for the CPU and for `device`.
 
     `torch.manual_seed` is slower: it seeds the generators of all devices, which takes about a
     millisecond if CUDA is not initialized.
@@ -113,11 +113,11 @@ def seeded_noise(
         frames: F.
         features: D.
         seed: seed of the run.
-        replication: number of the repetition of the run.
+        replication: index of the replication.
         like: a tensor; the noise has its device and precision.
 
     Returns:
-        A function from the number of a draw (0, 1, 2, ...) to noise (B, F, D).
+        A function that maps the draw index (0, 1, 2, ...) to noise (B, F, D).
     """
     keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
     return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

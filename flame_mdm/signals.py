@@ -18,7 +18,7 @@ _received: BaseException | None = None
 def stoppable(signums: Sequence[int]) -> Iterator[None]:
     """Turns signals into exceptions, so that partial files are deleted.
 
-    The exit code of the command is 128 + the number of the signal.
+    The exit code of the command is 128 + the signal number.
     """
     global _received
 
@@ -59,9 +59,8 @@ def raise_received() -> None:
 class StopRequest:
     """Records a signal that asks training to stop at the end of a step.
 
-    `signum` is the number of the signal; 0 = no signal. A second SIGINT stops immediately. A second
-    SIGTERM
-    also stops immediately, unless it comes within one second: `timeout` sends two at once.
+    `signum` is the signal number; 0 = no signal. A second SIGINT stops immediately. A second
+    SIGTERM also stops immediately, unless it comes within one second: `timeout` sends two at once.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)

@@ -179,10 +179,10 @@ class GeneratorTask(Task):
         parts: the four parts of the generator.
         losses: weights of `MotionLosses` on the clean estimate.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        cond_drop_prob: probability that a training sample gets the null condition.
+        cond_drop_prob: probability that a training sample receives the null condition.
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see
             `SamplerOptions`.
-        seed: seed of all random draws in training. Draws are functions of (seed, batch number,
+        seed: seed of all random draws during training. Draws are functions of (seed, batch number,
             rank).
         compile: compile the denoiser with torch.compile when training begins.
         checkpoint_activations: store fewer activations for the backward pass and recompute them;
@@ -258,7 +258,7 @@ class GeneratorTask(Task):
             seed=config["seed"],
             **section,
         )
-        # One object for both, so that facts added in training are also available in sampling.
+        # One object for both, so that facts added during training are also available for sampling.
         task.config = task.generator.config = config
         task.facts = task.generator.facts = {"actions": list(actions)}
         task.add_facts(facts or {})
@@ -343,7 +343,7 @@ class GeneratorTask(Task):
         return terms["loss"].mean()
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws which motions (B,) of a batch get the null condition."""
+        """Draws which motions (B,) of a batch receive the null condition."""
         return torch.rand(len(batch), device=self.device) < self.cond_drop_prob
 
     def loss_terms(
@@ -382,9 +382,9 @@ class GeneratorTask(Task):
         )
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
-        """Returns the losses (B,) of clips.
+        """Returns the losses (B,) for clips.
 
-        A clip gets the same time, noise and target in every call.
+        A clip receives the same time, noise and target on every call.
         """
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
         u, v = (draw[:, 0] for draw in uniform(keys, (1,)))

@@ -638,7 +638,7 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
         ("mdm", {"arch": "trans_dec"}, [], "unknown keys seqTransEncoder"),
         ("mfm", {"dynamic": "diffusion"}, [], "dynamic is \"diffusion\", not 'flow'"),
         ("mfm", {"text_emebed": "t5-large"}, [], "text_emebed is \"t5-large\", not 'clip'"),
-        ("flame", {}, [], "flame takes no file of options"),
+        ("flame", {}, [], "flame takes no options file"),
     ):
         words = released_file(bad, small_state(150), {"dataset": "uestc"} | change)
         refused("import", kind, *words, *more, says=message)

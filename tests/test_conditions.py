@@ -441,7 +441,7 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path, subtests):
         cases.append(
             (
                 lambda refused=refused: refused(texts),
-                rf"revision={revision}: {absent} .* 40 hex digits",
+                rf"revision={revision}: {absent} .* 40-digit commit hash",
             )
         )
     for call, message in cases:

@@ -114,7 +114,7 @@ def test_yaml_files_of_the_package_mean_the_same_to_both_readers(tmp_path):
 
 WRONG = {
     "trainer.max_step=5": "unknown config key 'trainer.max_step'. Did you mean trainer.max_steps",
-    "denoiser=mdm_encodr": "no denoiser is called 'mdm_encodr'. Did you mean mdm_encoder",
+    "denoiser=mdm_encodr": "unknown denoiser 'mdm_encodr'. Did you mean mdm_encoder",
     "data.source.clip=3": "Did you mean data.source.clips",
     "trainer.max_steps=[1": "cannot read an override",
     "+denoiser.heads=3": "unknown config key 'denoiser.heads'. Did you mean denoiser.num_heads?",
@@ -190,16 +190,16 @@ def test_recipes_outside_the_repository(tmp_path, subtests):
         ("losses: {joints: x}", "losses.joints=x: must be a finite number"),
         ("losses: null", "losses=None: must be a mapping"),
         ("losses: {feet: [1]}", "unknown config key 'losses.feet'"),
-        ("ema: 1", "ema=1: must be a mapping of keys or null"),
+        ("ema: 1", "ema=1: must be a mapping of keys to values or null"),
         ("ema: {decay: x}", "ema.decay=x: must be a finite number"),
         ("ema: {decays: 0.9}", "unknown config key 'ema.decays'"),
         ("seed: abc", "seed=abc: must be a whole number"),
         ("seed: -1", "seed=-1: must be from 0 to"),
-        ("initial_weights: 3", "initial_weights=3: must be a text or null"),
+        ("initial_weights: 3", "initial_weights=3: must be a string or null"),
         ("lr_decay: x", "lr_decay=x: must be a finite number or null"),
         ("lr_warmup: 1.5", "lr_warmup=1.5: must be a whole number or null"),
-        ("data_root: [a]", "data_root=['a']: must be a text"),
-        ("run: {dir: 3}", "run.dir=3: must be a text"),
+        ("data_root: [a]", "data_root=['a']: must be a string"),
+        ("run: {dir: 3}", "run.dir=3: must be a string"),
         ("callbacks: 3", "callbacks=3: must be a mapping"),
         ("logger: x", "logger=x: must be a mapping"),
         ("losess: {joints: 1.0}", "unknown config key 'losess'. Did you mean losses"),
@@ -423,7 +423,7 @@ def test_wrong_words_are_one_line(capsys, subtests):
         (["steps=1.5"], "steps=1.5: must be a whole number or a list"),
         (["loop=yes"], "loop=yes: must be true or false"),
         (["rate=nan"], "rate=nan: must be a finite number or null"),
-        (["rate=1,2"], "rate=1,2: several values. Use a single value, or a list: rate=[1,2]"),
+        (["rate=1,2"], "rate=1,2: got several values. Use a single value, or a list: rate=[1,2]"),
         (["which=first"], "which=first: must be one of last, best"),
         (["names='a"], "No closing quotation"),
         (["--fast"], "unknown option --fast"),
@@ -482,7 +482,7 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys, subte
 
     for extra, message in (
         (["launch=slurm"], "launch=slurm: this machine has no srun"),
-        (["launch=nothing"], "no launch is called 'nothing'"),
+        (["launch=nothing"], "unknown launch 'nothing'"),
         (["--multirun", "out=a.json"], "out=a.json: 4 jobs would write to this path. Remove out="),
         (["--fast", "--multirun"], "unknown option --fast"),
         (
@@ -545,7 +545,7 @@ def test_settings_with_a_data_set_compose_it(tmp_path, subtests):
     for line, message in (
         ("data=synthetic data.source.clip=5", r"Did you mean data\.source\.clips"),
         ("data.x=5", "no data set is named"),
-        ("data=syntetic", "no data is called 'syntetic'"),
+        ("data=syntetic", "unknown data 'syntetic'"),
     ):
         with subtests.test(line=line, message=message), pytest.raises(UserError, match=message):
             read_settings(EvaluateSettings, line.split())

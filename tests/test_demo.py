@@ -83,7 +83,7 @@ BAD = {
     "seed=99999999999999999999": "seed=99999999999999999999", "seed=1&seed=2": "seed is given twice",
     "num_inference_steps=1000000": "num_inference_steps=1000000", "num_inference_steps=400": "400",
     "guidance_scale=NaN": "guidance_scale=NaN", "cleanup=maybe": "cleanup=maybe",
-    "sampler=../../etc": "unknown sampler '../../etc'. GaussianDiffusion has ancestral",
+    "sampler=../../etc": "unknown sampler '../../etc'. Available for GaussianDiffusion: ancestral",
     "model=/etc/passwd": "unknown model '/etc/passwd'", "model=packige": "Did you mean package?",
     "text=": "the text is empty", "text=walks+|": "part 2 is empty", "text=" + quote("a\x00b\x1b[31m"): "text=",
     "text=walks+@600+|+waves": "the parts are too long. Use at most 30 seconds in total",

@@ -245,9 +245,9 @@ def test_evaluations_run_as_jobs_of_a_launcher(tmp_path, monkeypatch):
 
 
 REFUSED = {
-    "train quickstart launch=slurmm": "no launch is called 'slurmm'. Did you mean slurm?",
+    "train quickstart launch=slurmm": "unknown launch 'slurmm'. Did you mean slurm?",
     "train quickstart launch=local trainer.devices=2": "launch=local runs each job in one process",
-    "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "no logger is called 'nothing'",
+    "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "unknown logger 'nothing'",
     "train quickstart launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
     "train quickstart launch=slurm": "launch=slurm: this machine has no srun. Run the command on a",
     "train quickstart seed=0,1": "seed=0,1: several values make a sweep with one run per value. Add --multirun",

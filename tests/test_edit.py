@@ -255,7 +255,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
         (
             diffusion,
             {"region": [5, 5]},
-            r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec",
+            r"region=\[5, 5\] is not a range within this motion, which has 40 frames \(2 sec",
         ),
         (diffusion, {"region": [[1, 2], 3]}, r"expected \[begin, end\], or sev"),
         (
@@ -341,7 +341,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, su
         ("kit:1", {}, "no prepared data set"),
         ("walk", {}, r"Use a \.npz, \.bvh, .* file, or dataset:id"),
         (CLIP[:-2] + "3", {}, r"has no clip .*\. Did you mean synthetic_0_000003"),
-        (CLIP, {"cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
+        (CLIP, {"cut": [1, 99]}, f"is not a range within {CLIP}, which lasts"),
     ]
     for source, options, message in cases:
         with subtests.test(message=message):

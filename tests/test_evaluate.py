@@ -442,7 +442,7 @@ def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
 def test_more_motions_than_clips_are_said_to_repeat_clips(runs):
     evaluation = runs.evaluation(samples=500)
     assert evaluation._conditions() == [
-        f"500 motions of {len(evaluation.clips)} clips: clips are repeated, which changes the distances between sets"
+        f"500 motions from {len(evaluation.clips)} clips: clips are repeated, which changes the distances between sets"
     ]
     assert runs.evaluation(samples=5)._conditions() == []
 
@@ -656,7 +656,7 @@ def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(run
         runs.evaluation(features=True), expected={"synthetic": {"diversity": [4.0, 0.5]}}
     )
     assert uncomputed.run(None).invalid_because == [
-        "diversity of real motions, expected 4, could not be computed"
+        "diversity of real motions could not be computed (expected: 4)"
     ]
     others = replace(evaluation, clips=runs.data().clips("val"))
     assert others.run(None).invalid_because == [], "nothing is expected of other splits"

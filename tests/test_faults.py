@@ -92,7 +92,7 @@ def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys, subtests):
             assert line.startswith(
                 f"error: {tmp_path / 'data' / STORE}: cannot be written: File too large. "
             )
-            assert f" are free on the disk of {tmp_path / 'data'}" in line
+            assert f" is free on the disk that contains {tmp_path / 'data'}" in line
             assert list(tmp_path.iterdir()) == []
 
 

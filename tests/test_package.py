@@ -76,7 +76,7 @@ def test_forms_of_issues_ask_for_something(path):
 def test_an_old_name_works_and_says_the_new_one(module, old, new):
     get = renamed_names(module, {old: new.__name__}, since="0.3")
     with pytest.warns(
-        DeprecationWarning, match=f"{old} is called {new.__name__} since version 0.3"
+        DeprecationWarning, match=f"{old} was renamed to {new.__name__} in version 0.3"
     ):
         assert get(old) is new
     with pytest.raises(AttributeError, match="has no attribute 'Nothing'"):

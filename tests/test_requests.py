@@ -250,7 +250,7 @@ def test_edit_takes_a_part_of_any_motion(model, tmp_path, subtests):
             np.testing.assert_allclose(
                 edited.original.joints[0, :, 1], pose[:, 1] + motion.joints[20, 0, 1], atol=0.02
             )
-    with one_line_error(r"cut=\[3, 9\] is not a range of .*, which lasts 4 seconds"):
+    with one_line_error(r"cut=\[3, 9\] is not a range within .*, which lasts 4 seconds"):
         flame_mdm.edit(model, motion, TEXT, cut=[3, 9], **options)
 
 

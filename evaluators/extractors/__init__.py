@@ -93,9 +93,9 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         trained, learned = self.task.representation, self.task.facts.get("dataset", dataset)
         if not self.reads(representation) or learned != dataset:
             raise UserError(
-                f"extractor {self.path}: trained on {trained.name} of {learned} at {trained.fps:g} frames per second, "
-                f"but the motions are {representation.name} of {dataset} at {representation.fps:g}. Train a matching "
-                f"extractor with make train EXP={self.recipes}/..."
+                f"extractor {self.path}: trained on {trained.name} features of {learned} at {trained.fps:g} frames "
+                f"per second, but the motions are {representation.name} features of {dataset} at "
+                f"{representation.fps:g}. Train a matching extractor with make train EXP={self.recipes}/..."
             )
 
     def reads(self, other: Representation) -> bool:
@@ -262,7 +262,7 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
 
 
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
-    """The second evaluator that MARDM released. Its CLIP-score is the `MotionCLIPScore` of its features.
+    """The second evaluator that MARDM released. Its CLIP-score is the `MotionCLIPScore` on its features.
 
     The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
     eval_std).
@@ -345,7 +345,7 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
 
 
 class UnconstrainedExtractor(ClassifierExtractor):
-    """The classifier for unconstrained HumanAct12 with its reference motions, from a folder of two files."""
+    """The classifier for unconstrained HumanAct12 and its reference motions, from a folder with two files."""
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
 

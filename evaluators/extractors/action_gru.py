@@ -14,7 +14,7 @@ class ActionGRU(nn.Module):
 
     It classifies the state at the last real frame. The released weights provide the features and
     the accuracy in every HumanAct12 table. The authors draw the initial state from a normal
-    distribution in every call. In this implementation, the initial `state` (layers, B, hidden) is
+    distribution on every call. In this implementation, the initial `state` (layers, B, hidden) is
     zero by default.
     """
 

@@ -89,7 +89,7 @@ class MARDMClip(nn.Module):
 
 
 def clip_tokens(captions: Sequence[str]) -> Tensor:
-    """Returns CLIP's tokens (B, 77) of captions, with 0 after the end. Longer captions are cut."""
+    """Returns CLIP's tokens (B, 77) of captions, with 0 after the end. Longer captions are truncated."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
     encoded = tokenizer(
         list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt"

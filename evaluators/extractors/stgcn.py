@@ -117,7 +117,7 @@ class UESTC(STGCN):
 
 
 class Unconstrained(STGCN):
-    """The classifier of MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
+    """The classifier in MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
 
     def __init__(self):
         super().__init__(UNCONSTRAINED_PARENTS, 12, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))

@@ -24,7 +24,7 @@ from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
-# Number of tokens of a caption, including start and end marks
+# Number of tokens in a caption, including start and end marks
 SLOTS = MAX_TOKENS + 2
 # Number of frames that the movement encoder maps to one vector
 UNIT = 4
@@ -43,7 +43,7 @@ _SPECIAL_WORDS = {
     "Desc_VIP": "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly",
 }
 SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in words.split()}
-"""Words with a special part of speech, which overrides the tag of the tagger."""
+"""Words with a special part of speech, which overrides the tagger's tag."""
 
 
 class Words(NamedTuple):

@@ -218,7 +218,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self.network.text(self.words(tokens))
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of a batch: of the reconstruction at first, then of matching motions and texts."""
+        """Returns the loss of a batch: first the reconstruction loss, later the motion-text matching loss."""
         self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:

@@ -17,7 +17,7 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
 | contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
-| kept | (B, F, J) bool | True = this joint of this frame was to be kept, if motions are edits |
+| kept | (B, F, J) bool | True = the edit was to keep this joint in this frame, if motions are edits |
 | keys | (B,) int64 | unique keys of generated motions |
 | real | (R, E) | features of real motions |
 | real_joints | (B, F, J, 3) | real motions in meters, y up, floor at y = 0 |
@@ -26,8 +26,8 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | nearest, real_nearest | (B, 1 or 2) | distances from the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
-A key is the `flame_mdm.seeds.key` of an id. With several samples per id, the number of the sample
-is part of the key. Metrics that compare motions one by one (MID, position and displacement errors)
+A key is the `flame_mdm.seeds.key` of an id. With several samples per id, the sample index is
+part of the key. Metrics that compare motions one by one (MID, position and displacement errors)
 require real motions in the order of the generated motions.
 
 `compute()` returns a number, or a dict of numbers by name. Without samples, it returns None. It
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
-    """Creates metrics by name from mappings with a `_target_`. Each metric gets the `options` that it accepts."""
+    """Creates metrics by name from mappings with a `_target_`. Each metric receives the `options` that it accepts."""
     metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():
         legal = parameters(config["_target_"]) if "_target_" in config else ()

@@ -71,9 +71,9 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns for each query the probability that its correct candidate is among the k nearest.
+        """Returns the probability, for each query, that its correct candidate is among the k nearest.
 
-        The pool is random.
+        The probability is over random pools.
 
         Args:
             distance: (N, M) distances from queries to candidates.
@@ -100,8 +100,9 @@ class TextsForMotion(RPrecision):
 
     This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of
     FLAME's code. A motion ranks 32 texts by Euclidean distance: its own text, and 31 texts drawn
+    without replacement from other captions. In FLAME's code, a pool is a batch, so the last pool
     may be smaller. The motion's own text is at a random position, so that an extractor that cannot
-    tell texts apart gets k / 32.
+    tell texts apart scores k / 32.
 
     Args:
         pool: number of texts in a pool, including the motion's own text.
@@ -229,7 +230,7 @@ class MultimodalDistance(SampleMetric):
         self.normalize = normalize
 
     def value(self, generated: Tensor, text: Tensor) -> float:
-        """Returns the mean distance of features (N, E) of motions and texts."""
+        """Returns the mean distance between features (N, E) of motions and texts."""
         return self._distances(generated, text).mean().item()
 
     def _distances(self, generated: Tensor, text: Tensor) -> Tensor:
@@ -243,7 +244,7 @@ class MultimodalDistance(SampleMetric):
 
 
 class MotionCLIPScore(SampleMetric):
-    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and their texts.
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine between features of motions and texts.
 
     The value is in [-1, 1]; higher is better. `update` takes `generated` (B, E), `text` (B, E)
     and `keys` (B,).
@@ -259,11 +260,11 @@ class MotionCLIPScore(SampleMetric):
     states = ("generated", "text")
 
     def value(self, generated: Tensor, text: Tensor) -> float:
-        """Returns the mean cosine of features (N, E) of motions and texts."""
+        """Returns the mean cosine between features (N, E) of motions and texts."""
         return F.cosine_similarity(generated, text).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the cosine of each motion and its text."""
+        """Returns the cosine between each motion and its text."""
         cosines = F.normalize(rows["generated"], dim=-1) * F.normalize(rows["text"], dim=-1)
         return {"": equally_weighted(cosines.sum(1))}
 

@@ -162,9 +162,9 @@ def _lowered(
 ) -> dict[str, str | int]:
     """Reads crawling, lying down, sitting down and standing up.
 
-    The pelvis is higher than 78 cm if a person stands, between 35 and 72 cm if a person sits, and
-    below 35 cm if a person lies. The trunk of a person who lies or crawls is tilted by more than 55
-    degrees.
+    The pelvis is higher than 78 cm if a person is standing, between 35 and 72 cm if a person is
+    sitting, and below 35 cm if a person is lying. The trunk of a person who is lying or crawling is
+    tilted by more than 55 degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
@@ -193,7 +193,7 @@ def _locomotion(
     if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
-    # The speed in the middle counts, because walks begin and end with standing
+    # The speed in the middle counts, because walks start and end in a standing pose
     speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)
     ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
     if abs(turned) > 90:

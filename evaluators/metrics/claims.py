@@ -22,7 +22,7 @@ STEP = 0.0005  # meters per unit of the kept positions
 
 @lru_cache(maxsize=20_000)
 def claims_of(caption: str) -> tuple[Claim, ...]:
-    """Returns the claims of a caption. The result is cached, because many motions may have the same caption."""
+    """Returns the claims in a caption. The result is cached, because many motions may have the same caption."""
     return tuple(read_claims(caption))
 
 
@@ -31,9 +31,9 @@ class ClaimAccuracy(Timed, MotionMean):
 
     A metric of this project. The referee (`flame_mdm.sampling.referee`) reads the claims in the
     caption of each motion, and measures each claim on the joints of the motion. The values are
-    fractions in [0, 1] for each group of claims, such as "side"
-    and "count", and for "all" claims; higher is better. "decided" is the fraction of all claims
-    that are decided. "captions" is the fraction of captions with at least one decided claim.
+    fractions in [0, 1] for each group of claims, such as "side" and "count", and for "all" claims;
+    higher is better. "decided" is the fraction of all claims that are decided. "captions" is the
+    fraction of captions with at least one decided claim.
     Motions that are shorter than 0.5 seconds, or have a skeleton other than SMPL's 22 joints, are
     not judged.
 
@@ -74,7 +74,7 @@ class ClaimAccuracy(Timed, MotionMean):
         self.add(keys, rows)
 
     def judged(self, joints: np.ndarray, caption: str) -> list[Verdict]:
-        """Returns the verdicts on the claims of a caption about joints (F, J, 3)."""
+        """Returns the verdicts on the claims in a caption about joints (F, J, 3)."""
         if joints.shape[1] != len(SMPL22) or len(joints) < (SHORTEST + 0.1) * self.fps:
             return []
         return verdicts(joints, self.fps, claims_of(caption))

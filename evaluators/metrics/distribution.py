@@ -14,7 +14,7 @@ NEIGHBORS = 3
 
 
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E).
+    """Computes the Fréchet distance between normal distributions fitted to the rows of a (N, E) and b (M, E).
 
     In float64: |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982).
 
@@ -36,8 +36,9 @@ class FrechetMotionDistance(TwoSets):
     """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
     Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
-    means in float32, and scipy's `sqrtm` of the product. If `sqrtm` fails, it adds 1e-6 to the
-    diagonals. The values of this class and of the authors' code have a relative difference of 1e-8.
+    means in float32, and uses scipy's `sqrtm` for the product. If `sqrtm` fails, it adds 1e-6 to
+    the diagonals. The relative difference between the values of this class and of the authors' code
+    is 1e-8.
 
     Lower is better. The value is biased upward, especially with few samples, so compare only values
     with equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
@@ -53,14 +54,14 @@ class FrechetMotionDistance(TwoSets):
     higher_is_better = False
 
     def value(self, generated: Tensor, real: Tensor) -> float:
-        """Returns the distance of features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
+        """Returns the distance between features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
         # Rounding errors may make the value slightly negative
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the distance of two sets in which each motion is repeated as often as it was drawn."""
+        """Computes the distance between two sets in which each motion is repeated as often as it was drawn."""
         generated, real = rows["generated"], rows["real"]
         values = []
         for times in map(torch.from_numpy, weights):

@@ -33,7 +33,7 @@ def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Ten
 
 
 class Diversity(SampleMetric):
-    """Diversity: mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6).
+    """Diversity: mean distance between random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
     The best value is the diversity of real motions. Published values for text-to-motion use 300
     pairs, drawn as two sets without replacement. Published values for action-to-motion and
@@ -76,13 +76,13 @@ class Diversity(SampleMetric):
 
 
 class TextMultimodality(SampleMetric):
-    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): mean distance of random pairs per text.
+    """Multimodality as in Guo et al. 2022: mean distance between random pairs of motions for each text.
 
-    By default, 10 pairs are drawn from 30 motions for each text. As in the authors' code, two sets of 10
-    motions are drawn without replacement, with the same indices for all texts. A motion that is in
-    both sets may be paired with itself. Published values are for 100 texts. The code of MDM and MFM
-    uses whole batches, that is, 128 texts. `update` takes `generated` (B, E), `groups` (B,) and
-    `keys` (B,).
+    Source: MDM, B.2; MFM, eq. 12. By default, 10 pairs are drawn from 30 motions for each text.
+    As in the authors' code, two sets of 10 motions are drawn without replacement, with the same
+    indices for all texts. A motion that is in both sets may be paired with itself. Published values
+    are for 100 texts. The code of MDM and MFM uses whole batches, that is, 128 texts. `update`
+    takes `generated` (B, E), `groups` (B,) and `keys` (B,).
 
     Args:
         samples: number of motions per text.
@@ -115,7 +115,7 @@ class TextMultimodality(SampleMetric):
 
 
 class PairedMultimodality(SampleMetric):
-    """Multimodality of FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
+    """Multimodality as in FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
 
     FLAME published no code for this metric. FLAME's Table 3 states 10 motions per text, but eq. 19
     uses two sets of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
@@ -148,7 +148,7 @@ class PairedMultimodality(SampleMetric):
 
 
 class ActionMultimodality(SampleMetric):
-    """Multimodality of Guo et al. 2020 (MDM, eq. 7): mean distance of 20 random pairs for each class.
+    """Multimodality as in Guo et al. 2020 (MDM, eq. 7): mean distance between 20 random pairs per class.
 
     As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors
     divide the sum by the number of all classes. In this implementation, it is divided by the number
@@ -190,9 +190,9 @@ class ActionMultimodality(SampleMetric):
 
 
 class JointVariance(SampleMetric):
-    """Variance of joint positions among the motions of a text, in square meters.
+    """Variance of joint positions across the motions for a text, in square meters.
 
-    The variance over the `samples` motions of a text, which have equal length, is summed over x, y
+    The variance over the `samples` motions for a text, which have equal length, is summed over x, y
     and z, and averaged over joints, frames and texts. The denominator of the variance is n - 1. The
     value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of joints
     for the 10 generated motions", but eq. 18 defines a variance over the frames of one motion. No

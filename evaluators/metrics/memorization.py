@@ -61,7 +61,7 @@ class TrainingMotions:
             (B, 2), or (B, 1) without features. The first column is the root mean square distance
             of the joints in every fourth frame, in meters, from the best window of the same
             length; it is infinite if no training motion is long enough. The second column is the
-            distance of the features.
+            distance between the features.
         """
         squares = self.poses.square().sum(-1)
         # Number of frames from each frame to the end of its motion

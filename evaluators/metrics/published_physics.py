@@ -60,7 +60,7 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns by name the sum and the number (N, 2) of the values of each motion; {} if undefined."""
+        """Returns, by name, the sum and number (N, 2) of each motion's values; {} if undefined."""
         return super().readings(motions) if self.defined else {}
 
 
@@ -174,7 +174,7 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
 
 def _runs(aloft: Tensor) -> list[tuple[int, int]]:
-    """Returns the begin and end (exclusive) of each run of at least four True values in a mask (F,)."""
+    """Returns the start and end (exclusive) of each run of at least four True values in a mask (F,)."""
     runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
     return [(begin, end) for begin, end in runs if end - begin >= 4]
 
@@ -187,8 +187,6 @@ class KimodoQuality(PublishedPhysics):
       begin and end lower than 5 cm.
     - `low`: mean fraction of steps that begin lower than 5 cm. If it is 0, the first two values are
       also 0.
-
-
     - `skate_from_contacts`, `skate_max`: mean and largest speed of heels and toes in contact.
     - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15
       m/s and lower than 10 cm); higher is better.
@@ -248,7 +246,7 @@ class KimodoQuality(PublishedPhysics):
         self.add(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
 
     def extras(self, motions: Rows, i: int) -> dict[str, Tensor]:
-        """Returns the contacts of motion number i, if it has any."""
+        """Returns the contacts of motion i, if it has any."""
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
@@ -357,8 +355,8 @@ class PhysicalFootContact(PublishedPhysics):
     The score is the mean over frames of a product of three factors: the horizontal step of each
     foot in meters per frame (two factors), and the acceleration of the root divided by its largest
     value. Downward accelerations count as 0. The step of a foot is the smaller step of its ankle
-    and its toe. Motions without acceleration have no value. EDGE's code averages their NaN. Lower
-    is better.
+    and its toe. Motions without acceleration have no value; EDGE's code includes their NaN in the
+    mean. Lower is better.
 
     Args:
         fps: frames per second of the motions; at rates other than 30, `compute` raises

@@ -54,7 +54,7 @@ class Declared:
     def direction_of(self, name: str) -> bool | None:
         """Whether higher is better for the value with this name.
 
-        None = neither direction is better, or the value of real motions is best.
+        None = neither direction is better, or values closer to the value of real motions are better.
         """
         return self.directions.get(name, self.higher_is_better)
 
@@ -301,7 +301,7 @@ class MotionMean(SampleMetric):
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns by name the sum and the number (N, 2) of the values of each motion."""
+        """Returns, by name, the sum and number (N, 2) of each motion's values."""
         names = self.parts or self.names or [""]
         return {name: torch.as_tensor(rows[name]) for name in names if name in rows}
 
@@ -332,7 +332,7 @@ class JointMean(MotionMean):
         raise NotImplementedError
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns by name the sum and the number (N, 2) of the values of each motion."""
+        """Returns, by name, the sum and number (N, 2) of each motion's values."""
         self.reset()
         for i, joints in enumerate(motions["joints"]):
             mask = torch.ones(1, len(joints), dtype=torch.bool)
@@ -344,7 +344,7 @@ class JointMean(MotionMean):
         return {name: pairs[..., k] for k, name in enumerate(names) if pairs[:, 1, k].any()}
 
     def extras(self, motions: Rows, i: int) -> dict[str, Any]:
-        """Returns additional inputs of `update` for motion number i."""
+        """Returns additional inputs of `update` for motion i."""
         return {}
 
 

@@ -2,8 +2,8 @@
 
 A weight W (out, in) of attention or feed-forward layers becomes W + strength * up down, with `up`
 (out, rank) and `down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, the
-row of each new word gets an additional vector. In training, `torch.nn.utils.parametrize` computes
-the weights. This also works for code that reads a weight without calling its layer, such as
+row of each new word has an additional vector. During training, `torch.nn.utils.parametrize`
+computes the weights. This also works for code that reads a weight without calling its layer, such as
 cross-attention.
 
 All layers are trained, but a style keeps only the changes in the second half of them. The first
@@ -125,7 +125,7 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
-    """Copies the weights of a base model to a model, which may have attached changes.
+    """Copies the weights of a base model into a model, which may have attached changes.
 
     `base` is a path or name, as in `find`.
     """

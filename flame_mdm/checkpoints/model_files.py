@@ -48,7 +48,7 @@ def read_model_file(path: Path) -> dict[str, Any]:
     text = metadata.get(KEY)
     if ADAPTER in metadata:
         raise UserError(
-            f"{path} is an adapter, not a model. Name the model first, then the adapter: MODEL adapter={path}"
+            f"{path} is an adapter, not a model. Give the model first, then the adapter: MODEL adapter={path}"
         )
     if text is None:
         raise UserError(
@@ -195,7 +195,8 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
         if not is_dense or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
             shown = f"{str(name)[:80]} is {getattr(value, 'dtype', type(value).__name__)}"
             raise UserError(
-                f"{path} is damaged: its weights are not dense tensors of real numbers by name: {shown}"
+                f"{path} is damaged: its weights are not a mapping of names to dense tensors of real "
+                f"numbers: {shown}"
             )
     # The factor 2 allows for tensors with two names, which the file contains only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())

@@ -163,7 +163,7 @@ class Probe:
     """Records how a sampler combines noise and clean estimates.
 
     The probe replaces the denoiser, the noise and the `Guide`. `variance` is the constant that it
-    returns in the channels of a learned variance.
+    returns in the channels for a learned variance.
     """
 
     # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
@@ -187,7 +187,7 @@ class Probe:
         return self.unit(draw)
 
     def denoise(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Returns a constant instead of the denoiser's output, and records the time of the call."""
+        """Returns a constant instead of the denoiser's output, and records the call's diffusion time."""
         self.time = float(t[0])
         return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
 
@@ -306,10 +306,10 @@ class Call(nn.Module):
         Args:
             x_t: (B, F, D), noisy motion.
             t: (B,), times in units of the denoiser's table.
-            lengths: (B,), frames of each motion.
-            condition: (B, S) tokens of texts, or (B,) numbers of actions; None for an
-                unconditional model.
-            counts: (B,), tokens of each text.
+            lengths: (B,), number of frames of each motion.
+            condition: (B, S) tokens of texts, or (B,) action indices; None for an unconditional
+                model.
+            counts: (B,), number of tokens of each text.
         """
         return self._output(x_t, t, lengths, condition, counts, None)
 

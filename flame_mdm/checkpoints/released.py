@@ -134,7 +134,7 @@ def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
-    """Converts FLAME's network without RoBERTa.
+    """Converts FLAME's network, except for RoBERTa.
 
     FLAME's number of attention heads (8) cannot be read from the weights.
     """
@@ -269,9 +269,9 @@ def import_released(
     """
     file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):
-        needs = "takes no" if args else "needs a"
+        needs = "takes no" if args else "needs an"
         raise UserError(
-            f"{kind} {needs} file of options: MDM's args.json, or MFM's .hydra/config.yaml"
+            f"{kind} {needs} options file: MDM's args.json, or MFM's .hydra/config.yaml"
         )
     options = read_options(args, {} if num_heads is None else {"num_heads": num_heads})
     advice = "Add run_code=true if you trust the authors of the file"

@@ -6,7 +6,7 @@ python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
 The same caption, length and seed result in the same motion as `flame_mdm.generate`, which also
 understands sentences that differ from the captions of the training data. A model that continues
-frames starts from a person who stands.
+frames starts from a person who is standing.
 """
 
 from __future__ import annotations
@@ -285,11 +285,10 @@ class Sampler:
     ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action.
 
-        For an unconditional model, the prompt is "". `sample` is the sample number, which
+        For an unconditional model, the prompt is "". `sample` is the sample index, which
         distinguishes several motions for one text. `seconds` is 3 by default, or the model's
-        maximum if that is lower.
-        For a model that continues frames, the maximum is 600. Raises `ValueError` for an invalid
-        length or an unknown action, or if the result is not finite.
+        maximum if that is lower. For a model that continues frames, the maximum is 600. Raises
+        `ValueError` for an invalid length or an unknown action, or if the result is not finite.
         """
         content = self.content
         fps = content["fps"]

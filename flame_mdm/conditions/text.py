@@ -44,7 +44,7 @@ class PretrainedText(ConditionEncoder):
             new random numbers each time. FLAME was trained with one such map. In this
             implementation, the map is drawn with a fixed seed, and a released checkpoint can
             replace it.
-        revision: commit on the hub, 40 hex digits; required for models from the hub.
+        revision: full 40-digit commit hash on the hub; required for models from the hub.
         package: installed Python package that contains the files, instead of the hub. `model` is
             then the folder in the package.
         sha256: hash of the package's model.safetensors, checked before loading; required with
@@ -334,11 +334,9 @@ class Pretrained:
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
-            commits = (
-                f"40 hex digits of one commit from https://huggingface.co/{self.model}/commits"
-            )
+            commits = f"full 40-digit commit hash from https://huggingface.co/{self.model}/commits"
             raise UserError(
-                f"condition.revision={self.revision}: {self.model} is not pinned. Set it to the {commits}"
+                f"condition.revision={self.revision}: {self.model} is not pinned. Set the revision to a {commits}"
             )
         try:
             return loader.from_pretrained(self.model, revision=self.revision, **options)

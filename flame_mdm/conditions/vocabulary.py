@@ -186,7 +186,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 
 
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
-    """Returns the known word for which an unknown word probably stands; None if there is none.
+    """Returns the known word that an unknown word probably stands for; None if there is none.
 
     The unknown word is a typo of the known word, or has a similar meaning.
     """

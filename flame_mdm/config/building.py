@@ -38,7 +38,7 @@ RENAMED = {
 }
 """Names of classes in configurations of version 0.2, and their current names."""
 ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
-"""Names of the task that adapts models, whose configuration has a key `base`: in version 0.2, and now."""
+"""Names, in version 0.2 and now, of the task that adapts models. Its configuration has a key `base`."""
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
 """Limits for a configuration file: number of values, and depth of nested mappings and lists."""
 RUN_DIR = "${run.dir}"
@@ -139,7 +139,7 @@ def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **der
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(name, str):
-        raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")
+        raise UserError(f"missing _target_, the name of a class, in {str(node)[:80]}")
     if offered:
         legal = parameters(name)
         derived |= {key: value for key, value in offered.items() if key in legal or "**" in legal}

@@ -132,7 +132,7 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
         )
     if override.is_sweep_override():
         raise UserError(
-            f"{key}={text}: several values. Use a single value, or a list: {key}=[{text}]"
+            f"{key}={text}: got several values. Use a single value, or a list: {key}=[{text}]"
         )
     value = override.value()
     check_kind(key, value, annotation)

@@ -62,7 +62,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 def compose_data(
     name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0
 ) -> Config:
-    """Composes a file in experiments/data with its representation.
+    """Composes the configuration of a data set in experiments/data, including its representation.
 
     Returns the keys `data` and `representation`. Raises the same errors as `compose`.
     """
@@ -144,7 +144,8 @@ def find_recipe(name: str) -> ConfigSource:
         content = read_yaml(path)
         if not isinstance(content, dict):
             raise UserError(
-                f"{name}: not a recipe, because it has no keys. Begin it with `defaults:` and another recipe"
+                f"{name}: not a recipe, because it has no keys. Start it with a "
+                "`defaults:` list that names another recipe"
             )
         saved = "defaults" not in content
         if saved:
@@ -197,7 +198,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
         for option in choices(override):
             if option not in options:
                 raise UserError(
-                    f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"
+                    f"unknown {group} '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"
                 )
         if group == LAUNCH and source_file("submitit") is None:
             raise UserError(

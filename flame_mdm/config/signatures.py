@@ -42,7 +42,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "bool": (bool, "true or false"),
     "int": (int, "a whole number"),
     "float": ((int, float), "a finite number"),
-    "str": (str, "a text"),
+    "str": (str, "a string"),
     "None": (type(None), "null"),
 }
 """Types of the values that an annotation allows, and a description of the values."""
@@ -85,7 +85,7 @@ def check_top_level(config: Config) -> None:
             check_kind(key, node[name], annotation)
     task = (config.get("task") or {}).get("_target_")
     if config.get("losses", {}) is None and task is not None and "losses" in parameters(task):
-        raise UserError("losses=None: must be a mapping of keys")
+        raise UserError("losses=None: must be a mapping of keys to values")
     for key, target in ARGUMENTS.items():
         legal = {name: kind for name, kind in _signature(target).items() if name not in DERIVED}
         for name, value in (config.get(key) or {}).items():
@@ -148,7 +148,7 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
             choices = [ast.literal_eval(member) for member in members]
             return "" if value in choices else f"one of {', '.join(map(str, choices))}"
         if outer in ("dict", "Dict", "Mapping"):
-            return "" if isinstance(value, Mapping) else "a mapping of keys"
+            return "" if isinstance(value, Mapping) else "a mapping of keys to values"
         if outer not in (*SEQUENCES, *TUPLES) or (
             isinstance(value, Mapping) and "_target_" in value
         ):
@@ -216,7 +216,7 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
                     f"{key}.",
                 )
             elif config[name] is not None or key in ("run", "callbacks", "losses"):
-                raise UserError(f"{key}={config[name]}: must be a mapping of keys")
+                raise UserError(f"{key}={config[name]}: must be a mapping of keys to values")
         elif value is not None and not isinstance(value, list):
             kind = type(value).__name__
             check_kind(key, config[name], "str | int | float" if kind == "str" else kind)
@@ -240,7 +240,7 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
     key = ".".join(parts)
     if parts[0] == "data" and not depth:
         return (
-            f"{key} belongs to a data set, but no data set is named. Add data=NAME, such as "
+            f"{key} is an option of a data set, but no data set was given. Add data=NAME, such as "
             "data=folder"
         )
     siblings = {str(name) for name in node} if isinstance(node, Mapping) else set()

@@ -163,8 +163,8 @@ def _check_whole(config: Config, name: str) -> None:
         lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
     if lacking:
         raise UserError(
-            f"{name}: {lacking[0]} is missing. Set it, or begin with `defaults:` and another recipe, "
-            f"or /base"
+            f"{name}: {lacking[0]} is missing. Set it, or start with a `defaults:` list that "
+            f"names another recipe or /base"
         )
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:

@@ -47,11 +47,11 @@ class Denoiser(nn.Module, ABC):
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         """Returns the prediction (B, F, out_features).
 
-        The network is a pure function, except for dropout in training.
+        The network is a pure function, except for dropout during training.
 
         Args:
             x_t: (B, F, D) noisy motion.
-            t: (B,) float in [0, 1000), the time as a row of the sinusoidal table.
+            t: (B,) float in [0, 1000), the time as a row index of the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
             cond: the condition. Dropped samples already have the null condition.
 

@@ -22,7 +22,7 @@ Each loss (B,) is already weighted and has one value per sample.
 class Process(nn.Module, ABC):
     """Base class for generative processes: paths between noise and data.
 
-    Subclasses are Gaussian diffusion and flow matching. A process corrupts motions in training,
+    Subclasses are Gaussian diffusion and flow matching. A process corrupts training motions,
     defines what the denoiser predicts, and samples motions from noise. Only the process interprets
     the time t; the denoiser only embeds it. B is the batch size, F the number of frames, and D the
     number of features.
@@ -164,7 +164,7 @@ class Process(nn.Module, ABC):
 
         Args:
             denoise: the denoiser, with or without guidance; `options.guidance_scale` is ignored.
-            noise: function from the number of a draw (0, 1, 2, ...) to noise (B, F, D). Sampling
+            noise: function that maps the draw index (0, 1, 2, ...) to noise (B, F, D). Sampling
                 starts from draw 0.
             mask: (B, F) bool, True = real frame.
             cond: conditions of the batch.
@@ -190,7 +190,7 @@ class Process(nn.Module, ABC):
         name = options.sampler
         if name is None or name not in self.samplers:
             raise UserError(
-                f"unknown sampler '{name}'. {type(self).__name__} has {', '.join(self.samplers)}"
+                f"unknown sampler '{name}'. Available for {type(self).__name__}: {', '.join(self.samplers)}"
             )
         names = ["guidance_scale", "sampler", "num_inference_steps", *self.samplers[name].options]
         for option, value in options.chosen().items():
@@ -209,7 +209,7 @@ class Process(nn.Module, ABC):
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
             raise UserError(
-                f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}"
+                f"edit mode '{edit.mode}' is not supported: {type(self).__name__} supports {modes}"
             )
         kinds = {edit.mode, "resample"} if edit.resample > 1 else {edit.mode}
         able = [

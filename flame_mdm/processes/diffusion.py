@@ -39,7 +39,7 @@ class GaussianDiffusion(Process):
         average_padding: average losses over the padded length with zero noise in the padding, as
             in FLAME's code. Short motions then have less weight. The denoiser must return 0 in
             the padding.
-        clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
+        clip_x0: clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
         timestep_sampling: distribution of the training steps (FLAME, tables 6 and 7).
         skip: only for prediction epsilon. The noise is sqrt(1 - ab) x_t + sqrt(ab) times the output
             (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a velocity,
@@ -214,7 +214,7 @@ class GaussianDiffusion(Process):
     ) -> Tensor:
         """See `Process.sample`. The denoiser is called once per step.
 
-        Draws of noise are numbered in the order of their use. `options.num_inference_steps` is
+        Noise draws are numbered in the order of their use. `options.num_inference_steps` is
         either a number of steps from 2 to T, placed by `options.spacing`, or a list of steps in
         increasing order. The sampler "consistency" takes 1 to T steps of `grid`. An edit of mode
         "x0" reproduces the kept part exactly.

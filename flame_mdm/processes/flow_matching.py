@@ -15,8 +15,8 @@ from flame_mdm.sampler_options import SamplerOptions
 class FlowMatching(Process):
     """Straight path from noise at t = 0 to motion at t = 1, the process of MFM.
 
-    Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser gets the time 1000 t, and predicts the
-    velocity of the path or the clean motion. With s = `sigma_min`, x_t = t x + (1 - (1 - s) t)
+    Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser receives the time 1000 t, and predicts
+    the velocity of the path or the clean motion. With s = `sigma_min`, x_t = t x + (1 - (1 - s) t)
     noise, and the velocity is x - (1 - s) noise.
 
     Args:

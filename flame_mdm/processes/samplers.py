@@ -1,6 +1,6 @@
 """Samplers: functions that take one step from noise toward motion, and what they support.
 
-Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they get the
+Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they obtain the
 clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field. Coefficients
 and times are Python numbers, so that no step waits for the device.
 """
@@ -126,7 +126,7 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
         [[[1.0, 1.0]]]
     """
     # The clean estimate implies the noise in x. The step keeps the part of this noise that the
-    # next level needs, and replaces the rest by new noise of the given variance.
+    # next level needs, and replaces the rest with new noise of the given variance.
     schedule, eta = run.schedule, run.options.eta or 0.0
     x0_hat, _ = run.estimate(x, i)
     epsilon = (x - schedule.number("signal", i) * x0_hat) / schedule.number("noise", i)

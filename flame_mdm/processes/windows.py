@@ -30,7 +30,7 @@ class Windows:
 
 
 def blended(denoise: Denoise, windows: Windows) -> Denoise:
-    """Returns a denoiser for entire motions, which may be longer than the motions in training.
+    """Returns a denoiser for entire motions, which may be longer than the training motions.
 
     Args:
         denoise: denoiser for the windows.
@@ -59,7 +59,7 @@ def spans(
     """Covers the consecutive parts of a motion with windows.
 
     The windows of a part extend by half the overlap into the neighboring parts. A part that does
-    not fit into one window gets several windows.
+    not fit into one window is covered by several windows.
 
     Args:
         lengths: number of frames of each part.

@@ -35,7 +35,7 @@ MEBIBYTE = 2**20
 TEXT_LIMIT = 512 * MEBIBYTE
 """Maximum size of a text or JSON file.
 
-The largest known file, with BABEL's annotations, has 175 MiB.
+The largest known file, which contains BABEL's annotations, is 175 MiB.
 """
 YAML_LIMIT = MEBIBYTE // 4
 """Maximum size of a YAML file, because parsing is slow.
@@ -163,7 +163,7 @@ def write_failure(error: BaseException, path: Path) -> str:
     if getattr(error, "errno", None) not in FULL:
         return reason
     folder = next(parent for parent in path.absolute().parents if parent.exists())
-    return f"{reason}. {_size(shutil.disk_usage(folder).free)} are free on the disk of {folder}"
+    return f"{reason}. {_size(shutil.disk_usage(folder).free)} is free on the disk that contains {folder}"
 
 
 @contextmanager
@@ -277,7 +277,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         raise UserError(f"{path}: {kind}, not a file")
     if limit is not None and status.st_size > limit:
         raise UserError(
-            f"{path}: the file has {_size(status.st_size)}, but at most {_size(limit)} are allowed"
+            f"{path}: the file is {_size(status.st_size)}, but at most {_size(limit)} is allowed"
         )
     if status.st_size < POINTER_LIMIT and _begins(path, GIT_LFS):
         raise UserError(

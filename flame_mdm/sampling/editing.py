@@ -109,12 +109,12 @@ def edit(
 
     Returns:
         One edited motion per sample, `samples` for each text: all samples of the first text in
-        the order of their numbers, then all samples of the second text, and so on. The original
-        is not in the list; it is the attribute `original` of each edited motion.
+        order, then all samples of the second text, and so on. The original is not in the list; it
+        is the attribute `original` of each edited motion.
 
     Raises:
         UserError: If the request is invalid, the process does not support the method, or the
-            motion cannot be read or is longer than the motions in training.
+            motion cannot be read or is longer than the training motions.
 
     Example:
         >>> import flame_mdm
@@ -230,7 +230,7 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
     if not fits:
         raise UserError(
             f"the parts are not as long as the motion, which lasts {length / fps:g} seconds. State the "
-            "seconds of each part, as in 'walks @2 | sits @1'"
+            "duration of each part, as in 'walks @2 | sits @1'"
         )
     return rest // max(1, others)
 
@@ -272,7 +272,7 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
         if not 0 <= first < last <= length:
             frames = f"{length} frames ({length / fps:g} seconds)"
             raise UserError(
-                f"{name}=[{begin:g}, {end:g}] is not a range of this motion, which has {frames}"
+                f"{name}=[{begin:g}, {end:g}] is not a range within this motion, which has {frames}"
             )
         new[first:last] = True
     return new

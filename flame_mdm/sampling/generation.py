@@ -63,8 +63,8 @@ def generate(
             `flame_mdm.sampler_options.SamplerOptions` describe them.
 
     Returns:
-        One motion per sample, `samples` for each text: all samples of the first text in the order
-        of their numbers, then all samples of the second text, and so on.
+        One motion per sample, `samples` for each text: all samples of the first text in order,
+        then all samples of the second text, and so on.
 
     Raises:
         UserError: If the request is invalid, the model cannot do what is requested, or the model

@@ -112,7 +112,8 @@ class EditRequest:
         _ = self.ranges  # raises if they are invalid
         if self.joints is not None and not self.joints:
             raise UserError(
-                "joints: no joint is named. Name the joints to resample, or omit joints for all of them"
+                "joints: the list is empty. List the joints to resample, or omit joints to resample all of "
+                "them"
             )
         if type(self.resample) is not int or self.resample < 1:
             raise UserError(f"resample={self.resample}: expected a whole number, at least 1")
@@ -162,7 +163,7 @@ class SamplingRequest:
     A text or action may have several parts with their durations in seconds, "walks forward @3 |
     turns left | sits down @2". The parts are generated together as one motion, in overlapping
     windows; see docs/sequences.md. A single part with a duration, "walks forward @10", is also
-    generated in windows. Such a part may be longer than the motions in training.
+    generated in windows. Such a part may be longer than the training motions.
 
     `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
 
@@ -185,7 +186,7 @@ class SamplingRequest:
         None,
         "length of the motion in seconds, or a list with one length per text. In a sequence, the "
         "length of each part whose text does not state its own (as @2 does). Default: 3, or the "
-        "length of the longest motion in training if that is shorter",
+        "length of the longest training motion if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
         None, "length in frames, or a list of lengths, instead of seconds"

@@ -112,7 +112,7 @@ def read_set(source: str) -> MotionSet:
     stand = content.motions.get(content.stand)
     if stand is None or stand.kind != "loop":
         raise UserError(
-            f"{path}: stand is {content.stand}, which is not a loop. Name a motion with kind: loop"
+            f"{path}: stand is {content.stand}, which is not a loop. Use the name of a motion with kind: loop"
         )
     for name, motion in content.motions.items():
         if motion.kind == "turn" and not motion.degrees:
@@ -362,8 +362,8 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
 def closure(clip: RiggedClip) -> tuple[float, float]:
     """Returns the differences between the first and the last pose of an in-place clip.
 
-    The first difference is a distance in meters, the second one an angle of local rotations in
-    degrees.
+    The first difference is a distance in meters, and the second one is an angle between local
+    rotations in degrees.
     """
     positions, _ = clip.world()
     distance = float(np.linalg.norm(positions[-1] - positions[0], axis=-1).max())

@@ -37,7 +37,7 @@ def read_motion(
 
     Features of the same representation and frame rate are kept. Other motions are converted as in
     `flame_mdm.formats.conversion` and made canonical. If joints were fitted, the `notes` of the
-    result describe it, with the error.
+    result describe the fit and its error.
 
     Args:
         representation: the representation of the model.
@@ -60,7 +60,7 @@ def read_motion(
         store = Store(Path(data_root) / f"{dataset}-{representation.name}")
         if (rate := store.info["fps"]) != representation.fps:
             raise UserError(
-                f"{store.folder}: prepared at {rate:g} fps, but the model has {representation.fps:g} fps"
+                f"{store.folder}: prepared at {rate:g} fps, but the model uses {representation.fps:g} fps"
             )
         clips = {clip.id: clip for clip in store.clips}
         if clip_id not in clips:
@@ -82,7 +82,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
     The part begins at the origin.
 
     Raises:
-        UserError: If [begin, end] is not a range of the motion.
+        UserError: If [begin, end] is not a range within the motion.
     """
     if not is_range(cut):
         raise UserError(f"cut={cut}: expected [begin, end], in seconds")
@@ -90,7 +90,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
     if not 0 <= begin < end <= len(motion.features):
         seconds, name = len(motion.features) / representation.fps, motion.id or "the motion"
         raise UserError(
-            f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds"
+            f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range within {name}, which lasts {seconds:g} seconds"
         )
     features = torch.from_numpy(representation.rebase(motion.features[begin:end]))
     return replace(decoded(representation, features, motion.text, motion.id), notes=motion.notes)

@@ -93,9 +93,8 @@ def resolve(
     Args:
         request: the request.
         model: the model that samples the motions.
-        refused: mapping that receives the errors of prompts that the model cannot sample, by the
-            number of the prompt. All other prompts are resolved. Default: the first error is
-            raised.
+        refused: mapping that receives the errors of prompts that the model cannot sample, by prompt
+            index. All other prompts are resolved. Default: the first error is raised.
         check_words: whether to refuse a text if the model knows none of its content words.
 
     Raises:

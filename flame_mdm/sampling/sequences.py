@@ -105,7 +105,7 @@ def windows(
     spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]
     covering = [(row, *span) for row, parts in enumerate(spans_of) for span in parts]
     names = [conditions[row][part] for row, part, _, _ in covering]
-    # A denoiser that attends to its padding gets as many frames as in training.
+    # A denoiser that attends to its padding receives as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
     covered = cover(positions, [sum(parts) for parts in lengths], shared, width, device)

@@ -56,7 +56,7 @@ def stream(
         model: a model that continues frames (DiP), from `flame_mdm.load`.
         text: what the person does at first.
         start: the motion to continue: a motion, a file, or "dataset:id", a clip of a prepared
-            data set. Only its last frames are used. Default: a person who stands still.
+            data set. Only its last frames are used. Default: a person who is standing still.
         seed: seed of the noise.
         block: number of frames per block. The maximum and the default are the frames that the
             model predicts at once. Shorter blocks react sooner to a new text, but cost more per
@@ -150,7 +150,7 @@ class Stream(Iterator[Motion]):
         """Leads the person along waypoints from the next block on.
 
         The path bends toward the next waypoint, and the text determines how the person moves. A
-        person who stands does not move. After the last waypoint, the path no longer bends.
+        person who is standing does not move. After the last waypoint, the path no longer bends.
 
         Args:
             waypoints: x and z in meters in the world, in order. They replace all earlier
@@ -164,7 +164,7 @@ class Stream(Iterator[Motion]):
 
     @property
     def reached(self) -> list[int]:
-        """Numbers of the frames in which the first waypoints were reached, in order."""
+        """Indices of the frames in which the first waypoints were reached, in order."""
         return list(self._streams.waypoints.reached)
 
     def go_back(self, at: float) -> None:
@@ -243,7 +243,7 @@ class OnlineCleanup:
 class PastBlock(NamedTuple):
     """A past block of a single stream, which can be cut.
 
-    `begin` is the number of its first frame. `number` is the number of the block, which determines
+    `begin` is the index of its first frame. `number` is the index of the block, which determines
     its noise.
     """
 

@@ -147,7 +147,7 @@ class Route:
 
     Attributes:
         points: all waypoints in order.
-        reached: for each waypoint that was reached, the number of the stream's frame in which it was
+        reached: for each waypoint that was reached, the index of the stream frame in which it was
             reached.
 
     Raises:
@@ -170,7 +170,7 @@ class Route:
         return self.points[len(self.reached) :]
 
     def follow(self, begin: int, roots: np.ndarray) -> None:
-        """Records which waypoints the root (F, 3) reaches; `begin` is the number of its first frame."""
+        """Records which waypoints the root (F, 3) reaches; `begin` is the index of its first frame."""
         for frame, (x, _, z) in enumerate(roots, begin):
             while self.left and math.dist(self.left[0], (x, z)) < NEAR:
                 self.reached.append(frame)

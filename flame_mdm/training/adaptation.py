@@ -40,7 +40,7 @@ from flame_mdm.visualize import player_page
 
 # Number of motions that are sampled from the base model if its training data is missing
 SAMPLED = 300
-# Number of clips with which the page compares models
+# Number of clips on which the page compares the models
 COMPARED = 32
 # Parts of the recipe that are taken from the base model
 OF_BASE = (

@@ -237,7 +237,7 @@ class Report(Callback):
             f"{values[name]:.4g} {text}" for name, text in texts.items() if name in values
         ):
             say(
-                f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)"
+                f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable only within a recipe)"
             )
         say(f"report: {write_report(self.folder)}")
         if isinstance(pl_module, GeneratorTask):
@@ -265,7 +265,7 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics by their docstrings, with values of generated and real motions."""
+    """Returns lines that explain metrics with their docstrings, and values for generated and real motions."""
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -399,7 +399,7 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Writes the samples of the final model and prints their metrics next to real motions."""
+        """Writes the samples of the final model, and prints their metrics and the metrics of real motions."""
         # The last validation may already have written the samples of this step
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)

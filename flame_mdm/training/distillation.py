@@ -26,7 +26,7 @@ class DistillationTask(GeneratorTask):
     """Trains a student to sample in one to four steps, with built-in guidance.
 
     The student starts with its teacher's weights, and has the same parts, data and captions. The
-    teacher is needed only in training. The text encoder is not trained, and there is no dropout.
+    teacher is needed only during training. The text encoder is not trained, and there is no dropout.
     `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
@@ -58,14 +58,14 @@ class DistillationTask(GeneratorTask):
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Reads the teacher and copies its weights. Raises `UserError` if it is missing or does not match."""
+        """Loads the teacher and copies its weights. Raises `UserError` if it is missing or does not match."""
         options = self.config["distillation"]
         name = options["teacher"]
         try:
             path = find(name)
         except FileNotFoundError as error:
             raise UserError(
-                f"distillation.teacher={error}. Train the teacher first, or name another one"
+                f"distillation.teacher={error}. Train the teacher first, or choose another one"
             ) from error
         teacher = read_teacher(path)
         theirs, ours = (

@@ -164,7 +164,7 @@ def _start_from(task: GeneratorTask, source: str) -> None:
         copied, count = copy_matching_weights(task.generator, source)
     except FileNotFoundError as error:
         raise UserError(
-            f"initial_weights={error}. Train it first, name another model, or start from random weights: "
+            f"initial_weights={error}. Train it first, choose another model, or start from random weights: "
             "initial_weights=null"
         ) from error
     say(f"initial weights: {copied} of {count} tensors from {source}")

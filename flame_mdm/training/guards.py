@@ -51,7 +51,7 @@ class BadLoss(Callback):
 
     A loss explodes if it exceeds `factor` times the median of the previous interval.
     `bad_batch.json` in the run directory describes the first bad batch. It contains the step and,
-    for each rank, the number of the batch, the ids of the clips and the loss.
+    for each rank, the batch index, the clip ids and the loss.
 
     Args:
         folder: the run directory.

@@ -19,9 +19,9 @@ from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 
 TOKENS = 20
-"""Number of tokens of a caption."""
+"""Number of tokens in a caption."""
 FLOAT = 4
-"""Bytes of a weight, a gradient, and each of the two states of Adam."""
+"""Number of bytes of a weight, a gradient, and each of the two states of Adam."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ def training_memory(config: Config) -> TrainingMemory:
 
 
 def _saved(denoiser: nn.Module, forward: Callable[[], object]) -> tuple[int, list[tuple[int, int]]]:
-    """Returns the bytes that a forward pass saves for the backward pass.
+    """Returns the number of bytes that a forward pass saves for the backward pass.
 
-    For each layer of `stacked_layers`, it also returns the bytes saved inside the layer, and the
-    size of its input.
+    For each layer of `stacked_layers`, it also returns the number of bytes saved inside the layer,
+    and the size of its input.
     """
     weights = {p.untyped_storage()._cdata for p in denoiser.parameters()}
     kept: dict[int, Tensor] = {}  # by storage; kept alive, so that no address is used twice

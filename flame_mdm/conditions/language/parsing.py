@@ -75,7 +75,7 @@ def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
 
 
 class _Sentence:
-    """The actions of a sentence, given its tokens and the phrases that name actions."""
+    """The actions described in a sentence, given its tokens and the phrases that name actions."""
 
     def __init__(self, text: str, tokens: Sequence[Token], matches: Sequence[Match]):
         self.text, self.tokens = text, tokens
@@ -261,6 +261,6 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Returns a step without repetitions, and without "stands still" next to another action."""
+    """Returns a step without duplicates, and without "stands still" next to another action."""
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

@@ -1,4 +1,4 @@
-"""Claims: checkable statements of a sentence about a motion, and their false variants."""
+"""Claims: checkable statements in a sentence about a motion, and their false variants."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ EXCLUDED = {"upright": "lie", "sit": "upright", "kneel": "upright", "lie": "upri
 
 @dataclass(frozen=True)
 class Claim:
-    """A checkable statement of a sentence about a motion.
+    """A checkable statement in a sentence about a motion.
 
     Attributes:
         kind: what is claimed, a key of `flame_mdm.sampling.referee.kinds.KINDS`.
@@ -89,7 +89,7 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
         wrong += [("duration", replace(claim, seconds=value)) for value in durations if value > 0]
     if claim.when and claim.kind in EXCLUDED:
         wrong.append(("posture", replace(claim, kind=EXCLUDED[claim.kind])))
-    # A body stands at both ends of most motions.
+    # A person is standing at both ends of most motions.
     if claim.when and claim.kind not in ("upright", "return pose", "return place"):
         wrong.append(("start or end", replace(claim, when=FLIPPED_END[claim.when])))
     return wrong

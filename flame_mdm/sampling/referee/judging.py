@@ -1,4 +1,4 @@
-"""`judge`: verdicts on the claims of a sentence about a motion, with evidence."""
+"""`judge`: verdicts on the claims in a sentence about a motion, with evidence."""
 
 import math
 from collections.abc import Sequence
@@ -65,7 +65,7 @@ class Verdict:
         return f"{self.answer}: {self.claim}; {self.evidence}"
 
     def marks(self, fps: float, frames: int) -> list[tuple[int, int, str, str]]:
-        """Returns the time spans of the evidence, in frames, for the time line of a player."""
+        """Returns the time spans of the evidence, in frames, for the timeline of a player."""
         marks = []
         for start, end in self.reading.spans[:3]:
             first = min(max(0, round(start * fps)), frames - 1)
@@ -76,7 +76,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Judgment:
-    """The verdicts on all claims of a sentence.
+    """The verdicts on all claims in a sentence.
 
     Attributes:
         text: the sentence.
@@ -113,7 +113,7 @@ def judge(
 ) -> Judgment:
     """Judges whether a motion does what a sentence says.
 
-    The claims of the sentence are read, and each is measured on the motion. The answer is "yes",
+    The claims in the sentence are read, and each is measured on the motion. The answer is "yes",
     "no" or "cannot tell". docs/referee.md lists what can be checked.
 
     Args:
@@ -156,7 +156,7 @@ def try_judge(motion: Motion) -> Judgment | None:
 
 
 def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
-    """Returns the evidence for the claims of a motion's own text, as marks of a time line."""
+    """Returns the evidence for the claims in a motion's own text, as marks on a timeline."""
     judgment = try_judge(motion)
     if judgment is None:
         return []

@@ -22,7 +22,7 @@ class Reading:
             claim. NaN = undecided.
         number, unit: the measured value, in a readable unit.
         joint: joint or part of the body.
-        spans: begin and end in seconds of each time span in which the claim is true, or nearly true.
+        spans: start and end in seconds of each time span in which the claim is true, or nearly true.
         unclear: reason why a high score does not make the claim true; "" = none.
         signal: values (F,) that show for each frame whether the claim is true; None if single
             frames do not show it.
@@ -41,7 +41,7 @@ class Reading:
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
-    """Returns the begin and the end, in seconds, of each run of true frames (F,).
+    """Returns the start and the end, in seconds, of each run of true frames (F,).
 
     Runs shorter than `shortest` seconds are left out.
     """

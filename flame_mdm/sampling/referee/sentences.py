@@ -1,4 +1,4 @@
-"""Reads the claims of a sentence by rules. Parts that are not understood are left out.
+"""Reads the claims in a sentence by rules. Parts that are not understood are left out.
 
 The rules are precise rather than complete. The patterns are in `sentences.yaml`, and the verb forms
 are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or several people
@@ -82,7 +82,7 @@ class Pattern:
 
 
 def read_claims(text: str) -> list[Claim]:
-    """Returns the claims of a sentence in order, without repetitions.
+    """Returns the claims in a sentence in order, without duplicates.
 
     The list is empty if the sentence has no claim that can be checked.
     """

@@ -50,7 +50,7 @@ AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
-    """Measures perturbed motions of a split, with intervals from bootstrap resamples; see docs/audit.md.
+    """Measures perturbed motions from a split, with intervals from bootstrap resamples; see docs/audit.md.
 
     An interrupted audit continues with the metric inputs in the folder `cache`. Raises `UserError` if
     data, protocol and extractor do not match.
@@ -145,7 +145,7 @@ def _measured(
 
 
 def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> Inputs:
-    """Returns the metric inputs of motions: cached inputs, or the results of one feature pass."""
+    """Returns the metric inputs for motions: cached inputs, or the results of one feature pass."""
     if path.exists():
         return read_npz(path)
     extracted = evaluator.extract(MotionsOf(ids, make()))
@@ -162,7 +162,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 
 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
-    """Returns the metrics by name for which the audit has all inputs."""
+    """Returns, by name, the metrics for which the audit has all inputs."""
     metrics = make_metrics(evaluator.metrics)
     return {
         name: metric
@@ -178,8 +178,8 @@ def _named(metric: str, part: str) -> str:
 class _Measure:
     """Computes metrics from cached inputs, for all motions and for each bootstrap resample.
 
-    Each motion or pair is weighted by the number of times that it is drawn, so the candidates of
-    retrieval are not resampled. FID is computed again for each resample. Retrieval and diversity
+    Each motion or pair is weighted by the number of times that it is drawn, so retrieval
+    candidates are not resampled. FID is recomputed for each resample. Retrieval and diversity
     are means over all pools and pairs that a protocol may draw.
     """
 
@@ -232,7 +232,7 @@ class _Measure:
         return values
 
     def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns the values (N,) of single motions or pairs, by metric."""
+        """Returns the values (N,) for individual motions or pairs, by metric."""
         values = {}
         for name, metric in self.metrics.items():
             rows = self._rows(name, metric, inputs, texts)
@@ -246,7 +246,7 @@ class _Measure:
         return self.metrics[metric].direction_of(part)
 
     def facts_of(self, name: str) -> dict[str, Any]:
-        """Returns the facts that a card states about a value, except its direction; see `AuditedMetric`."""
+        """Returns the facts that a card states about a value, except for its direction; see `AuditedMetric`."""
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]
         return {

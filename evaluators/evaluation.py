@@ -81,7 +81,7 @@ class Evaluation:
     clips: Clips
     # The opened extractor. If it is None, metrics that need features have no value.
     extractor: Extractor | None
-    # Representation of the motions, on the device for computations
+    # Representation of the motions, on the device that computes the metrics
     representation: Representation
     # Seed of all random draws
     seed: int = 0
@@ -256,7 +256,7 @@ class Evaluation:
     def _conditions(self) -> list[str]:
         """Returns notes that limit how the values can be interpreted.
 
-        The notes concern repeated clips, and unchecked values of real motions.
+        The notes are about repeated clips and unchecked values of real motions.
         """
         lines = []
         clips = len(self.protocol.selected(self.clips))

@@ -63,7 +63,7 @@ class Motions:
 
 
 Rows = dict[str, Any]
-"""Metric inputs of N motions by their names in `evaluators.metrics`.
+"""Metric inputs for N motions by their names in `evaluators.metrics`.
 
 The inputs are tensors, or lists of N entries (such as joints).
 """
@@ -71,7 +71,7 @@ The inputs are tensors, or lists of N entries (such as joints).
 
 @dataclass
 class Evaluator:
-    """Computes metrics of motions, with one feature pass for all metrics.
+    """Computes metrics for motions, with one feature pass for all metrics.
 
     For the same features, all values are bit-identical for any batch size and order. If there are
     several processes, they share the feature pass. Each process receives whole batches, so that
@@ -99,7 +99,7 @@ class Evaluator:
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:
-        """Computes the metric inputs of motions. All processes pass the same motions.
+        """Computes the metric inputs for motions. All processes pass the same motions.
 
         Raises `UserError` if a motion is not finite.
         """
@@ -204,7 +204,7 @@ class Evaluator:
     def score(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
-        """Computes all metrics of generated motions and of their paired real motions, in the same order.
+        """Computes all metrics for generated motions and their paired real motions, in the same order.
 
         Comparisons of sets use `real`, a separate draw, because the distance from a set to itself
         is 0. Returns the values by name (`metric` or `metric/part`), and the reasons for missing

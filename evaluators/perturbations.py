@@ -111,7 +111,7 @@ def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
 
 
 def crop(joints: Joints, percent: float) -> Joints:
-    """Cuts a percentage of the motion off at its end. At least three frames remain."""
+    """Cuts off the end of the motion, by a percentage of its length. At least three frames remain."""
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 
@@ -157,7 +157,7 @@ second draw of real motions, for metrics that compare sets.
 """
 
 Inputs = dict[str, np.ndarray]
-"""Metric inputs of N motions by name: features (N, E), and the readings of the metrics."""
+"""Metric inputs for N motions by name: features (N, E), and the readings of the metrics."""
 
 Motions = Callable[[], list[np.ndarray]]
 """A function that computes a set of N motions as features (F, D)."""
@@ -260,7 +260,7 @@ class ReplacedShare(ChangedSet):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions, of which this share (in percent) was replaced, with the same texts."""
+        """Returns the motions with this share (in percent) replaced, and the same texts."""
         count = round(len(scene) * grade / 100)
         replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
         base, other = sets[BASE], sets[self.name]
@@ -297,7 +297,7 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same motions, and the texts, of which this share (in percent) is replaced."""
+        """Returns the same motions, and the texts with this share (in percent) replaced."""
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]

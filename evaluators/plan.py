@@ -123,7 +123,7 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
     """Returns the prepared data with the representation of its store.
 
     Raises `UserError` if no data set is given, the data set is not prepared, or the model
-    generates another representation.
+    generates a different representation.
     """
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:

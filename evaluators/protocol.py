@@ -47,7 +47,7 @@ class DrawnClip:
     caption: int | None
     #: Name shared by all motions with the same caption and length.
     prompt: str
-    #: Indices of the frames that the model receives as context and continues. They are not measured.
+    #: Indices of the frames that the model receives as context and continues; not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
@@ -127,14 +127,14 @@ class Protocol(ClosedSchema):
     #: Motions per batch, if the protocol measures time. The first batch is not timed.
     batch_size: Count | None = None
     #: Frames that a model that continues frames receives as context. "drawn": the first of the
-    #: drawn frames, which are not measured. "start": as in DiP's code, frames of the clip that begin
-    #: at one of its first five frames; the motion that follows is as long as the drawn frames.
+    #: drawn frames, which are not measured. "start": as in DiP's code, frames of the clip that
+    #: begin at one of its first five frames; the motion that follows is as long as the drawn frames.
     context: Literal["drawn", "start"] = "drawn"
     #: Number of context frames that the model receives; `open_protocol` sets it.
     context_frames: Int = 0
     #: Attributes that evaluated clips must have. {} = all clips of the split.
     only: dict[str, Any] = Field({})
-    #: Expected values of real motions of the test split, by data set or sha256 of the extractor:
+    #: Expected values of real test motions, by data set or sha256 of the extractor:
     #: a mapping from metrics to [value, tolerance]. If the measured values differ, nothing is
     #: generated.
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = (
@@ -157,7 +157,7 @@ class Protocol(ClosedSchema):
         quick: bool = False,
         multimodality: bool = True,
     ) -> tuple[Protocol, dict[str, Any]]:
-        """Returns the protocol in another size, and the options that changed.
+        """Returns the protocol in a different size, and the options that changed.
 
         `clips` is the number of clips in the split. A quick evaluation has few motions and
         replications. `batch_size` only changes protocols that measure time.
@@ -196,8 +196,8 @@ class Protocol(ClosedSchema):
         """Opens the extractor at `path`, by default the protocol's extractor.
 
         Returns None if the protocol needs no extractor, or if `path` is "none". Raises `UserError`
-        or `FileNotFoundError` if the extractor is missing, or if it belongs to another
-        representation or data set.
+        or `FileNotFoundError` if the extractor is missing, or if it belongs to a
+        different representation or data set.
         """
         if self.extractor is None or path == "none":
             return None
@@ -300,7 +300,7 @@ class Protocol(ClosedSchema):
         """Checks that the clips and the model fit the protocol.
 
         Raises `UserError` if there is no clip, if a caption or label is missing, or if the model
-        has another condition.
+        has a different condition.
         """
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
         drawn = {

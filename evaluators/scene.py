@@ -34,7 +34,7 @@ def text_of(row: DrawnClip, caption: str) -> Text:
 
 @dataclass
 class Scene:
-    """Real motions of a split: the clips, the features (F, D) of each clip, and the seed of all draws."""
+    """Real motions from a split: the clips, the features (F, D) of each clip, and the seed of all draws."""
 
     data: MotionDataModule
     rows: list[DrawnClip]

@@ -56,7 +56,7 @@ class Source(Interface):
 
 
 def real_motions(clips: Clips, rows: Sequence[DrawnClip]) -> list[np.ndarray]:
-    """Returns features (F, D) of the real motions of the rows, in the data's units."""
+    """Returns features (F, D) of the real motions for the rows, in the data's units."""
     store, rebase = clips.store, clips.representation.rebase
     return [
         np.ascontiguousarray(rebase(store.motion(row.clip)[row.frames]), np.float32) for row in rows
@@ -223,7 +223,7 @@ class SampleFolder:
 
     @property
     def sha256(self) -> str:
-        """Hash of the contents of the files."""
+        """Hash of the file contents."""
         return sha256_of_samples(self.files)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
@@ -311,7 +311,7 @@ class Baseline:
         return real_motions(self.clips, moved)
 
     def _shuffled(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
-        """Gives each row the motion of a row with another caption or label.
+        """Gives each row the motion of a row with a different caption or label.
 
         The rows are grouped by caption or label, with the groups in random order, and rotated by
         the size of the largest group.
@@ -369,7 +369,7 @@ def sample_files(folder: Path) -> list[Path]:
 
 
 def sha256_of_samples(files: Sequence[Path]) -> str:
-    """Returns the hash of the contents of all files, in this order."""
+    """Returns the hash of all file contents, in this order."""
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.read_bytes())

@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from flame_mdm.config.jobs import run_jobs
 
         return run_jobs(command, settings, rest)
-    from flame_mdm.config import run  # imports Hydra, for which --help does not wait
+    from flame_mdm.config import run  # imports Hydra, which --help does not need
 
     return run(command, settings, rest)
 

@@ -294,7 +294,7 @@ class Constant:
     def on(self, device: torch.device) -> Tensor:
         """Returns the tensor on a device. Only the first call for a device waits for a copy."""
         if device not in self.tensors:
-            # The first call may happen during validation, whose inference tensors training cannot use.
+            # The first call may happen during validation. Training cannot use inference tensors.
             with torch.inference_mode(False):
                 self.tensors[device] = torch.tensor(self.values, device=device)
         return self.tensors[device]

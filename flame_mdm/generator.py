@@ -71,7 +71,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames of which all training lengths are multiples."""
+    """Returns the number of frames that divides all training lengths."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 

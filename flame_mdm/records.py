@@ -125,7 +125,7 @@ class Checkpoint(Schema):
 
 
 class UsedSkeleton(Schema):
-    """Origin of the bones if joints are computed from SMPL's rotations.
+    """Origin of the bones if joints are computed from SMPL rotations.
 
     The bones come from SMPL's model file or from a stand-in.
     """

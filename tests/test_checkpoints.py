@@ -621,13 +621,13 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
             "mdm",
             {},
             [f"stats={bad}"],
-            "model.pt: features of uestc are not normalized. Leave out stats=FOLDER",
+            "model.pt: features of uestc are not normalized. Omit stats=FOLDER",
         ),
         (
             "mdm",
             {"dataset": "humanml"},
             [],
-            "expected 263 of humanml-legacy-smpl22",
+            "expected 263 features of humanml-legacy-smpl22",
         ),
         (
             "mdm",

@@ -223,7 +223,7 @@ def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_pat
         path.read_text() for path in (tmp_path / "sweep" / ".submitit").rglob("*log.*")
     )
     assert "seed=1: already trained for 0 steps" in logs
-    assert "seed=2 contains a run with another configuration" in logs
+    assert "seed=2 contains a run with a different configuration" in logs
 
 
 @pytest.mark.robustness

@@ -55,7 +55,7 @@ BESIDE = {"travel", "veer", "pace"}
 MOST_SYNTHETIC = 600  # maximum number of procedural motions, from the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
 # false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
-# are stated by the functions in `postures.py` and `movements.py`; a score is negative if less speaks for the claim.
+# are stated by the functions in `postures.py` and `movements.py`; a score is negative if less supports the claim.
 """
 
 

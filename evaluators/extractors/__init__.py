@@ -42,7 +42,7 @@ class Extractor(ABC):
 
     @abstractmethod
     def check(self, representation: Representation, dataset: str) -> None:
-        """Raises `UserError` if the network was trained for another representation or data set."""
+        """Raises `UserError` if the network was trained for a different representation or data set."""
 
     @abstractmethod
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
@@ -75,7 +75,7 @@ TrainedTask = TypeVar("TrainedTask", bound=ExtractorTask)
 class OwnExtractor(Extractor, Generic[TrainedTask]):
     """A network trained with `make train`, loaded from its checkpoint.
 
-    Raises `UserError` if the checkpoint contains another kind of model.
+    Raises `UserError` if the checkpoint contains a different kind of model.
     """
 
     task: TrainedTask
@@ -89,7 +89,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Raises `UserError` if the extractor was trained on another representation, frame rate or data set."""
+        """Raises `UserError` if the extractor was trained on a different representation, frame rate or data set."""
         trained, learned = self.task.representation, self.task.facts.get("dataset", dataset)
         if not self.reads(representation) or learned != dataset:
             raise UserError(
@@ -215,7 +215,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
         )
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Raises `UserError` if the extractor was released for another representation or data set."""
+        """Raises `UserError` if the extractor was released for a different representation or data set."""
         names = {representation.name} | (
             {representation.part_of} if self.used <= representation.features else set()
         )

@@ -122,7 +122,7 @@ def info_nce(
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
-        wrong_text: (B, K, E) features of texts, each of which is a negative of a single motion.
+        wrong_text: (B, K, E) features of texts, each a negative for a single motion.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)

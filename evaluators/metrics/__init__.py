@@ -1,5 +1,5 @@
 # pyright: standard
-"""Metrics of generated motions, as torchmetrics classes.
+"""Metrics for generated motions, as torchmetrics classes.
 
 Every `update` takes some of these inputs by name, for B generated and R real motions.
 
@@ -17,7 +17,7 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
 | contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
-| kept | (B, F, J) bool | True = the edit was to keep this joint in this frame, if motions are edits |
+| kept | (B, F, J) bool | True = the edit must keep this joint in this frame, if motions are edits |
 | keys | (B,) int64 | unique keys of generated motions |
 | real | (R, E) | features of real motions |
 | real_joints | (B, F, J, 3) | real motions in meters, y up, floor at y = 0 |

@@ -239,7 +239,7 @@ class MultimodalDistance(SampleMetric):
         return torch.linalg.vector_norm(generated - text, dim=-1)
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the distance of each motion from its text."""
+        """Returns the distance between each motion and its text."""
         return {"": equally_weighted(self._distances(rows["generated"], rows["text"]))}
 
 

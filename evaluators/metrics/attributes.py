@@ -133,7 +133,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
 
 def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
-    """Returns the attributes of one clip (F, 22, 3) and, as "checks", the result of each check of `CHECKED`."""
+    """Returns the attributes of one clip (F, 22, 3) and, as "checks", the results of the checks in `CHECKED`."""
     seen: dict[str, Any] = dict(read_attributes(joints, fps))
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -282,7 +282,7 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
     """Returns whether each requested attribute, and combinations of attributes, were read from a motion.
 
-    Each action of `CHECKED` is read by its own check. Returns {} for actions without a rule.
+    Each action in `CHECKED` is read by its own check. Returns {} for actions without a rule.
 
     Args:
         seen: the attributes that `read_all` or `read_attributes` returned.

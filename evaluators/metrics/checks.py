@@ -1,4 +1,4 @@
-"""Checks of single actions: whether a motion shows an action, and with which side, count or direction.
+"""Checks for individual actions: whether a motion shows an action, and with which side, count or direction.
 
 `evaluators.metrics.attributes` recognizes 22 actions. Rules cannot tell the other actions apart: a
 hand at the head for half a second may be a drink, a phone call or a scratch. A check therefore only

@@ -92,7 +92,7 @@ class TrainingMotions:
         best = int(total.argmin())
         if total[best].isinf():
             return total[best]
-        # The distance is computed again from the differences, because the expanded square has
+        # The distance is recomputed from the differences, because the expanded square has
         # rounding errors of about a millimeter.
         difference = compared - self.poses[best : best + len(motion) : STEP]
         return (difference.square().sum() / (difference.numel() / 3)).sqrt()

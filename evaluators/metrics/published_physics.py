@@ -2,7 +2,7 @@
 """Physics metrics of published benchmarks. The floor is y = 0.
 
 Each benchmark has its own units, thresholds and frame rate. The values are not comparable between
-benchmarks, nor with values of `evaluators.metrics.physics`.
+benchmarks, nor with values from `evaluators.metrics.physics`.
 """
 
 import math

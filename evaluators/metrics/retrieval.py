@@ -36,7 +36,7 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of a caption, of norm 1. `config` is the JSON of an encoder's mapping.
+    """Returns the vector (C,) of a caption, scaled to norm 1. `config` is the JSON of an encoder's mapping.
 
     The caption is encoded alone, not in a batch.
     """
@@ -54,15 +54,15 @@ def plain_caption(caption: str) -> str:
 
 
 def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> dict[str, float]:
-    """Computes TMR's recall and median rank from the similarities of texts and motions.
+    """Computes TMR's recall and median rank from the similarities between texts and motions.
 
     Args:
-        similarity: (N, N) similarities of texts (rows) and motions (columns).
+        similarity: (N, N) similarities between texts (rows) and motions (columns).
         correct: (N, N) bool, symmetric, True = correct pair. The best correct candidate counts.
             None = only the diagonal is correct.
 
     Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for texts.
-    The names of the values of texts for motions begin with `m2t_`.
+    The values for the reverse direction, texts for motions, have names that begin with `m2t_`.
 
     Example:
         >>> values = whole_set_retrieval(torch.eye(4))
@@ -235,7 +235,7 @@ class TMRRetrieval(CaptionMetric):
       are averaged.
 
     Each protocol has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of
-    motions for texts. The names of the values of texts for motions begin with `m2t_`.
+    motions for texts. The values for the reverse direction have names that begin with `m2t_`.
 
     TMR's encoder of captions is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
     for HumanML3D and KIT. In this implementation, batches are drawn. Without `ids`, the dissimilar

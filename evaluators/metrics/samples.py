@@ -18,15 +18,15 @@ Value = float | dict[str, float | None] | None
 """Result of `compute`: a number, or numbers by name; None without samples."""
 
 Rows = Mapping[str, Any]
-"""Inputs of N motions by their names in `evaluators.metrics`, such as tensors with N rows."""
+"""Inputs for N motions by their names in `evaluators.metrics`, such as tensors with N rows."""
 
 
 class Declared:
-    """Base class for metrics: declarations about values, and values of single samples and of resamples.
+    """Base class for metrics: properties of values, and values for individual samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
-        units: units of single values by name, if they differ from `unit`.
+        units: units of individual values by name, if they differ from `unit`.
         directions: whether higher is better, by name, for the values that differ from
             `higher_is_better`; None = neither direction is better.
         summary: name of the value that summarizes the other values; None = there is no such value.
@@ -54,12 +54,12 @@ class Declared:
     def direction_of(self, name: str) -> bool | None:
         """Whether higher is better for the value with this name.
 
-        None = neither direction is better, or values closer to the value of real motions are better.
+        None = neither direction is better, or values closer to those of real motions are better.
         """
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the metric's readings of motions without their conditions, by name.
+        """Returns the metric's readings of motions, without the conditions, by name.
 
         Each reading is an array with N rows. Metrics of features need no readings.
         """
@@ -69,8 +69,8 @@ class Declared:
         """Returns the value and the weight (N, 2) of each sample, by the name of the value.
 
         The metric is the weighted mean. A metric with random pools is also averaged over all draws.
-        Returns {} for metrics without values of single samples. `rows` contains the inputs of the
-        metric and its `readings`. Raises `UserError` if there are too few samples.
+        Returns {} for metrics without values for individual samples. `rows` contains the inputs of
+        the metric and its `readings`. Raises `UserError` if there are too few samples.
         """
         return {}
 
@@ -89,7 +89,7 @@ class Declared:
 
 
 class SampleMetric(Declared, Metric):
-    """Base class for metrics, which compute their value from one row per sample, sorted by key.
+    """Base class for metrics that compute their value from one row per sample, sorted by key.
 
     Therefore, the value does not depend on the batches, their order or the number of ranks. A rank
     may have no samples. `value` is the formula. If a metric draws at random, its argument `seed`
@@ -307,7 +307,7 @@ class MotionMean(SampleMetric):
 
 
 class JointMean(MotionMean):
-    """Base class for metrics that average values measured on the joints of single motions."""
+    """Base class for metrics that average values measured on the joints of individual motions."""
 
     sees_meaning = False
 

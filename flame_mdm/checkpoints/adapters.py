@@ -3,8 +3,8 @@
 A weight W (out, in) of attention or feed-forward layers becomes W + strength * up down, with `up`
 (out, rank) and `down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, the
 row of each new word has an additional vector. During training, `torch.nn.utils.parametrize`
-computes the weights. This also works for code that reads a weight without calling its layer, such as
-cross-attention.
+computes the weights. This also works for code that reads a weight without calling its layer, such
+as cross-attention.
 
 All layers are trained, but a style keeps only the changes in the second half of them. The first
 half would learn that the clips show few actions, and the model would no longer follow the requested
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from flame_mdm.generator import MotionGenerator
 
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
-# Learned vectors of words are multiplied by this factor. Rows of the word table are drawn from
+# Learned word vectors are multiplied by this factor. Rows of the word table are drawn from
 # N(0, 1), so vectors must change more than weights.
 FARTHER = 10.0
 Paths = str | Path | Sequence[str | Path]  # one file or several files
@@ -150,7 +150,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
         source: a path or name, as in `find`.
 
     Returns:
-        Number of copied tensors, and number of trained tensors of the model.
+        Number of copied tensors, and number of trained tensors in the model.
 
     Raises:
         UserError: If no tensor fits.
@@ -164,7 +164,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
     ]
     if not fitting:
         raise UserError(
-            f"initial_weights={source}: no weight has the name and the shape of a weight in this recipe. Use a model "
+            f"initial_weights={source}: no weight matches a weight of this recipe in name and shape. Use a model "
             "with the same network and width"
         )
     with torch.no_grad():

@@ -77,8 +77,8 @@ def load(
     Raises:
         FileNotFoundError: If there is no such file or checkpoint.
         UserError: If the file is damaged or contains no motion generator, if its weights do not
-            match its recipe, if the model cannot be downloaded, if an adapter belongs to another
-            model, or if the device does not exist.
+            match its recipe, if the model cannot be downloaded, if an adapter belongs to a
+            different model, or if the device does not exist.
 
     Example:
         >>> import flame_mdm
@@ -105,8 +105,8 @@ def load_task(
         adapted: the keyword arguments `adapter` and `strength` of `load`.
 
     Raises:
-        UserError: If the file is damaged or contains another kind of task, if its weights do not
-            match its recipe, or if the device does not exist.
+        UserError: If the file is damaged or contains a different kind of task, if its weights do
+            not match its recipe, or if the device does not exist.
     """
     check_device(device)
     regular_file(path)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 FORMAT = 2
 # Key of the format in a checkpoint
 FORMAT_KEY = "flame_mdm_format"
-# Keys of the metadata of model files and of adapters
+# Keys in the metadata of model files and adapters
 KEY = "flame_mdm"
 ADAPTER = "flame_mdm_adapter"
 FILE = "model.safetensors"
@@ -233,7 +233,7 @@ def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
-    """Returns a hash of the names, types, shapes and values of tensors, taken in the order of their names."""
+    """Returns a hash of the names, types, shapes and values of tensors, sorted by name."""
     import torch
 
     digest = hashlib.sha256()

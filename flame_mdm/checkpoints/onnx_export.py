@@ -36,7 +36,7 @@ from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
 # Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output.
-# In float32, another order of operations changes results by about 1e-6.
+# In float32, a different order of operations changes results by about 1e-6.
 TOLERANCE = 1e-4
 # The ONNX graphs of these networks require a fixed number of frames, so motions are padded to the
 # longest length.

@@ -337,10 +337,13 @@ def _model(
     width = released.features[0]
     dataset = facts["dataset"]
     if representation.features != width:
-        expected = f"{representation.features} of {representation.name}, the representation of data set {dataset}"
-        raise ValueError(f"released weights: expected {expected}, but they have {width} features")
+        expected = (
+            f"{representation.features} features of {representation.name}, "
+            f"the representation of {dataset}"
+        )
+        raise ValueError(f"released weights: expected {expected}, but they have {width}")
     if (stats is not None) != (dataset in NORMALIZED):
-        state, advice = ("normalized", "Set") if stats is None else ("not normalized", "Leave out")
+        state, advice = ("normalized", "Set") if stats is None else ("not normalized", "Omit")
         raise ValueError(
             f"features of {dataset} are {state}. {advice} stats=FOLDER with Mean.npy and Std.npy"
         )

@@ -1,7 +1,7 @@
 # pyright: standard
 """Options of released models.
 
-An option is read, ignored because it has no effect on the model, or refused.
+An option is read, ignored because it has no effect on the model, or rejected.
 """
 
 from collections.abc import Mapping

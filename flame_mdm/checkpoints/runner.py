@@ -51,7 +51,7 @@ LONGEST = 600
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
 # Maximum number of bytes of model.json
 MAX_DESCRIPTION = 64 * 2**20
-# Maximum number of bytes of an ONNX file, the limit of the format
+# Maximum size of an ONNX file in bytes, which is the limit of the format
 MAX_GRAPH = 2**31
 EXTERNAL_DATA = re.compile(rb"(?:\x08|\x88\x80*\x00)location")
 """Pattern of the key that names a file of external data, after its length.
@@ -219,7 +219,7 @@ class Sampler:
     def __init__(self, folder: str | Path, threads: int = 1):
         """Opens a folder.
 
-        Raises `ValueError` if a file is missing, damaged, too large or from another version.
+        Raises `ValueError` if a file is missing, damaged, too large or from a different version.
         """
         self.folder = Path(folder)
         try:

@@ -49,7 +49,7 @@ def read_prompt(
         splits: whether a sentence with several actions is split into one part per action. Only for
             texts with a single part.
         check_words: whether the model's words for actions replace the words of the text. A text is
-            then also refused if the model knows none of its content words.
+            then also rejected if the model knows none of its content words.
 
     Raises:
         UserError: If the model does not understand a part.

@@ -36,7 +36,7 @@ class TargetConditions:
     """Draws targets for training motions and computes the error of predicted motions.
 
     Args:
-        joints: names of the joints of the skeleton, in the order of its positions.
+        joints: names of the skeleton's joints, in the order of its positions.
         facing: joint indices of right hip, left hip, right shoulder and left shoulder.
         choices: sets of slots. Each training motion draws one of the sets with equal probability.
             An empty set results in a target that requests nothing, which differs from having no

@@ -13,7 +13,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.seeds import key, seed_generator
 
-# Number of clips per step of the contrastive loss, and the temperature of its softmax
+# Number of clips per step of contrastive training, and the temperature of its softmax
 PAIRS, TEMPERATURE = 64, 0.1
 
 START = "<start>"
@@ -103,7 +103,7 @@ class LearnedTokens(ConditionEncoder):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
-        Pooled vectors of captions of the same clip are pulled together, and pooled vectors of
+        Pooled vectors of captions for the same clip are pulled together, and pooled vectors of
         different clips are pushed apart. Each step compares two captions from each of `PAIRS`
         clips. Without this training, a small model learns many words slowly, because it learns them
         only from the loss of the motions. Clips with a single caption are not used.

@@ -23,8 +23,8 @@ Settings = TypeVar("Settings")
 """Dataclass of a command.
 
 The docstring of the class is the usage, and its fields made by `option` are the keys. `OBJECTS`
-lists the keys to which leading words without a key belong. If the last of these keys is a list, it
-takes all remaining words. `SWEEPS` is True if the command accepts --multirun and launch=, as in
+lists the keys of leading words that are given without a key. If the last of these keys is a list,
+it takes all remaining words. `SWEEPS` is True if the command accepts --multirun and launch=, as in
 `flame_mdm.config.jobs`. A field `composed` receives the arguments for Hydra: keys with a dot, such
 as `data.source.path`, and the keys and options in `COMPOSED`.
 """
@@ -160,7 +160,7 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
             raise UserError(
                 f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
             )
-    # Additional words remain unchanged, and are refused later because they have no key
+    # Additional words remain unchanged, and are rejected later because they have no key
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
     return keyed + leading[len(objects) :] + rest
 

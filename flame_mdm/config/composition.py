@@ -88,7 +88,7 @@ def prepare_overrides(
     """Checks the overrides (not those in `first`) and prepares them for Hydra.
 
     Keys that the recipe lacks but a `_target_` accepts get the prefix `++`. Also returns the recipe
-    with its groups chosen, before single keys are overridden; {} without overrides.
+    with its groups chosen, before individual keys are overridden; {} without overrides.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -190,7 +190,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
         if _is_group(override) and recipe.saved and group != LAUNCH:
             raise UserError(
                 f"{override.input_line} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
-                "configuration, whose parts are fixed. Start from the experiment, or override single keys"
+                "configuration, whose parts are fixed. Start from the experiment, or override individual keys"
             )
         if not _is_group(override) or override.is_delete():
             continue

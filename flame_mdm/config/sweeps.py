@@ -150,7 +150,7 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 def _check_whole(config: Config, name: str) -> None:
     """Raises `UserError` if a recipe lacks a part, or has an invalid value that would only be noticed later."""
-    plain(config, name)  # otherwise, the checkpoints of the run would be refused
+    plain(config, name)  # otherwise, the checkpoints of the run would be rejected
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]
     lacking = [key for key in ("experiment", "seed", "ema", "logger") if key not in config]

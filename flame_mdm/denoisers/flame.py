@@ -33,7 +33,7 @@ class FLAME(Denoiser):
             first two rows).
         condition_frames: also add TS and CLS to every frame. A small network then learns to
             follow the text in fewer steps.
-        length_unit: number of frames of which the lengths of the training windows are multiples. ML
+        length_unit: the lengths of the training windows are multiples of this number of frames. ML
             embeds the length rounded down to such a multiple.
 
     Example:

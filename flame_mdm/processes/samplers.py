@@ -220,7 +220,7 @@ def blended(
         run: the run.
         steps: the steps to take, from noisy to clean.
         edit: the part to keep, how to blend it, and how many times to repeat each step.
-        start: (B, F, D) noise with which sampling started.
+        start: (B, F, D) noise that sampling started from.
 
     Returns:
         Normalized motion (B, F, D).

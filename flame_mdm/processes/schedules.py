@@ -170,7 +170,7 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
     """
     if not 2 <= num_train_timesteps <= MAX_STEPS:
         raise UserError(
-            f"num_train_timesteps={num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps"
+            f"num_train_timesteps={num_train_timesteps}: expected 2 to {MAX_STEPS:,} steps"
         )
     if not 0 < noise_scale < math.inf:
         raise UserError(

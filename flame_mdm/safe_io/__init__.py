@@ -3,7 +3,7 @@
 A file that may come from other people is first read or checked with this module. The file must be a
 regular file of limited size, and the sizes that it declares must match its bytes. Functions that
 read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular
-file, or if its content is refused.
+file, or if its content is rejected.
 """
 
 from __future__ import annotations
@@ -163,7 +163,10 @@ def write_failure(error: BaseException, path: Path) -> str:
     if getattr(error, "errno", None) not in FULL:
         return reason
     folder = next(parent for parent in path.absolute().parents if parent.exists())
-    return f"{reason}. {_size(shutil.disk_usage(folder).free)} is free on the disk that contains {folder}"
+    return (
+        f"{reason}. {_size(shutil.disk_usage(folder).free)} is free on the disk that contains "
+        f"{folder}"
+    )
 
 
 @contextmanager
@@ -312,7 +315,7 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON text. Raises `ValueError` for content that `read_json` refuses."""
+    """Returns the content of a JSON text. Raises `ValueError` for content that `read_json` rejects."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # Maximum number of samples per request. All samples are kept in memory until the last one is
 # complete.
 MAX_SAMPLES = 10_000
-# Maximum number of characters of a text. Captions of the data sets are far shorter.
+# Maximum number of characters in a text. Captions in the data sets are far shorter.
 MAX_TEXT_LENGTH = 2000
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
@@ -276,7 +276,7 @@ class SamplingRequest:
         if self.after is not None and other is not None:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
             raise UserError(
-                f"after={name}: a motion that continues another one cannot have {other}. Omit after or {other}"
+                f"after={name}: a motion that continues another motion cannot have {other}. Omit after or {other}"
             )
 
         if (edit := self.editing) is not None:

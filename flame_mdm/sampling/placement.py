@@ -1,4 +1,4 @@
-"""Placements of bodies in the world, with which the blocks of a motion are joined."""
+"""Placements of bodies in the world, used to join the blocks of a motion."""
 
 from __future__ import annotations
 

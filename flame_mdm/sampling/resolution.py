@@ -95,7 +95,7 @@ def resolve(
         model: the model that samples the motions.
         refused: mapping that receives the errors of prompts that the model cannot sample, by prompt
             index. All other prompts are resolved. Default: the first error is raised.
-        check_words: whether to refuse a text if the model knows none of its content words.
+        check_words: whether to reject a text if the model knows none of its content words.
 
     Raises:
         UserError: If the model cannot do what is requested. The sampler and its options are
@@ -162,7 +162,7 @@ def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[No
 
 
 def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks what concerns all prompts: the kind of condition, streams, and windows."""
+    """Checks everything that applies to all prompts: the kind of condition, streams, and windows."""
     if model.denoiser.context_frames:
         check_streams(model)
         if request.loop:

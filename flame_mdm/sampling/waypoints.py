@@ -31,7 +31,7 @@ TIGHTEST = 0.7
 # the person can walk. With 1, a runner would circle around a waypoint because a bend begins
 # slowly.
 ROOM = 1.2
-PATIENCE = 0.4  # time constant in seconds with which deviations disappear
+PATIENCE = 0.4  # time constant, in seconds, of the decay of deviations
 SMOOTHING = (
     0.3  # weight of a frame in the moving average of steps, which removes the sway of a walk
 )

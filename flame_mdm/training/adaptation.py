@@ -151,7 +151,7 @@ def adapt(
         str(base),
         None if full else _about(model, captions, name, rank, file, action),
     )
-    # With a vocabulary, the model would refuse texts with the new words.
+    # With a vocabulary, the model would reject texts with the new words.
     model.facts.pop("vocabulary", None)
     prior = _prior(model, Path(data_root), out / "data", captions)
     config["data"]["source"] |= {"path": str(source), "prior": str(prior)}

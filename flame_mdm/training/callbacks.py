@@ -483,7 +483,7 @@ class SampleMotions(Callback):
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
-        """Computes all metrics of motions (F, J, 3) in meters. Metrics without a value are left out."""
+        """Computes all metrics for motions (F, J, 3) in meters. Metrics without a value are left out."""
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()

@@ -22,8 +22,8 @@ from flame_mdm.safe_io import write_failure
 from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
-# Checkpoints of older versions of Lightning are refused, because Lightning migrates them with code
-# that trusts their content
+# Checkpoints from older versions of Lightning are rejected, because Lightning migrates them with
+# code that trusts their content
 OLDEST_LIGHTNING = Version("2.6")
 
 # Numbers in the state of a learning rate schedule

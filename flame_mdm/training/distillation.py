@@ -26,12 +26,12 @@ class DistillationTask(GeneratorTask):
     """Trains a student to sample in one to four steps, with built-in guidance.
 
     The student starts with its teacher's weights, and has the same parts, data and captions. The
-    teacher is needed only during training. The text encoder is not trained, and there is no dropout.
+    teacher is needed only for training. The text encoder is not trained, and there is no dropout.
     `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
     kind = DistilledGenerator
-    grids: dict[int, Constant]  # times of the teacher's steps, by the number of steps
+    grids: dict[int, Constant]  # times of the teacher's steps, by number of steps
 
     @classmethod
     def build(
@@ -53,7 +53,7 @@ class DistillationTask(GeneratorTask):
         return super().train(False)
 
     def setup(self, stage: str) -> None:
-        """Loads the teacher, from whose weights training starts."""
+        """Loads the teacher, whose weights initialize the student."""
         super().setup(stage)
         self.start_from_teacher()
 

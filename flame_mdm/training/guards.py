@@ -116,7 +116,7 @@ class BadLoss(Callback):
             write_json(self.path, {"step": step, "usual_loss": str(self.usual), "batches": batches})
         typical = f" (typical: {self.usual:.3g})" if self.usual < float("inf") else ""
         raise UserError(
-            f"the loss of step {step} is {float(losses[:, first].max()):g}{typical}. The clips of the batch are listed "
+            f"the loss at step {step} is {float(losses[:, first].max()):g}{typical}. The clips of the batch are listed "
             f"in {self.path}. Lower optimizer.lr, set trainer.gradient_clip_val, or inspect these clips. Earlier "
             "checkpoints are intact"
         )

@@ -52,7 +52,7 @@ def recipe_changes(config: Config) -> list[str]:
     """Returns "key=value" for each key whose value differs from the recipe that the configuration names.
 
     Some keys are not compared: keys that may differ when a run is resumed, the seed, and keys that
-    the configuration lacks because it was written by another version. If the class of a part
+    the configuration lacks because it was written by a different version. If the class of a part
     differs, all other keys of this part are left out. If the recipe is not in `experiments/`, the
     result is empty.
     """
@@ -84,6 +84,6 @@ def _check_same(folder: Path, config: Config) -> None:
     ]
     if differing:
         raise UserError(
-            f"{folder} contains a run with another configuration: {'; '.join(differing)}. Choose another name with "
+            f"{folder} contains a run with a different configuration: {'; '.join(differing)}. Choose another name with "
             "run.name=..., or delete that folder"
         )

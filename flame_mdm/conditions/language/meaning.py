@@ -19,7 +19,7 @@ NEIGHBORS = 5  # number of nearest listed words that decide whether a word names
 def nearest_actions(word: str) -> list[tuple[str, float]]:
     """Returns the actions with their similarities to a word, nearest first.
 
-    The result is empty if the table of vectors does not contain the word.
+    The result is empty if the vector table does not contain the word.
     """
     vector = word_table().vector(word)
     return [] if vector is None else _ranked(vector)
@@ -32,7 +32,7 @@ def nearest_to(words: list[str]) -> list[tuple[str, float]]:
 
 
 def similarity(action: str, other: str) -> float:
-    """Returns the similarity of two actions: the cosine of the means of their words."""
+    """Returns the similarity of two actions: the cosine between the means of their words."""
     names, _, _ = _action_vectors()
     first, second = names.index(action), names.index(other)
     centers = _centers()

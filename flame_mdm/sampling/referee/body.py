@@ -119,7 +119,7 @@ class Body:
     def velocity(self) -> np.ndarray:
         """Velocity (F, 2) of the pelvis to the left and forward, in m/s.
 
-        The sway of single steps is filtered out.
+        The sway of individual steps is filtered out.
         """
         ground = gaussian_filter1d(
             self.joints[:, PELVIS][:, [0, 2]], 0.15 * RATE, axis=0, mode="nearest"

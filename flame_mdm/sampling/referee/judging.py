@@ -19,9 +19,9 @@ from flame_mdm.sampling.referee.sentences import read_claims
 Answer = Literal["yes", "no", "cannot tell"]
 # Minimum duration of a motion that is judged, in seconds
 SHORTEST = 0.4
-# Seconds at the start and at the end of a motion in which its posture there is measured
+# Length, in seconds, of the start and of the end of a motion, where postures are measured
 END = 0.6
-# Seconds for which the posture must be held in this time
+# Seconds for which a posture must be held within this time
 HELD = 0.2
 # Maximum interruption, in seconds, of a state or activity whose duration is measured
 BREAK = 0.5
@@ -122,7 +122,7 @@ def judge(
         fps: frames per second; required for joints.
 
     Raises:
-        UserError: If the motion has another skeleton, is shorter than 0.4 seconds, or is not
+        UserError: If the motion has a different skeleton, is shorter than 0.4 seconds, or is not
             finite; if there is no text; or if joints are passed without `fps`.
     """
     if isinstance(motion, Motion):
@@ -229,7 +229,7 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 
     Postures and contacts are measured in the first or last `END` seconds, and movements in the
     first or second half of the motion. The claim is unclear if the other end shows the same posture
-    or movement. Standing is an exception because it is usual at both ends.
+    or movement. Standing is an exception because it is common at both ends.
     """
     kind = KINDS[claim.kind]
     reading = kind.measure(body, replace(claim, when=""))

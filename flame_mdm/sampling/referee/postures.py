@@ -1,4 +1,4 @@
-"""Measurements of postures, and of contacts between parts of the body. `kinds.py` lists them."""
+"""Measurements of postures, and of contacts between body parts. `kinds.py` lists them."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from flame_mdm.sampling.referee.readings import Reading, existence, of_side, spa
 SIDES = ("left", "right")
 # Speed of the pelvis in m/s above which the body travels
 MOVING = 0.25
-# Height of the pelvis of a standing body of the usual size, in meters
+# Pelvis height of a standing body of normal size, in meters
 STANDING = 0.9
 # Smallest change in height, in meters, that counts as standing up or getting down without doubt
 RISE = 0.25

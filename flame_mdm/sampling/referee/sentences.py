@@ -215,7 +215,7 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
 
 
 def _further(take: str, claim: Claim, text: str) -> list[Claim]:
-    """Returns the additional claims of a clause, besides the claim of its pattern."""
+    """Returns the claims that a clause makes in addition to the claim of its pattern."""
     if take == "travel" or take == "jumped":
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"

@@ -92,7 +92,7 @@ class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
     The caption and crop of a clip, and the noise of the generated motion, are functions of (seed,
-    replication, id). Motions have the length of the real clip. Real motions are measured in the
+    replication, id). Motions are as long as the real clip. Real motions are measured in the
     same way, and compared with a second draw of real motions.
     """
 

@@ -177,7 +177,7 @@ class Edit:
 
     Attributes:
         known: (B, F, D) normalized features of the motion.
-        keep: (B, F, D) bool, True = keep this feature of this frame.
+        keep: (B, F, D) bool, True = keep this feature in this frame.
         mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t"
             replaces the kept part of the noisy sample with the known motion with the same amount of
             noise (FLAME, RePaint). "trajectory" overwrites the early part of the flow's path

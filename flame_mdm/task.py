@@ -127,7 +127,7 @@ class Task(Model, LightningModule):
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Returns the optimizer and the schedule of its learning rate.
+        """Returns the optimizer and its learning-rate schedule.
 
         The learning rate rises linearly over the first `lr_warmup` steps. It falls linearly to 0
         over the last fraction `lr_decay` of the training run.

@@ -21,7 +21,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-# Near-miss captions per motion and step. They differ in different attributes if possible.
+# Near-miss captions per motion and step. Each differs in another attribute if possible.
 NEAR_MISSES = 2
 # Standard deviation, in meters, of noise on the joints at strength 1
 JITTER = 0.02

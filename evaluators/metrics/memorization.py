@@ -39,7 +39,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 
 @dataclass
 class TrainingMotions:
-    """The training motions, among which the nearest neighbor of a motion is searched."""
+    """The training motions, which are searched for the nearest neighbor of a motion."""
 
     #: (N, 3J) poses of all frames of all motions, concatenated; see `poses`.
     poses: Tensor

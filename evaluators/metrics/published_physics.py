@@ -312,7 +312,7 @@ class KimodoConstraints(MotionMean):
             joints: (B, F, J, 3) edited motions in meters, y up.
             real_joints: (B, F', J, 3) motions before editing, in the same order, F' >= F.
             mask: (B, F) bool, True = real frame.
-            kept: (B, F, J) bool, True = the edit kept this joint of this frame.
+            kept: (B, F, J) bool, True = the edit kept this joint in this frame.
             keys: (B,) int64, unique keys of the edits.
 
         Raises:
@@ -437,7 +437,7 @@ class TransitionJerk(SampleMetric):
         Args:
             joints: (B, F, J, 3) positions in meters.
             mask: (B, F) bool, True = real frame.
-            kept: (B, F, J) bool, True = the edit kept this joint of this frame.
+            kept: (B, F, J) bool, True = the edit kept this joint in this frame.
             keys: (B,) int64, unique keys of the motions.
 
         Raises:

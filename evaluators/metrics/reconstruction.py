@@ -316,7 +316,7 @@ class DisplacementErrors(EditErrors):
             real_joints: (B, F', J, 3) real motions, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the generated motions.
-            kept: (B, F, J) bool, True = the edit kept this joint of this frame. None = everything
+            kept: (B, F, J) bool, True = the edit kept this joint in this frame. None = everything
                 was generated.
 
         Raises:
@@ -368,7 +368,7 @@ class KeptDrift(EditErrors):
             real_joints: (B, F', J, 3) motions before editing, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the edited motions.
-            kept: (B, F, J) bool, True = the edit kept this joint of this frame.
+            kept: (B, F, J) bool, True = the edit kept this joint in this frame.
 
         Raises:
             UserError: If a motion is not finite.

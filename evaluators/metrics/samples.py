@@ -145,13 +145,13 @@ class SampleMetric(Declared, Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
-        """Returns the value of all samples. Without samples, the value is None, or None by name."""
+        """Returns the value of all samples. Without samples, the value or each value is None."""
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 
     @property
     def nothing(self) -> Value:
-        """The value without samples: None, or None by name."""
+        """The value without samples: None, or a mapping from each name to None."""
         return dict.fromkeys(self.names) if self.names else None
 
     def value(self, *rows: Any, **_: Any) -> Value:
@@ -385,7 +385,7 @@ class TwoSets(SampleMetric):
     def compute(self) -> Any:
         """Returns the value of both sets.
 
-        If a set is empty, the value is None, or None by name.
+        If a set is empty, the value or each value is None.
         """
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         return self.value(*generated, *real) if generated and real else self.nothing

@@ -168,7 +168,7 @@ class Probe:
 
     # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
     # of clean estimates. The sampler is therefore run once on unit vectors instead of motions.
-    # Draw number n is unit vector n, and clean estimate number k is unit vector `calls` + 1 + k.
+    # Draw n is unit vector n, and clean estimate k is unit vector `calls` + 1 + k.
     # The entries of a noisy motion (1, 1, 2 `calls` + 1) in this run are then its weights, and
     # `_plan` solves for the four numbers of each step. No sampler needs its own formula here.
     def __init__(self, process: Process, calls: int, variance: float):

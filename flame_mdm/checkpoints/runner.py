@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = 1
-MIN_WORDS = 3  # minimum number of tokens of a graph, including padding
+MIN_WORDS = 3  # minimum number of tokens in the input of a graph, including padding
 WORD = re.compile(r"[^\W_]+")
 NUMBERS = frozenset(
     [
@@ -49,7 +49,7 @@ MASK = (1 << 64) - 1
 LONGEST = 600
 # the last graph exists only for SMPL's joints
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
-# Maximum number of bytes of model.json
+# Maximum size of model.json in bytes
 MAX_DESCRIPTION = 64 * 2**20
 # Maximum size of an ONNX file in bytes, which is the limit of the format
 MAX_GRAPH = 2**31

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.errors import UserError
 
-# Number of slots of a target: six joints, the position on the floor and the heading; see
+# Number of slots in a target: six joints, the position on the floor and the heading; see
 # `flame_mdm.conditions.target`
 SLOTS = 8
 

@@ -49,7 +49,7 @@ class Edited(Motion):
 
     #: The motion before editing.
     original: Motion
-    #: (F, D) bool, True = this feature of this frame should be kept.
+    #: (F, D) bool, True = this feature in this frame should be kept.
     keep: np.ndarray
     #: Maximum change of the kept values, in normalized features. It is 0 if the method is exact.
     feature_error: float

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Files of prompts, which are read without torch, so that invalid files fail quickly."""
+"""Prompt files. They are read without torch, so that invalid files fail quickly."""
 
 from __future__ import annotations
 

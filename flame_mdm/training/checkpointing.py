@@ -26,7 +26,7 @@ LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 # code that trusts their content
 OLDEST_LIGHTNING = Version("2.6")
 
-# Numbers in the state of a learning rate schedule
+# Numbers in the state of a learning-rate schedule
 SCHEDULE = {
     "base_lrs",
     "_last_lr",
@@ -154,7 +154,7 @@ def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Itera
     for schedule in content.get("lr_schedulers") or []:
         for key in SCHEDULE & schedule.keys():
             if not all(isinstance(item, int | float) for item in _leaves(schedule[key])):
-                yield f"the {key} of the learning rate's schedule is {str(schedule[key])[:40]}"
+                yield f"the {key} of the learning-rate schedule is {str(schedule[key])[:40]}"
 
 
 def _is_alike(value: Any, usual: Any) -> bool:

@@ -104,7 +104,7 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
     """Measures the largest rise of an angle (F,) in degrees.
 
-    The span of the reading is the time in which the angle rises from 10 % to 90 % of this rise.
+    The span of the reading is the time during which the angle rises from 10 % to 90 % of this rise.
     """
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())

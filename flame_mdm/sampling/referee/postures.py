@@ -82,7 +82,7 @@ def crouch(body: Body, claim: Claim) -> Reading:
 
 
 def bend(body: Body, claim: Claim) -> Reading:
-    """Measures the angle of the trunk from the vertical."""
+    """Measures the angle between the trunk and the vertical."""
     return existence(body.tilt, "degrees", "trunk", 0.15)
 
 

@@ -1,4 +1,4 @@
-"""Reads the claims in a sentence by rules. Parts that are not understood are left out.
+"""Reads the claims in a sentence by rules. Parts that are not understood are ignored.
 
 The rules are precise rather than complete. The patterns are in `sentences.yaml`, and the verb forms
 are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or several people

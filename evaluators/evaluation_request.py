@@ -100,7 +100,7 @@ class EvaluationRequest(EvaluationKeys):
 
     @property
     def editing(self) -> EditRequest:
-        """The options of the edit, for protocols that edit motions."""
+        """The edit options, for protocols that edit motions."""
         return EditRequest(method=self.method, until=self.until, strength=self.strength)
 
     @classmethod

@@ -63,7 +63,7 @@ class Task(Model, LightningModule):
         raise NotImplementedError
 
     def encoder(self) -> ConditionEncoder:
-        """Returns the encoder of the captions or actions in the data."""
+        """Returns the encoder for the captions or actions in the data."""
         raise NotImplementedError
 
     @property
@@ -265,7 +265,7 @@ class GeneratorTask(Task):
         return task
 
     def encoder(self) -> ConditionEncoder:
-        """Returns the encoder of the captions or actions in the data."""
+        """Returns the encoder for the captions or actions in the data."""
         return self.generator.condition
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:

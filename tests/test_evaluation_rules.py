@@ -117,4 +117,4 @@ def test_only_own_data_gets_the_advice_to_change_its_splits(tmp_path: Path):
 def test_repeated_clips_are_said():
     assert evaluation(samples=100)._conditions() == []
     (line,) = evaluation(samples=101)._conditions()
-    assert line.startswith("101 motions of 100 clips: clips are repeated")
+    assert line.startswith("101 motions from 100 clips: clips are repeated")

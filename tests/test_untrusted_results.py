@@ -108,7 +108,7 @@ UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
         "a pipe, a socket or a device, not a file",
     ),
     "folder": (Path.mkdir, "a folder, not a file"),
-    "huge": (huge, "the file has 1 TiB, but at most"),
+    "huge": (huge, "the file is 1 TiB, but at most"),
     "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
 }
 

@@ -62,7 +62,7 @@ class ExtractorTask(Task, Generic[Network]):
         return task
 
     def encoder(self) -> ConditionEncoder:
-        """Returns the encoder of the data set's captions."""
+        """Returns the encoder for the data set's captions."""
         return self.condition
 
     @classmethod

@@ -237,7 +237,7 @@ class TMRRetrieval(CaptionMetric):
     Each protocol has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of
     motions for texts. The values for the reverse direction have names that begin with `m2t_`.
 
-    TMR's encoder of captions is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
+    TMR's caption encoder is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
     for HumanML3D and KIT. In this implementation, batches are drawn. Without `ids`, the dissimilar
     subset starts with the first motion by key. The motion whose caption is least similar to the
     captions already chosen is added next, until the subset is complete.

@@ -166,8 +166,8 @@ class Probe:
     returns in the channels for a learned variance.
     """
 
-    # All exported samplers are linear: each noisy motion is a weighted sum of draws of noise and
-    # of clean estimates. The sampler is therefore run once on unit vectors instead of motions.
+    # All exported samplers are linear: each noisy motion is a weighted sum of noise draws and clean
+    # estimates. The sampler is therefore run once on unit vectors instead of motions.
     # Draw n is unit vector n, and clean estimate k is unit vector `calls` + 1 + k.
     # The entries of a noisy motion (1, 1, 2 `calls` + 1) in this run are then its weights, and
     # `_plan` solves for the four numbers of each step. No sampler needs its own formula here.
@@ -178,11 +178,11 @@ class Probe:
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1) of one draw of noise or one clean estimate."""
+        """Returns the unit vector (1, 1, 2 * calls + 1) of one noise draw or one clean estimate."""
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
-        """Returns a unit vector instead of a draw of noise, and counts the draws."""
+        """Returns a unit vector instead of a noise draw, and counts the draws."""
         self.draws = draw + 1
         return self.unit(draw)
 

@@ -20,6 +20,8 @@ class ReadPrompt:
         summary: one line that states how the prompt was understood. It is "" unless each caption of
             the model describes a single action.
         changes: lines about differences between the prompt and what is sampled.
+        fitting: seconds that fit the stated number of repetitions of each part, None if a part states
+            no number; () if the captions do not describe single actions.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -27,6 +29,7 @@ class ReadPrompt:
     unknown: tuple[str, ...] = ()
     summary: str = ""
     changes: tuple[str, ...] = ()
+    fitting: tuple[float | None, ...] = ()
 
 
 def read_prompt(
@@ -89,13 +92,18 @@ def _with_actions(
     if splits:
         reading = reader.read(prompt)
         readings, captions = [reading], reading.captions
+        fitting = reading.seconds() or (None,)
         if len(reading.texts) > 1:
             parts = [(words, None) for words in reading.texts]
     else:
         readings = [reader.read(words) for words, _ in parts]
-        pairs = zip(parts, readings, strict=True)
+        single = [reading if len(reading.captions) == 1 else None for reading in readings]
         captions = tuple(
-            read.captions[0] if len(read.captions) == 1 else words for (words, _), read in pairs
+            words if reading is None else reading.captions[0]
+            for (words, _), reading in zip(parts, single, strict=True)
+        )
+        fitting = tuple(
+            reading.seconds()[0] if reading and reading.steps else None for reading in single
         )
     ignored = [word for reading in readings for word in reading.ignored]
     unread = [word for text in captions for word in unread_words(text, max_words)]
@@ -105,4 +113,5 @@ def _with_actions(
         unknown=(*ignored, *unread),
         summary=", then ".join(reading.summary() for reading in readings),
         changes=tuple(line for reading in readings for line in reading.warnings()),
+        fitting=fitting,
     )

@@ -122,7 +122,7 @@ def resolve(
                 model,
                 text,
                 prompt.parts,
-                usual_lengths[number],
+                _usual_frames(prompt, usual_lengths[number], model),
                 is_sequence=is_sequence,
                 loop=request.loop,
             )
@@ -148,6 +148,24 @@ def resolve(
     return ResolvedRequest(
         request, tuple(prompts), is_sequence, before, targets, edit, tuple(warnings)
     )
+
+
+def _usual_frames(
+    prompt: ReadPrompt, requested: float | None, model: MotionGenerator
+) -> list[float | None]:
+    """Returns the number of frames of each part without a stated duration; None = the default.
+
+    A requested number applies to all parts. Otherwise, a part with a stated number of repetitions
+    is as long as the repetitions take, because a longer motion would repeat the action more often.
+    """
+    parts = len(prompt.parts)
+    if requested is not None or not prompt.fitting:
+        return [requested] * parts
+    longest = min(3 * model.representation.fps, model.facts["max_frames"])
+    return [
+        None if seconds is None else min(seconds * model.representation.fps, longest)
+        for seconds in prompt.fitting
+    ]
 
 
 @contextmanager

@@ -30,7 +30,7 @@ def part_frames(
     model: MotionGenerator,
     text: str,
     parts: Sequence[Part],
-    usual: float | None,
+    usual: Sequence[float | None],
     *,
     is_sequence: bool,
     loop: bool,
@@ -41,8 +41,8 @@ def part_frames(
         model: the model that samples the motion.
         text: the prompt, for messages.
         parts: its parts, with their durations in seconds if the prompt states them.
-        usual: number of frames, not rounded, of a part without a stated duration. Default: 3
-            seconds, or as many frames as fit into one window if that is less.
+        usual: for each part, its number of frames, not rounded, if the prompt states no duration.
+            None = 3 seconds, or as many frames as fit into one window if that is less.
         is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
         loop: whether the last frame leads to the first one.
 
@@ -53,7 +53,8 @@ def part_frames(
     if is_sequence or model.denoiser.context_frames:
         return _sequence_frames(model, text, parts, usual, loop)
 
-    length = min(round(3 * fps), longest) if usual is None else round(usual)
+    (frames,) = usual
+    length = min(round(3 * fps), longest) if frames is None else round(frames)
     shown = f"{length / fps:g} seconds ({length} frames)"
     if length < 2:
         raise UserError(f"{shown} are too short. Use at least {2 / fps:g} seconds")
@@ -67,13 +68,20 @@ def part_frames(
 
 
 def _sequence_frames(
-    model: MotionGenerator, text: str, parts: Sequence[Part], usual: float | None, loop: bool
+    model: MotionGenerator,
+    text: str,
+    parts: Sequence[Part],
+    usual: Sequence[float | None],
+    loop: bool,
 ) -> list[int]:
     fps, shared = model.representation.fps, overlap(model)
-    if usual is None:
-        fitting = model.facts["max_frames"] - shared * (loop or len(parts) > 1)
-        usual = 3 * fps if model.denoiser.context_frames else min(3 * fps, fitting)
-    lengths = [round(usual if seconds is None else seconds * fps) for _, seconds in parts]
+    window = model.facts["max_frames"] - shared * (loop or len(parts) > 1)
+    default = 3 * fps if model.denoiser.context_frames else min(3 * fps, window)
+    lengths = []
+    for (_, seconds), frames in zip(parts, usual, strict=True):
+        if seconds is not None:
+            frames = seconds * fps
+        lengths.append(round(default if frames is None else frames))
     for (name, _), length in zip(parts, lengths, strict=True):
         if length < 1:
             raise UserError(

@@ -14,6 +14,8 @@ from flame_mdm.errors import UserError, shortened
 ATTRIBUTES = ("direction", "amount", "speed", "count", "side")
 # Maximum number of repetitions that are sampled as several parts
 LONGEST_COUNT = 12
+# Duration in seconds of a motion with stated repetitions: a start and an end, and each repetition
+START_AND_END, REPETITION = 0.8, 0.7
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,15 @@ class Reading:
             return self.texts[0]
         return ", then ".join(
             " + ".join(predicate(mention) for mention in step) for step in self.steps
+        )
+
+    def seconds(self) -> tuple[float | None, ...]:
+        """Returns how many seconds fit the stated count of each step; None = no count is stated."""
+        counts = [
+            step[0].attributes.get("count") if len(step) == 1 else None for step in self.steps
+        ]
+        return tuple(
+            None if count is None else START_AND_END + REPETITION * int(count) for count in counts
         )
 
     def warnings(self) -> list[str]:

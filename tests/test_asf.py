@@ -79,7 +79,7 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
     np.testing.assert_array_equal(asf.read(files / "07_01.amc", 120).frames, motion.frames)
     with pytest.raises(
         UserError,
-        match=r"AMC files contain no frame rate\. Set fps=120, or write `fps: 120` into skeleton",
+        match=r"AMC files contain no frame rate\. Set fps=120, or add `fps: 120` to skeleton",
     ):
         asf.read(files / "07_01.amc", None)
     (files / "someone.asf").unlink()
@@ -106,10 +106,10 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
             "dof rx l",
             "07.asf, line 19: degrees of freedom must be among rx, ry and rz",
         ),
-        ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 19: an order of axes is needed"),
+        ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 19: expected an axis order such as XYZ"),
         ("    arm hand", "    arm foot", "line 29: bone foot is unknown"),
         ("   position 0 0 0", "   position 0 1 0", "line 8: a root whose position is not 0 0 0"),
-        ("     length 2\n", "", "line 18: a bone without length"),
+        ("     length 2\n", "", "line 18: a bone has no length"),
         (SKELETON, "HIERARCHY\n", "07.asf, line 1: not an ASF file"),
     ],
 )

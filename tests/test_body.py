@@ -121,9 +121,9 @@ def test_a_motion_that_no_body_fits_says_why(subtests):
     for motion, reason in (
         (
             posed(scale=3.0),
-            r"left_knee is 1\.17 m long, but the body's is 0\.392 m\. Is the unit right\?",
+            r"left_knee is 1\.17 m long, but the body's bone is 0\.392 m\. Is the unit right\?",
         ),
-        (sway(3, skeleton=KIT21), "computed only for the 22 joints of SMPL"),
+        (sway(3, skeleton=KIT21), "computed only for SMPL's 22 joints"),
         (Motion(np.zeros((3, 22, 3)), 20), "has no length"),
     ):
         with subtests.test(reason=reason):
@@ -256,9 +256,9 @@ def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch, subtest
     for name, message in (
         (
             "anny age=old",
-            "age=old is not one of gender, age, height, weight with a number from 0 to 1",
+            "age=old is invalid. Use NAME=NUMBER, with a name from gender, age, height, weight and a number",
         ),
-        ("anny age=1.1", r"age=1\.1 is not one of"),
+        ("anny age=1.1", r"age=1\.1 is invalid"),
         ("anny", r'body=anny needs the package anny\. Run pip install "flame-mdm\[body\]"'),
     ):
         with subtests.test(name=name, message=message), pytest.raises(UserError, match=message):

@@ -178,7 +178,7 @@ def test_a_rest_pose_in_front_shows_the_axes_of_the_joints_and_without_one_joint
     unknown = changed(any_axes)
     assert unknown.bones.poses is None
     note = raw_motion(unknown, SMPL(20.0)).note
-    assert note.startswith("rotations were fitted to joints (the rest pose of the file is unknown)")
+    assert note.startswith("rotations were fitted to joints (the rest pose in the file is unknown)")
 
 
 def test_rotations_that_do_not_move_the_joints_are_not_used(changed):
@@ -197,7 +197,7 @@ def test_rotations_that_do_not_move_the_joints_are_not_used(changed):
     motion = changed(by_positions)
     np.testing.assert_allclose(motion.joints, twisting().joints, atol=1e-4)
     assert motion.bones.poses is None
-    assert "cm from the positions)" in raw_motion(motion, SMPL(20.0)).note
+    assert "cm from their positions)" in raw_motion(motion, SMPL(20.0)).note
 
 
 def test_rotations_follow_the_frame_rate_and_end_with_cleanup(tmp_path: Path):

@@ -44,7 +44,7 @@ ROWS = {
         Row(LIES, f"{LYING}.*up=z", refused_by_prepare=LYING),
         Row(STANDS, keys={"up": "z"}),
     ],
-    "f03_swapped_sides.bvh": [Row("", "the toes point backwards. Exchange left and right")],
+    "f03_swapped_sides.bvh": [Row("", "the toes point backwards. Swap left and right")],
     "f04_rotmat_216.npz": [Row("", r"216.*rotation matrices\. Convert them to axis-angle")],
     "f05_json_z_up.json": [Row(STANDS), Row(STANDS, keys={"up": "z"})],
     "f06_tpose_first.bvh": [Row(STANDS, "the first frame is a rest pose and is left out")],
@@ -54,7 +54,7 @@ ROWS = {
     "f12_thirty_joints.npz": [
         Row(
             "",
-            "30 joints, but not the joints of SOMA.*Write the names of all joints.*skeleton.yaml",
+            "30 joints, but not the joints of SOMA.*Add the names of all joints.*skeleton.yaml",
         )
     ],
     "f12_body_only_66.npz": [Row(STANDS)],
@@ -62,7 +62,7 @@ ROWS = {
     "f13_shorter_person.npz": [
         Row(STANDS, r"the feet are \d cm below the floor.*the body in the file is smaller")
     ],
-    "f14_two_people.bvh": [Row(STANDS, "2 people in the file")],
+    "f14_two_people.bvh": [Row(STANDS, "the file contains 2 people")],
     "f15_half.npz": [Row(STANDS)],
     "f18_git_lfs_pointer.bvh": [Row("", "a Git LFS pointer.*git lfs pull")],
     "f20_more_frames_than_stated.bvh": [Row("", r"the file contains \d+ frames, but declares \d+")],

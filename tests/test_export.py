@@ -121,7 +121,7 @@ def test_bones_that_change_length_are_met_on_average_and_joints_without_rotation
     torch.testing.assert_close(lengths, lengths[:1].expand_as(lengths))
     assert torch.linalg.vector_norm(poses.joints() - noisy, dim=-1).mean() < 0.008
     joints = two_circles().joints()
-    with pytest.raises(UserError, match="22 joints of SMPL"):
+    with pytest.raises(UserError, match="SMPL's 22 joints"):
         solve(joints[:, :21], FPS)
     joints[:, 4] = joints[:, 1]
     with pytest.raises(UserError, match="left_knee"):
@@ -300,20 +300,20 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle, subtests):
     options: dict[str, Any]
     kit = sway(5, 12.5, KIT21)
     for motion, name, options, message in (
-        (circle, "a.glb", {"rest_pose": True}, "rest_pose is only for .bvh"),
+        (circle, "a.glb", {"rest_pose": True}, "rest_pose applies only to .bvh"),
         (
             circle,
             "a.bvh",
             {"rig": "miximo"},
             r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal",
         ),
-        (circle, "a.npz", {"rig": "mixamo"}, r"rig is only for"),
+        (circle, "a.npz", {"rig": "mixamo"}, r"rig applies only to"),
         (kit, "a.bvh", {}, r"\.json or \.npy"),
         (
             circle,
             "walk.npz.txt",
             {},
-            "unknown kind of motion file. Use one of .bvh, .glb, .fbx, .usda",
+            "unsupported motion format. Use one of .bvh, .glb, .fbx, .usda",
         ),
     ):
         with (

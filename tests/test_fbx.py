@@ -363,7 +363,7 @@ REFUSED = {
     ),
     "unknown property": (header(7700) + wide_record(b"A", b"Z\x01", 1), "unknown property"),
     "bomb": (bomb(), "an array has"),
-    "large claim": (claim(2**31), "arrays have more than"),
+    "large claim": (claim(2**31), "arrays take more than"),
     "short array": (claim(10), "an array has"),
     "unknown encoding": (claim(10, 9), "unknown encoding 9"),
     "nested": (nested(), "nested"),
@@ -430,7 +430,7 @@ FAULTS = {
     "keys out of order": "not in order",
     "far keys": "too many",
     "nan": "not in order, or not finite",
-    "attributes": "do not fit its keys",
+    "attributes": "do not match its keys",
 }
 
 

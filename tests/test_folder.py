@@ -244,7 +244,10 @@ BAD = {
         lambda f: write_table(f, [{"id": "one", "split": split} for split in ("val", "test")]),
         "line 3: one has two values for split: val and test",
     ),
-    "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
+    "no rate": (
+        lambda f: (f / "skeleton.yaml").unlink(),
+        r"one\.npy: the file contains no frame rate",
+    ),
     "up": (
         lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
         "is lying down",

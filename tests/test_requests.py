@@ -302,7 +302,7 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
         ),
         (
             ["walk.fbx", "root_motion=true"],
-            "root_motion is only for .glb, .fbx and USD files with rig=unreal",
+            "root_motion applies only to .glb, .fbx and USD files with rig=unreal",
         ),
     ],
 )

@@ -265,7 +265,7 @@ def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(
 ):
     hero = tmp_path / "hero.bvh"
     own_bvh(hero, kick, "first frame")
-    with pytest.raises(UserError, match=r"out\.glb: this character is a \.bvh file without meshes"):
+    with pytest.raises(UserError, match=r"out\.glb: a \.bvh character has no meshes"):
         kick.save(tmp_path / "out.glb", character=hero)
     text = hero.read_text()
     lines = text.splitlines()
@@ -308,7 +308,7 @@ def test_names_of_joints_are_read_from_a_file(
     for other, message in (
         (
             {"left_nee": "x"},
-            r"hero\.yaml: left_nee is not a joint of SMPL\. Did you mean left_knee",
+            r"hero\.yaml: left_nee is not an SMPL joint\. Did you mean left_knee",
         ),
         (
             {"left_knee": "Rig Bone-l_flak"},
@@ -397,7 +397,7 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
             with pytest.raises(UserError, match=message):
                 kick.save(tmp_path / "out.glb", character=hero)
             assert not (tmp_path / "out.glb").exists()
-    with pytest.raises(UserError, match=r"out\.bvh: this character is a \.glb file"):
+    with pytest.raises(UserError, match=r"out\.bvh: a \.glb character can only"):
         kick.save(tmp_path / "out.bvh", character=tmp_path / "mixamo.glb")
 
 

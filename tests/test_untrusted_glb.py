@@ -94,7 +94,7 @@ def drawn(document: dict[str, Any]) -> None:
 
 
 FAULTS: dict[str, tuple[Change, str]] = {
-    "child that does not exist": (node(children=[999]), "child: there is no number 999"),
+    "child that does not exist": (node(children=[999]), "child: index 999 does not exist"),
     "two parents": (
         lambda d: d["nodes"][0]["children"].append(d["nodes"][1]["children"][0]),
         "two parents",
@@ -103,7 +103,7 @@ FAULTS: dict[str, tuple[Change, str]] = {
     "many nodes": (lambda document: document["nodes"].extend([{}] * 100_000), "at most 4096"),
     "chain of all nodes": (deep, ""),
     "all nodes are joints": (many, ""),
-    "many primitives": (drawn, "parts of meshes"),
+    "many primitives": (drawn, "parts of skinned meshes"),
     "nothing stored": (unbuffered, ""),
     "bool as a number": (item("bufferViews", byteOffset=True), "valid integer"),
     "large integer": (item("accessors", count=HUGE), "accessors.0.count"),
@@ -155,8 +155,8 @@ def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: P
         (packed(b"[1, 2]"), "valid dictionary"),
         (packed(b"{}" * 3), "Extra data"),
         (packed(b"\xff{}"), "decode"),
-        (packed(b" " * (glb.DOCUMENT_LIMIT + 4)), "a first part"),
-        (whole[:12] + b"\xff\xff\xff\xff" + whole[16:], "a first part"),
+        (packed(b" " * (glb.DOCUMENT_LIMIT + 4)), "its first chunk"),
+        (whole[:12] + b"\xff\xff\xff\xff" + whole[16:], "its first chunk"),
     ):
         with subtests.test(content=content, message=message):
             path.write_bytes(content)

@@ -110,7 +110,7 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60000) + b"(" * 60000, "not an array"),
     ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60) + b"(" * 60, "not an array"),
     ("a.json", b'{"joints": ' + b"[" * 10**6, "nested too deeply"),
-    ("a.json", b"[1, 2]", "not a motion in JSON"),
+    ("a.json", b"[1, 2]", "not a JSON motion"),
     ("a.json", json.dumps({"fps": 1e-7, "joints": JOINTS.tolist()}).encode(), "fps is 1e-07"),
     ("a.json", b"\xff\xfe{}", "a.json: not a UTF-8 text file"),
 ]

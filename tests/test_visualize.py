@@ -108,7 +108,7 @@ def _write(motion: Motion, path: Path) -> None:
     elif path.suffix == ".png":
         contact_sheet(path, [motion])
     elif motion.skeleton is KIT21 and path.suffix not in (".npz", ".json", ".npy", ".gif", ".mp4"):
-        with pytest.raises(UserError, match="computed only for the 22 joints of SMPL"):
+        with pytest.raises(UserError, match="computed only for SMPL's 22 joints"):
             motion.save(path, **options.get(path.stem, {}))
     else:
         motion.save(path, **options.get(path.stem, {}))

@@ -10,15 +10,15 @@ from flame_mdm.errors import UserError
 
 # Files with a scene of nodes and its animations
 SCENES = (".fbx", ".glb", ".vrm", ".vrma")
-# Endings of motion files that can be read
+# Extensions of motion files that can be read
 ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
-# Endings of files with a tree of joints and their rotations
+# Extensions of files with a tree of joints and their rotations
 TREES = (".bvh", ".amc")
 # Universal Scene Description
 USD = (".usda", ".usdc", ".usdz")
 # Endings of files that can be written with the skeleton of another program
 RIGGED = (".bvh", ".glb", ".fbx", *USD)
-# Endings of the files that `Motion.save` writes
+# Extensions of the files that `Motion.save` writes
 WRITTEN = (
     *RIGGED,
     ".vrma",
@@ -30,7 +30,7 @@ WRITTEN = (
 )
 
 ADVICE = {
-    ".gltf": "Save it as .glb, which is one file, for example with Blender (File > Export > glTF 2.0)",
+    ".gltf": "Save it as .glb, which is a single file, for example with Blender (File > Export > glTF 2.0)",
     ".blend": "Open it in Blender and export BVH (File > Export > Motion Capture)",
     ".c3d": "It contains markers, not joints. Fit a skeleton with your motion capture program and export BVH",
     ".trc": "It contains markers, not joints. Fit a skeleton with your motion capture program and export BVH",
@@ -38,27 +38,27 @@ ADVICE = {
     ".pt": "Save its arrays with numpy.savez as joints and fps, or as poses, trans and mocap_framerate",
     ".csv": "Save joints (frames, joints, 3) with numpy.savez as joints and fps",
 }
-"""Advice by ending, for motion files that cannot be read."""
+"""Advice by extension, for motion files that cannot be read."""
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
-"""Suffixes of AMASS files that contain a body shape and no motion."""
+"""Suffixes of AMASS files that contain a body shape but no motion."""
 # Name of the array of joints, which only motions in JSON contain
 JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 
 
 def unread(path: Path) -> UserError:
-    """Returns the error for a file that has an unsupported ending."""
+    """Returns the error for a file that has an unsupported extension."""
     advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
     return UserError(
-        f"{path}: {path.suffix or 'a file without ending'} is not read as a motion. {advice}"
+        f"{path}: {path.suffix or 'a file without extension'} cannot be read as a motion. {advice}"
     )
 
 
 def motions_in(folder: Path) -> list[Path]:
     """Returns the motion files in a folder and its subfolders, sorted.
 
-    Hidden files (created by macOS and editors), folders, and AMASS files without motion are left
-    out. A JSON file is a motion only if it contains an array of joints.
+    Hidden files (created by macOS and editors), folders, and AMASS files without motion are
+    skipped. A JSON file is a motion only if it contains an array of joints.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 
@@ -67,7 +67,7 @@ def motion_files(folder: Path) -> list[Path]:
     """Returns the same files as `motions_in`. Raises `UserError` if there are none."""
     files = motions_in(folder)
     if not files:
-        raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")
+        raise UserError(f"{folder}: contains no motion files ({', '.join(ENDINGS)})")
     return files
 
 

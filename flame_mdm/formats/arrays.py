@@ -72,7 +72,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         data["poses"] = _joined([data[name] for name in BODY])
     if not {"joints", "poses"} & data.keys():
         raise UserError(
-            "contains neither joints nor poses. A motion needs joints and fps, or poses, trans and a rate"
+            "contains neither joints nor poses. A motion needs joints and fps, or poses, trans and a frame rate"
         )
     for name in {"joints", "poses", "trans"} & data.keys():
         check_numbers(name, data[name])
@@ -119,9 +119,9 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
-    """Returns the axis-angle vectors (F, 72) of SMPL's joints.
+    """Returns the axis-angle vectors (F, 72) for SMPL's joints.
 
-    If the file contains no hands, the vectors of the hands are 0.
+    If the file contains no hands, the vectors for the hands are 0.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
@@ -147,11 +147,11 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     if not is_real(values):
         raise UserError(f"{name} are not an array of real numbers")
     if not values.ndim or not len(values):
-        raise UserError(f"{name} of shape {values.shape} have no frames")
+        raise UserError(f"{name} with shape {values.shape} have no frames")
     check_frames(len(values))
     if (beyond := ~(np.abs(values.astype(float)) < 1e6)).any():
         raise UserError(
-            f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million"
+            f"numbers in {name}, frame {np.argwhere(beyond)[0][0]}, are not finite, or exceed a million"
         )
 
 
@@ -167,7 +167,7 @@ def _read_json(path: Path) -> dict[str, Any]:
             data["unit"] = LENGTHS.get(str(content["unit"]).lower(), content["unit"])
     except (AttributeError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise UserError(
-            f"not a motion in JSON, which is an object with joints and fps: {error}"
+            f"not a JSON motion, which must be an object with joints and fps: {error}"
         ) from error
     data["ours"] = "caption" in content and (data.get("up"), data.get("unit")) == ("y", 1.0)
     return data

@@ -2,8 +2,8 @@
 
 An ASF file lists the bones of a subject. Each bone has a direction and length in the world in the
 rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file contains
-the angles of these degrees of freedom for each frame. If M is the rotation of the angles, the bone
-turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied first: C = Rz Ry Rx.
+the angles of these degrees of freedom for each frame. If M is the rotation given by these
+angles, the bone turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Bone(NamedTuple):
 def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints.
 
-    Each bone becomes a joint of the same name at its start. AMC files do not contain `fps`, which
+    Each bone becomes a joint with the same name at its start. AMC files do not contain `fps`, which
     is 120 for most of CMU's recordings.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
     if fps is None:
         raise UserError(
-            f"{path}: AMC files contain no frame rate. Set fps=120, or write `fps: 120` into skeleton.yaml"
+            f"{path}: AMC files contain no frame rate. Set fps=120, or add `fps: 120` to skeleton.yaml"
         )
     names = tuple(bones)
     inner = set(parents.values())
@@ -97,7 +97,7 @@ def skeleton_of(path: Path) -> Path:
     )
     if chosen is None:
         raise UserError(
-            f"{path}: no skeleton {candidates[1].name} next to it. AMC files need their ASF file"
+            f"{path}: there is no skeleton {candidates[1].name} next to it. AMC files need their ASF file"
         )
     return chosen
 
@@ -153,7 +153,7 @@ def _bone(lines: Lines, fields: dict[str, list[str]]) -> Bone:
     if missing := [
         name for name in ("name", "direction", "length", "axis") if not fields.get(name)
     ]:
-        lines.fail(f"a bone without {missing[0]}")
+        lines.fail(f"a bone has no {missing[0]}")
     freedoms = tuple(word.upper() for word in fields.get("dof", ()))
     if not set(freedoms) <= set(TURNS) or len(set(freedoms)) < len(freedoms):
         lines.fail(
@@ -170,7 +170,7 @@ def _bone(lines: Lines, fields: dict[str, list[str]]) -> Bone:
 def _order(lines: Lines, words: list[str]) -> str:
     order = "".join(words).upper()
     if sorted(order) != list("XYZ"):
-        lines.fail(f"an order of axes is needed, such as XYZ, found {order[:40]}")
+        lines.fail(f"expected an axis order such as XYZ, found {order[:40]}")
     return order
 
 
@@ -193,7 +193,7 @@ def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.n
             frames += 1
         elif words[0] not in rows or len(rows[words[0]]) != frames - 1:
             lines.fail(
-                f"{words[0][:40]} is not a moving bone of the skeleton, is outside of a frame, or occurs twice"
+                f"{words[0][:40]} is not a moving bone of the skeleton, is outside a frame, or occurs twice"
             )
         else:
             rows[words[0]].append(lines.numbers(words[1:], len(bones[words[0]].freedoms)))

@@ -16,12 +16,12 @@ from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh,
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 """How much the width of the trunk at a joint follows the shoulders, from 0 to 1; the rest follows the hips."""
-# Limits of the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
+# Limits on the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
 # positions must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)
-# Limits of a limb's length, relative to the limb's length in the mesh
+# Limits on a limb's length, relative to the limb's length in the mesh
 LONGER = (0.4, 2.5)
-# Limits of the length scale of all other parts, relative to the scale of the limbs
+# Limits on the length scale of all other parts, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
 ORTHONORMAL = 0.1  # maximum error of the dot products between rows of a rotation matrix
 LIMBS = tuple(
@@ -36,7 +36,7 @@ class PosedFigure(Figure):
     """Moving joints with rotations that can drive bodies and characters.
 
     Attributes:
-        poses: rotations of SMPL's joints, if they are known.
+        poses: rotations of SMPL's joints, if known.
     """
 
     poses: Poses | None = None
@@ -132,7 +132,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     for joint in LIMBS:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
             raise UserError(
-                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's is "
+                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's bone is "
                 f"{usual[joint]:.3g} m. Is the unit right? Such a motion is drawn without a body"
             )
     wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())

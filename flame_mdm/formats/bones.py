@@ -1,8 +1,8 @@
 """Rotations for SMPL's joints, computed from the bones in a BVH or AMC file.
 
 Joint positions do not show how a forearm or a head turns about its own axis, but the bones of a
-file do. Each SMPL joint is turned in the same way as its bone has turned from the rest pose. Three
-rest poses are tried, in this order: the pose of the file without rotations, a rest pose in front of
+file do. Each SMPL joint gets the rotation by which its bone has turned from the rest pose. Three rest
+poses are tried, in this order: the pose of the file without rotations, a rest pose that precedes
 the motion, and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose, its arms
 and legs are turned to SMPL's directions by the smallest rotation.
 """
@@ -30,7 +30,7 @@ ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 """Possible directions of the trunk in a rest pose.
 
-Some programs export rest poses with another axis up.
+Some programs export rest poses with a different up axis.
 """
 
 
@@ -51,11 +51,11 @@ def bone_poses(
         layout: the skeleton of the file.
         joints: (F, 22, 3), SMPL's joints in meters, y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
-        in_front: (J, 3, 3), rotations relative to the parents in a rest pose in front of the
-            motion; None if there is no such pose.
+        in_front: (J, 3, 3), rotations relative to the parents in a rest pose that precedes
+            the motion; None if there is no such pose.
     """
     if layout.mirrored:
-        return BoneRotations(reason="the motion of the file is mirrored")
+        return BoneRotations(reason="the motion in the file is mirrored")
     bones = [tree.joints.index(layout.bone(joint)) for joint in SMPL22.joints]
     up = np.array(UP[layout.up], float)
     turned = up @ worlds[:, bones]
@@ -65,12 +65,12 @@ def bone_poses(
 
     rest = _rest(tree, layout, bones, turned, steps, in_front)
     if rest is None:
-        return BoneRotations(reason="the rest pose of the file is unknown")
+        return BoneRotations(reason="the rest pose in the file is unknown")
     turned = turned @ _aligned(rest, turned, steps)
     poses = _assembled(turned, joints[:, 0], steps)
     apart = np.linalg.norm(poses.joints().numpy() - joints, axis=-1).mean()
     if not apart <= APART:
-        reason = f"the rotations of the file place joints {100 * apart:.0f} cm from the positions"
+        reason = f"the rotations in the file place joints {100 * apart:.0f} cm from their positions"
         return BoneRotations(reason=reason)
     return BoneRotations(poses)
 

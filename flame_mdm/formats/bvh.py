@@ -1,9 +1,8 @@
 """BVH motion capture files: reading, forward kinematics, resampling, writing.
 
 A BVH file contains a tree of joints with offsets, and a table of numbers with one row per frame and
-one
-column per channel. The rotation channels of a joint are intrinsic Euler angles in degrees, in the
-listed order: `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position
+one column per channel. The rotation channels of a joint are intrinsic Euler angles in degrees, in
+the listed order: `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position
 channels replace the joint's offset.
 """
 
@@ -26,7 +25,7 @@ from flame_mdm.formats.resampling import MAX_FRAMES, RATES, check_tree, frame_pa
 from flame_mdm.safe_io import TEXT_LIMIT, naming, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-# Maximum number of joints and end sites of a file
+# Maximum number of joints and end sites in a file
 MAX_JOINTS = 4096
 # Maximum absolute value of a number, and maximum sum of the numbers in a line
 LARGEST = 1e9
@@ -72,7 +71,8 @@ class Bvh:
     def translations(self) -> np.ndarray:
         """Returns the position (F, J, 3) of each joint in its parent's frame.
 
-        Positions are read from the position channels. For a joint without such channels, the offset is used.
+        Positions are read from the position channels. For a joint without such channels,
+        the offset is used.
         """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
@@ -171,7 +171,7 @@ def read(path: str | Path) -> Bvh:
                 )
         elif keyword == "}":
             if not node.offset:
-                source.fail("joint or end site without OFFSET")
+                source.fail("a joint or end site has no OFFSET")
             blocks.pop()
         else:
             name = source.word("SITE") if keyword == "END" else source.name_of_joint()
@@ -183,7 +183,7 @@ def read(path: str | Path) -> Bvh:
             )
             source.word("{")
     if blocks or not nodes or source.row[-1].upper() != "MOTION":
-        source.fail("MOTION before the end of the hierarchy, or before the end of its line")
+        source.fail("expected MOTION after the end of the hierarchy, at the end of a line")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
     # The number of digits is limited, because Python needs quadratic time to parse long numbers.
@@ -218,7 +218,7 @@ _IN_JOINT, _IN_END = ("OFFSET", "CHANNELS", "JOINT", "END", "}"), ("OFFSET", "}"
 
 @dataclass
 class _Node:
-    """A joint or end site in a hierarchy, and the keywords that may be inside its braces."""
+    """A joint or end site in a hierarchy, and the keywords allowed inside its braces."""
 
     name: str
     parent: int

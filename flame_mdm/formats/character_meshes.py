@@ -36,7 +36,7 @@ def character_clip(character: Character, motion: PosedFigure, name: str) -> Rigg
         skins = meshes(file)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise UserError(
-            f"a mesh of this character cannot be converted: {error}. Write a .glb file"
+            f"a mesh of this character cannot be converted: {error}. Save a .glb file instead"
         ) from error
     return RiggedClip(
         name=name,
@@ -54,7 +54,7 @@ def character_clip(character: Character, motion: PosedFigure, name: str) -> Rigg
 
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the names. A number is appended to each repeated name."""
+    """Returns the names. A number is appended to each duplicate."""
     counts: dict[str, int] = {}
     distinct = []
     for name in names:
@@ -64,7 +64,7 @@ def _distinct(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def meshes(file: glb.Glb) -> list[Skin]:
-    """Returns one skinned mesh per part of a mesh in a file.
+    """Returns one skinned mesh for each part of each mesh in a file.
 
     Parts without a skin follow their node.
 
@@ -105,13 +105,13 @@ def _part(
     else:
         corners = np.arange(len(points))
     if len(corners) % 3 or (len(corners) and corners.max() >= len(points)):
-        raise ValueError(f"{name} has triangles whose corners are missing")
+        raise ValueError(f"{name} has triangles whose vertices are missing")
     triangles = corners.reshape(-1, 3)
     normals = _normals(file, attributes, points, triangles)
     uvs = np.zeros((0, 2))
     if "TEXCOORD_0" in attributes:
         uvs = glb.numbers(file, attributes["TEXCOORD_0"], "VEC2")
-        # glTF counts v from the upper edge of the image
+        # glTF measures v from the upper edge of the image
         uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], 1)
 
     if bound is None or "JOINTS_0" not in attributes:
@@ -124,7 +124,7 @@ def _part(
         bones = glb.numbers(file, attributes["JOINTS_0"], "VEC4").astype(int)
         weights = glb.numbers(file, attributes["WEIGHTS_0"], "VEC4")
         if not (bones >= 0).all() or not (bones < len(ordered)).all():
-            raise ValueError(f"{name} has a vertex of an unknown joint")
+            raise ValueError(f"{name} has a vertex that is bound to an unknown joint")
         weights = np.maximum(weights, 0)
         weights = weights / np.maximum(weights.sum(1, keepdims=True), 1e-9)
         binds = bound.binds if len(bound.binds) else np.linalg.inv(file.worlds[bound.joints])
@@ -190,7 +190,7 @@ def _image(file: glb.Glb, number: int | None) -> bytes:
     start = view.get("byteOffset", 0)
     content = file.data[start : start + view["byteLength"]]
     if len(content) > MAX_IMAGE:
-        raise ValueError("an image has more than 64 MiB")
+        raise ValueError("an image is larger than 64 MiB")
     with Image.open(io.BytesIO(content), formats=["PNG", "JPEG"]) as picture:
         picture.verify()
     return content

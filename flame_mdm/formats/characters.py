@@ -1,4 +1,4 @@
-"""Motions on a user's character, which is a skinned .glb file or the skeleton of a .bvh file.
+"""Motions for a user's character, which is a skinned .glb file or the skeleton of a .bvh file.
 
 The proportions, units, axes, names and rest pose of a character may differ from SMPL's body. The
 rest pose must be upright with flat feet.
@@ -201,7 +201,7 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 class UnknownJoints(UserError):
     """Error for joints that cannot be identified.
 
-    `template` contains the lines of a file of names, which the user can complete.
+    `template` contains the lines of a file with names, which the user can complete.
     """
 
     def __init__(self, message: str, template: list[str]):
@@ -235,8 +235,8 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
         template = [f"# Joints of {path.name}: {', '.join(names.values())}"]
         template += [f"{joint}:{listed_names.get(joint, '')}" for joint in JOINT]
         raise UnknownJoints(
-            f"{path}: no joint found for {', '.join(missing)}. Write the names of the joints into {listed}, as in the "
-            "lines above; only spine, neck, head, collars and feet may stay empty",
+            f"{path}: no joint found for {', '.join(missing)}. Add the joint names to {listed}, as in the "
+            "lines above; only spine, neck, head, collars and feet may remain empty",
             template,
         )
     return numbers
@@ -254,7 +254,7 @@ def _listed(
     for joint, name in chosen.items():
         if joint not in JOINT:
             raise UserError(
-                f"{listed}: {joint} is not a joint of SMPL.{did_you_mean(str(joint), JOINT)}"
+                f"{listed}: {joint} is not an SMPL joint.{did_you_mean(str(joint), JOINT)}"
             )
         if name is not None:
             candidates[joint] = [number for number, label in names.items() if label == name]
@@ -282,7 +282,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     """
     if path.suffix.lower() != ".glb":
         raise UserError(
-            f"{path}: this character is a .glb file, so name a .glb, .fbx, .usda, .usdc or .usdz file for the result"
+            f"{path}: a .glb character can only be saved as a .glb, .fbx, .usda, .usdc or .usdz file"
         )
     file, (world, positions, rig) = character.file, moved(character, motion)
     document, hips = copy.deepcopy(file.document), rig.hips
@@ -324,7 +324,7 @@ def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
     """Writes the character's file with this motion. Returns a line that describes the file."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
-            f"{path}: this character is a .bvh file without meshes, so name a .bvh file for the result"
+            f"{path}: a .bvh character has no meshes, so it can only be saved as a .bvh file"
         )
     file, (world, positions, rig) = character.file, moved(character, motion)
     local, offsets, hips = rig.local(world), rig.offsets(), rig.hips

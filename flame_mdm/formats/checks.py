@@ -1,13 +1,13 @@
-"""Checks of motions on SMPL's joints: body size, feet, up axis, flipped legs, and rest poses."""
+"""Checks for motions with SMPL's joints: body size, feet, up axis, flipped legs, and rest poses."""
 
 import numpy as np
 
 from flame_mdm.formats.layouts import UP, Layout, check_feet, check_size
 from flame_mdm.representations.skeleton import SMPL22
 
-# A body lies if the mean vertical component of its trunk direction is smaller than this
+# A body is lying if the mean vertical component of its trunk direction is smaller than this
 LYING = 0.3
-# With another axis up, a body stands if the component is larger than this
+# With a different up axis, a body is standing if the component is larger than this
 STANDING = 0.7
 # Maximum speed of the pelvis in m/s. Sprinters reach 12; files with higher speeds are damaged.
 FASTEST = 15.0
@@ -18,7 +18,7 @@ AVERAGED = 0.05
 KICK = 30.0
 UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is reported as too small
 
-# Maximum number of seconds between a rest pose in front of a motion and the motion. Some
+# Maximum number of seconds between a rest pose that precedes a motion and the motion. Some
 # conversions blend these frames.
 BLEND = 0.04
 # Number of subsequent frames with which the first steps are compared
@@ -43,7 +43,7 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
     """Checks that joints (F, 22, 3) form a human body.
 
     The `layout` of the file contains its unit, its up axis, and whether the body may be a child's.
-    If the size is wrong and the body lies, the message names both the unit and the axis, so that
+    If the size is wrong and the body is lying, the message names both the unit and the axis, so that
     the file needs only one correction.
 
     Raises:
@@ -63,7 +63,7 @@ def uprightness(joints: np.ndarray) -> float:
 
 
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
-    """Returns a message if the body lies in most frames, with the axis that would make it stand.
+    """Returns a message if the body is lying in most frames, with the axis that would make it stand.
 
     Returns "" otherwise. `joints` (F, 22, 3) have y up. They were converted from the axes of the
     file by `axes` (3, 3). `up` is the up axis of the file.
@@ -99,7 +99,7 @@ def jump(joints: np.ndarray, fps: float) -> str:
         )
         if speeds.max(initial=0.0) > fastest:
             frame = int(speeds.max(1).argmax())
-            return f"{verb}, it moves at {speeds.max():.0f} m/s in frame {frame} ({fps:g} fps), so the file is damaged"
+            return f"{verb}: it moves at {speeds.max():.0f} m/s in frame {frame} ({fps:g} fps), so the file is damaged"
     return ""
 
 
@@ -116,7 +116,7 @@ def below_floor(joints: np.ndarray) -> str:
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:
-    """Returns the number of frames in front of a motion that show a rest pose, or lead from it to the motion.
+    """Returns the number of frames before a motion that show a rest pose or lead from it to the motion.
 
     Several programs write a T-pose or A-pose as the first frame. In a recorded motion that begins
     with a rest pose, the first step is not longer than the following steps.
@@ -133,7 +133,7 @@ def rest_frames(joints: np.ndarray, fps: float) -> int:
 
 
 def _is_rest_pose(pose: np.ndarray) -> bool:
-    """Returns whether joints (22, 3) show a person who stands with straight legs and straight arms.
+    """Returns whether joints (22, 3) show a person standing with straight legs and straight arms.
 
     Both arms must be raised equally.
     """

@@ -35,7 +35,7 @@ In generated motion, a foot on the floor may slide along with the body. A swingi
 than the body.
 """
 DRIFT = 0.2
-"""Maximum speed in m/s with which the body may slide over its feet; the legs compensate for it.
+"""Maximum speed in m/s at which the body may slide over its feet; the legs compensate for it.
 
 Above 1.5 times this speed, the body follows its feet entirely.
 """
@@ -91,7 +91,7 @@ def cleanup(
     Returns:
         Joints (F, J, 3) float32.
     """
-    # Joints get smooth paths, and bones get their median lengths. Then the body is moved over the
+    # Joints get smooth paths, and bones get their median lengths. Then, the body is moved over the
     # ground so that its feet in contact stand still on average. The remaining sliding is corrected
     # by two-bone inverse kinematics: the legs keep each toe in place during its contacts. Inverse
     # kinematics also moves the arms out of the trunk and thighs.
@@ -146,7 +146,7 @@ def _least_squares(
 
 
 def _smooth(motion: np.ndarray) -> np.ndarray:
-    """Returns smooth paths of the joints (Whittaker 1923).
+    """Returns smooth joint paths (Whittaker 1923).
 
     Positions that jump for a few frames have little influence on the paths.
     """
@@ -173,7 +173,7 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
-    """Bends limbs whose foot or hand is lower because bones got their median lengths.
+    """Bends limbs whose foot or hand has moved down because bones got their median lengths.
 
     Between two very different poses of a sequence, for example from a crawl to a walk, the poses
     are averages of both and have short bones. With full lengths, they would reach through the

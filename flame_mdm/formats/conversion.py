@@ -23,7 +23,7 @@ It is its own inverse.
 """
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
-"""SMPL joint at the same location of the body, for KIT-ML joints with other names."""
+"""SMPL joint at the same location on the body, for KIT-ML joints with different names."""
 LEGS = tuple(
     SMPL22.joints.index(f"{side}_{name}")
     for side in ("left", "right")
@@ -38,10 +38,10 @@ class RawMotion:
     Attributes:
         values: joints (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
-        note: a line for the user if a body with other proportions was used, with the error;
-            otherwise "". The line states whether the rotations come from the file or were fitted to
-            the joints.
-        error: mean distance in meters between the joints of this body and of the motion.
+        note: a line for the user if a body with different proportions was used; otherwise "".
+            The line states the error, and whether the rotations come from the file or were fitted
+            to the joints.
+        error: mean distance in meters between the joints of this body and the joints of the motion.
     """
 
     values: Tensor

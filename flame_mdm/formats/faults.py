@@ -1,4 +1,4 @@
-"""Physical faults of motions, such as sliding feet, jumps, penetration, floating or freezing."""
+"""Physical faults in motions, such as sliding feet, jumps, penetration, floating or freezing."""
 
 import math
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ LIMITS = {
     "limit": (
         15.0,
         "degrees",
-        "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less",
+        "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less than 15",
     ),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
@@ -101,7 +101,7 @@ def find_faults(motion: Motion) -> list[Fault]:
     # time.
     jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
-    # An opening (morphology) of a flag in time keeps only runs that are at least as long as the
+    # A morphological opening of a flag over time keeps only runs that are at least as long as the
     # window.
     floats = [
         binary_opening(flag, np.ones((math.ceil(s * fps), 1)))

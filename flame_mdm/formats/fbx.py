@@ -3,9 +3,9 @@
 `fbx_scene` reads motions from these trees, and `fbx_writer` writes motions as such trees.
 
 Autodesk does not publish the format. The layout of the records, the arrays and the end of the file
-follows the description of the Blender Foundation
-(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files of Autodesk's own
-SDK. A record has a name, properties and nested records. Numbers are little-endian.
+follows the description by the Blender Foundation
+(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files written by
+Autodesk's own SDK. A record has a name, properties and nested records. Numbers are little-endian.
 """
 
 import struct
@@ -33,12 +33,12 @@ LIMIT = 512 * MEBIBYTE
 EXPANDED_LIMIT = 512 * MEBIBYTE
 # Maximum nesting of records; programs write about 8
 MAX_DEPTH = 32
-# Maximum number of records of a file
+# Maximum number of records in a file
 MAX_RECORDS = 1_000_000
 # The length of a name is stored in one byte
 MAX_NAME = 255
 
-# Format of a number by the code of its type
+# Format of a number by its type code
 SCALARS = {
     "Y": "<h",
     "C": "<?",
@@ -47,7 +47,7 @@ SCALARS = {
     "D": "<d",
     "L": "<q",
 }
-# Type of an array's items by the code of the array's type
+# Type of an array's items by the array's type code
 ARRAYS = {
     "f": "<f4",
     "d": "<f8",
@@ -168,7 +168,9 @@ class _Reader:
         if not position <= after <= end <= limit:
             raise ValueError(f"a record at byte {start} ends outside its parent")
         if depth > MAX_DEPTH or self.records > MAX_RECORDS:
-            raise ValueError(f"it has more than {MAX_DEPTH} nested or {MAX_RECORDS:,} records")
+            raise ValueError(
+                f"it has more than {MAX_DEPTH} nesting levels or {MAX_RECORDS:,} records"
+            )
 
         name = self.content[position - length : position].decode("utf-8", "replace")
         record = Record(name, self._properties(position, after, count))
@@ -213,7 +215,7 @@ class _Reader:
         size = items * kind.itemsize
         self.expanded += size
         if self.expanded > EXPANDED_LIMIT:
-            raise ValueError(f"its arrays have more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
+            raise ValueError(f"its arrays take more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
             # One more byte than declared is decompressed, to detect arrays that are too long.

@@ -59,7 +59,7 @@ TIME_MODES = {
 
 # Bits of `KeyAttrFlags`; without them, interpolation is linear
 CONSTANT, CUBIC = 0x2, 0x8
-# Bit of a constant segment with the value of the key after it
+# Bit for a constant segment that has the value of the next key
 NEXT_VALUE = 0x100
 # A frame takes the value of a key that is up to this many seconds after the frame
 UNSTEPPED = 1e-6
@@ -149,7 +149,7 @@ class _Model:
         return values
 
     def local(self, times: np.ndarray) -> np.ndarray:
-        """Returns the matrix (F, 4, 4) to the coordinates of the parent at times (F,)."""
+        """Returns the matrix (F, 4, 4) to the parent's coordinates at times (F,)."""
         active = bool(self.number("RotationActive"))
         order = ORDERS[self.number("RotationOrder") % len(ORDERS)] if active else "xyz"
         before = euler("xyz", self.vector("PreRotation")) if active else np.eye(3)
@@ -230,7 +230,7 @@ class _Scene:
         self.below: dict[int, list[tuple[int, str]]] = defaultdict(list)
         for record in connections.all("C"):
             if len(record.properties) < 3:
-                raise ValueError("a connection does not name its two objects")
+                raise ValueError("a connection does not specify its two objects")
             kind, child, parent, *names = record.properties
             self.below[parent].append((child, str(names[0]) if kind == "OP" and names else ""))
             if child in self.models and parent in self.models and kind == "OO":
@@ -286,7 +286,7 @@ class _Scene:
                 self.models[model].curves.setdefault(target, {})[axis] = curves[-1]
         if not curves:
             raise UserError(
-                "contains no animation of its bones. Export the file with its animation"
+                "contains no animation for its bones. Export the file with its animation"
             )
 
         fps = self._rate()
@@ -389,7 +389,7 @@ def _curve(record: fbx.Record) -> Curve:
     if not len(flags):
         return Curve(times, values, np.zeros(len(times), np.int64), slopes)
     if len(counts) != len(flags) or (counts < 0).any() or counts.sum() != len(times):
-        raise ValueError("attributes of an animation curve do not fit its keys")
+        raise ValueError("attributes of an animation curve do not match its keys")
     if len(floats) == 4 * len(flags):
         slopes = np.repeat(floats.reshape(-1, 4)[:, :2], counts, axis=0)
     return Curve(times, values, np.repeat(flags, counts), slopes)

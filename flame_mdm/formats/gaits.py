@@ -37,11 +37,11 @@ SLOWEST = 0.2
 ASIDE = 35.0
 # Weight of velocities relative to positions, in seconds, when poses are compared
 VELOCITY = 0.1
-# A body stands if no joint moves faster than this relative to the root, in m/s
+# A body is standing if no joint moves faster than this relative to the root, in m/s
 SETTLED = 0.12
-# Seconds of standing that are kept before a start and after a stop
+# Seconds of standing still that are kept before a start and after a stop
 MARGIN = 0.15
-# Seconds in which the first or last pose of a clip is blended into the motion
+# Seconds over which the first or last pose of a clip is blended into the motion
 FADE = 0.5
 # Minimum and maximum angle of a turn, relative to the requested angle
 OVERSHOOT = (0.6, 1.6)
@@ -114,8 +114,8 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
     preferred, so that the loops of a set begin with the same foot.
     """
     # The cycle lies in the longest part that has a steady speed in the requested direction. All
-    # pairs of frames at the distance of a plausible cycle are compared, by the differences between
-    # joints and between velocities.
+    # pairs of frames that are a plausible cycle length apart are compared, by the differences
+    # between joints and between velocities.
     along, aside = progress(motion, degrees)
     even = gaussian_filter1d(along, EVEN * motion.fps, mode="nearest")
     full = np.percentile(even, 90)
@@ -156,7 +156,7 @@ def gait(
     """Returns the start, the loop and the stop of a gait on a straight path.
 
     Args:
-        motion: a person who stands, moves in a direction, and stands again.
+        motion: a person who is standing, moves in a direction, and stands again.
         cycle: the cycle that becomes the loop.
         degrees: the direction, relative to the heading of the person.
         stand: (22, 3), the first pose of the start and the last pose of the stop.
@@ -223,7 +223,7 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
     Returns None if the motion turns by a very different angle or to the other side.
     """
     # The model turns by about the requested angle. The root gets exactly this angle, and the pose
-    # turns along.
+    # turns with it.
     begin, end = moving(motion)
     part = motion.cut(begin, end)
     angle = part.heading[-1] - part.heading[0]
@@ -255,7 +255,7 @@ def passing(motion: GroundedMotion) -> list[float | None]:
     """Returns the times in seconds at which the planted left and right toes pass the root of a loop.
 
     None = the toes never pass the root. Two gaits are best blended at these times, because both
-    then have the foot at the same place.
+    then have the foot in the same place.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)

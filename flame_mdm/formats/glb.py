@@ -1,6 +1,6 @@
 """glTF 2.0 binary files (.glb).
 
-Readers get a validated document. Writers use `Binary` for the binary part. Source: Khronos Group,
+Readers receive a validated document. Writers use `Binary` for the binary part. Source: Khronos Group,
 "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
 
@@ -22,7 +22,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-# For each integer type, the integer that stands for 1 if the accessor is normalized
+# For each integer type, the integer that represents 1 if the accessor is normalized
 WHOLE = {
     5120: 127,
     UNSIGNED_BYTE: 255,
@@ -141,7 +141,9 @@ class _Document(_Object):
 def _item(items: Sequence[Item], index: int, name: str) -> Item:
     """Returns an item of a list in the document. Raises `ValueError` if it does not exist."""
     if not 0 <= index < len(items):
-        raise ValueError(f"{name}: there is no number {index}, because there are only {len(items)}")
+        raise ValueError(
+            f"{name}: index {index} does not exist, because there are only {len(items)}"
+        )
     return items[index]
 
 
@@ -192,7 +194,7 @@ class Glb:
     locals: np.ndarray
     # (N, 4, 4), from each node's coordinates to the world
     worlds: np.ndarray
-    # Skins of meshes
+    # Skins of the meshes
     skins: tuple[Skin, ...]
 
 
@@ -244,7 +246,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
     """Returns the parsed document and the binary part of a file."""
     version, _, size, kind = struct.unpack_from("<III4s", content, 4)
     if version != 2 or kind != b"JSON" or size > DOCUMENT_LIMIT:
-        raise ValueError(f"it has version {version} and a first part {kind!r} of {size} bytes")
+        raise ValueError(f"it has version {version}, and its first chunk {kind!r} has {size} bytes")
     if len(content) < 20 + size:
         raise ValueError("the file ends too early")
     document = parse_json(content[20 : 20 + size])
@@ -253,7 +255,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
     length, kind = struct.unpack_from("<I4s", content, 20 + size)
     if kind != b"BIN\0" or len(content) < 28 + size + length:
         raise ValueError(
-            f"its second part {kind!r} should have {length} bytes, but the file is shorter"
+            f"its second chunk {kind!r} should have {length} bytes, but the file is shorter"
         )
     return document, content[28 + size : 28 + size + length]
 
@@ -268,7 +270,7 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
             for primitive in _item(parts.meshes, node.mesh, "mesh").primitives
         ]
         if sum(map(len, corners)) > MAX_ITEMS:
-            raise ValueError(f"it has more than {MAX_ITEMS:,} parts of meshes with a skin")
+            raise ValueError(f"it has more than {MAX_ITEMS:,} parts of skinned meshes")
     skins = []
     for skin, boxes in zip(parts.skins, corners, strict=True):
         joints = [_item(rank, joint, "joint of a skin") for joint in skin.joints]
@@ -280,7 +282,7 @@ def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
     """Returns the corners (8, 3) of the box around a part of a mesh."""
     accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
     if {len(accessor.min), len(accessor.max)} != {3}:
-        raise ValueError("a mesh has no bounds of its positions")
+        raise ValueError("a mesh has no bounds for its positions")
     box = np.array([accessor.min, accessor.max], float)
     box /= WHOLE.get(accessor.componentType, 1) if accessor.normalized else 1
     return np.array([box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
@@ -359,7 +361,7 @@ class Binary:
     ) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor.
 
-        If `normalized`, bytes stand for numbers from 0 to 1.
+        If `normalized`, bytes represent numbers from 0 to 1.
         """
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]

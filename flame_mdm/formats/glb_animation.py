@@ -22,7 +22,7 @@ from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 # Maximum number of frames times nodes
 MAX_CELLS = 4_000_000
-# Keys at a lower rate than this were set by hand. Sampled motions have denser keys.
+# Keys at a lower rate than this are assumed to be set by hand. Sampled motions have denser keys.
 SPARSE_RATE = 24.0
 # Rate at which motions with hand-set keys are sampled
 USUAL_RATE = 30.0
@@ -33,7 +33,7 @@ WIDTHS = {
     "scale": 3,
 }
 
-# SMPL joints by the bones of VRM's humanoid
+# SMPL joint for each bone of VRM's humanoid
 HUMANOID = {
     "hips": "pelvis",
     "spine": "spine1",
@@ -223,14 +223,14 @@ def _worlds(
 
 
 def _animated(node: dict[str, Any], tracks: dict[str, Track], times: np.ndarray) -> np.ndarray:
-    """Returns the matrix (F, 4, 4) from the coordinates of a node to the coordinates of its parent."""
+    """Returns the matrix (F, 4, 4) from a node's coordinates to its parent's coordinates."""
     rest = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
     values = {}
     for name, usual in rest.items():
         fixed = np.tile(np.array(node.get(name, usual), float), (len(times), 1))
         values[name] = tracks[name].at(times) if name in tracks else fixed
     if not (np.linalg.norm(values["rotation"], axis=1) > 1e-12).all():
-        raise ValueError("a rotation of an animation is zero")
+        raise ValueError("a rotation in an animation is zero")
     matrices = np.zeros((len(times), 4, 4))
     turns = Rotation.from_quat(values["rotation"]).as_matrix()
     matrices[:, :3, :3] = turns * values["scale"][:, None, :]
@@ -248,7 +248,7 @@ def _tracks(file: glb.Glb, animation: _Animation) -> dict[int, dict[str, Track]]
         if target.path not in WIDTHS or target.node < 0:
             continue
         if target.node not in rank or channel.sampler >= len(animation.samplers):
-            raise ValueError("a channel of an animation has no node or no sampler")
+            raise ValueError("a channel in an animation has no node or no sampler")
         sampler = animation.samplers[channel.sampler]
         track = _track(file, sampler, WIDTHS[target.path])
         tracks.setdefault(rank[target.node], {})[target.path] = track
@@ -262,9 +262,9 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
     if len(values) != len(times) * (3 if cubic else 1):
         raise ValueError("an animation lacks a value for a key")
     if not len(times) or not (np.diff(times) > 0).all() or times[0] < 0 or not times[-1] < 1e5:
-        raise ValueError("keys of an animation are not in order, or not finite")
+        raise ValueError("keys in an animation are not in order, or not finite")
     if not (np.abs(values) < LARGEST).all():
-        raise ValueError("values of an animation are not finite, or too large")
+        raise ValueError("values in an animation are not finite, or too large")
     slopes = np.zeros((2, len(times), width))
     if cubic:
         before, values, after = values.reshape(len(times), 3, width).transpose(1, 0, 2)

@@ -1,6 +1,6 @@
 """Motions relative to a root on the floor, and feet that stay where they are planted.
 
-Game engines move a character by a root on the floor, and play the rest of the motion relative to
+Game engines move a character with a root on the floor, and play the rest of the motion relative to
 this root. Motions are cut in this representation, so that the last pose of one clip can be the
 first pose of the next. Then the path of the root is added again, and inverse kinematics keeps each
 foot in place during its contacts.
@@ -25,7 +25,7 @@ LOW = 0.05
 SLOW = 0.25
 # Contacts, and gaps between contacts, that are shorter than this are ignored; in seconds
 SHORT = 0.1
-# Seconds in which the body is lowered for a leg that is too short
+# Seconds over which the body is lowered for a leg that is too short
 LOWERING = 0.2
 # Number of repetitions of a loop in which toes are planted together. The middle repetition has
 # neighbors on both sides.
@@ -276,8 +276,8 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 
     The last frame of each repetition is the first frame of the next one.
     """
-    # Each repetition begins at the place and in the direction in which the previous one ended.
-    # The path of each repetition is turned and moved there.
+    # Each repetition begins where the previous one ended, in the same direction. Its path is turned
+    # and moved accordingly.
     step = turned(np.r_[motion.path[-1] - motion.path[0], 0][[0, 2, 1]], -motion.heading[0])
     turn = motion.heading[-1] - motion.heading[0]
     count = len(motion) - 1
@@ -343,7 +343,7 @@ def pivot(motion: GroundedMotion) -> float:
 
 
 def jolt(motion: GroundedMotion) -> float:
-    """Returns the maximum acceleration of an ankle or of toes in m/s²."""
+    """Returns the maximum acceleration of the ankles and toes in m/s²."""
     feet = motion.world()[:, [joint for leg in FEET for joint in leg[2:]]]
     changes = np.diff(feet, 2, axis=0) * motion.fps**2
     return float(np.linalg.norm(changes, axis=-1).max(initial=0.0))

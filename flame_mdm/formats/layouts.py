@@ -65,13 +65,13 @@ class Layout(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
     # For each SMPL joint, the name of its joint in the files
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
-    # Names of the joints of arrays, in order. BVH files contain their own names.
+    # Joint names for arrays, in order. BVH files contain their own names.
     joints: list[str] = []
     # Meters per unit of length in the files
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0
     # The up axis
     up: Literal["y", "z", "-y"] = "y"
-    # Frame rate of files that do not contain it
+    # Frame rate of files that contain none
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
     # Whether the files contain mirrored motion. If so, the sign of x is changed.
     mirrored: bool = False
@@ -271,12 +271,12 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
         )
     if len(names) != count:
         rest = (
-            f"but skeleton.yaml names {len(names)}"
+            f"but skeleton.yaml lists {len(names)}"
             if names
-            else "not the 22, 24 or 52 of SMPL or 30 or 77 of SOMA"
+            else "but SMPL has 22, 24 or 52, and SOMA has 30 or 77"
         )
         raise UserError(
-            f"{count} joints, {rest}. Write the names of all joints and a map into skeleton.yaml"
+            f"{count} joints, {rest}. Add the names of all joints and a map to skeleton.yaml"
         )
     return find_layout(names, fields), names
 
@@ -330,7 +330,7 @@ def _one(name: str, candidates: Sequence[str]) -> str:
         return name if name in candidates else candidates[0]
     listed = " or ".join(dict.fromkeys(candidates))[:500]
     raise UserError(
-        f"{name} may be {listed}. Remove one from the file, or map SMPL's joints in skeleton.yaml"
+        f"{name} could refer to {listed}. Remove one from the file, or map SMPL's joints in skeleton.yaml"
     )
 
 
@@ -468,7 +468,7 @@ def check_feet(joints: np.ndarray) -> None:
     lower = np.where(depths[0] > depths[1], *forward)
     if np.median(lower) < 0 and np.mean(forward.max(0) < 0) > BACKWARDS:
         raise UserError(
-            "the toes point backwards. Exchange left and right in skeleton.yaml, or set `mirrored: true`"
+            "the toes point backwards. Swap left and right in skeleton.yaml, or set `mirrored: true`"
         )
 
 
@@ -480,11 +480,11 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
 
     Args:
         joints: (F, 22, 3), SMPL's joints, mapped as if the array had the joints of the skeleton.
-        count: number of joints of the array.
+        count: number of joints in the array.
         skeleton: name of the skeleton.
 
     Raises:
-        UserError: If the limbs differ between the sides or change their length.
+        UserError: If the limbs differ between the sides or change in length.
     """
     lengths = np.stack(
         [_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1
@@ -493,14 +493,10 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     unequal = np.abs(np.log(usual[:4] / usual[4:])).mean() > math.log(UNEQUAL)
     changing = (lengths.std(0) / usual).mean() > CHANGING
     if unequal or changing:
-        fault = (
-            "left and right limbs are not equally long"
-            if unequal
-            else "the limbs change their length"
-        )
+        fault = "left and right limbs differ in length" if unequal else "the limbs change in length"
         raise UserError(
-            f"{count} joints, but not the joints of {skeleton} in order: {fault}. Write the names of all "
-            "joints and a map into skeleton.yaml"
+            f"{count} joints, but not the joints of {skeleton} in order: {fault}. Add the names of all "
+            "joints and a map to skeleton.yaml"
         )
 
 

@@ -1,4 +1,4 @@
-"""`Motion`, one motion outside the models, and writers of motion files.
+"""`Motion`, a single motion independent of any model, and writers for motion files.
 
 `docs/formats.md` describes the files. The 6D rotations in the 263 features of HumanML3D are not
 SMPL's rotations: they follow different chains and do not define the twist of a bone. They are never
@@ -65,7 +65,7 @@ Programs draw a bone only if it has a tip.
 
 @dataclass(eq=False, repr=False)
 class Motion(PosedFigure):
-    """One motion outside the models: generated, real, or read from a file.
+    """A single motion, independent of any model: generated, real, or read from a file.
 
     Attributes:
         joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`. Joints
@@ -140,7 +140,7 @@ class Motion(PosedFigure):
 
         Args:
             path: the file. Its extension selects the format (docs/formats.md).
-            rest_pose: begin a `.bvh` file with a frame of the rest pose, with the arms to the
+            rest_pose: begin a `.bvh` file with a frame in the rest pose, with the arms to the
                 sides. Some programs expect it.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's skeleton.
@@ -151,7 +151,7 @@ class Motion(PosedFigure):
                 `formats.people.load_body`. Default: the mannequin.
             root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD
                 file. Otherwise, it stays in place. Only for `rig="unreal"` and `rig="soma"`.
-            facts: additional entries of an `.npz` file, such as the seed.
+            facts: additional entries for an `.npz` file, such as the seed.
 
         Raises:
             UserError: If an argument is unknown, if it does not fit the file or the motion, or if
@@ -160,17 +160,17 @@ class Motion(PosedFigure):
         path = Path(path)
         ending = path.suffix.lower()
         if ending not in WRITTEN:
-            raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
+            raise UserError(f"{path}: unsupported motion format. Use one of {', '.join(WRITTEN)}")
         on_a_rig = character is None and ending in RIGGED
         if rig is not None and not on_a_rig:
             raise UserError(
-                f"{path}: rig is only for {', '.join(RIGGED)} files, and not for characters"
+                f"{path}: rig applies only to {', '.join(RIGGED)} files, and not to characters"
             )
         if rest_pose and (ending != ".bvh" or not on_a_rig):
-            raise UserError(f"{path}: rest_pose is only for .bvh files, and not for characters")
+            raise UserError(f"{path}: rest_pose applies only to .bvh files, and not to characters")
         if root_motion and (ending == ".bvh" or not on_a_rig or rig is None):
             raise UserError(
-                f"{path}: root_motion is only for .glb, .fbx and USD files with rig=unreal or rig=soma"
+                f"{path}: root_motion applies only to .glb, .fbx and USD files with rig=unreal or rig=soma"
             )
         if character is not None:
             if not isinstance(character, Character | BvhCharacter):
@@ -411,7 +411,7 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
         summary = "H.264 video"
     else:
         write_gif(path, [motion], body=body)
-        summary = "animated GIF of at most 50 frames per second"
+        summary = "animated GIF with at most 50 frames per second"
     return summary + (reason and f"; without a body: {reason}")
 
 

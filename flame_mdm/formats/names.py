@@ -80,7 +80,7 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
-    """Returns the skeleton that best matches the names of joints.
+    """Returns the skeleton that best matches a list of joint names.
 
     Skeletons without missing joints are preferred. The next criteria are the number of joints and
     the order. If several prefixes match equally well, the match is ambiguous.

@@ -1,4 +1,4 @@
-"""Bodies by name: the mannequin, the body in a file, and people of all shapes by Anny.
+"""Bodies by name: the mannequin, the body in a file, and people of all shapes from Anny.
 
 Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
 Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp., Apache-2.0.
@@ -79,7 +79,7 @@ def load_body(name: str) -> Mesh:
     Creating the first Anny body takes about 90 seconds. Each body is saved in the user's cache.
 
     Raises:
-        UserError: If the file is damaged, a number is unknown, or Anny is not installed.
+        UserError: If the file is damaged, a shape parameter is invalid, or Anny is not installed.
     """
     kind, *words = name.split() or [""]
     if kind != "anny":
@@ -109,13 +109,14 @@ def shape_of(words: list[str]) -> dict[str, float]:
             shape[key] = np.nan
         if not 0 <= shape[key] <= 1:
             raise UserError(
-                f"body=anny: {word} is not one of {', '.join(SHAPE)} with a number from 0 to 1"
+                f"body=anny: {word} is invalid. Use NAME=NUMBER, with a name from {', '.join(SHAPE)} and a "
+                "number from 0 to 1"
             )
     return shape
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of a body file for an Anny body; see `packed`.
+    """Returns the arrays that make up the body file of an Anny body; see `packed`.
 
     The first call takes about 90 seconds.
     """
@@ -230,7 +231,7 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns how far points of the head are inside the region of the hair.
+    """Returns how far points on the head are inside the hair region.
 
     Hair is above the forehead and behind the ears.
     """
@@ -273,7 +274,7 @@ def packed(
     joints: np.ndarray,
     turns: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of a body file, which `Mesh` reads.
+    """Returns the arrays that make up a body file, which `Mesh` reads.
 
     Points are stored in units of 1/20 mm, with the pelvis at 0. Normals are stored in units of
     1/127.

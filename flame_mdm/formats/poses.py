@@ -117,8 +117,8 @@ def solve(joints: Tensor, fps: float) -> Poses:
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
-            "joint rotations are computed only for the 22 joints of SMPL, (frames, 22, 3), but these have shape "
-            f"{tuple(joints.shape)}. Write them as .json or .npy"
+            "joint rotations are computed only for SMPL's 22 joints, (frames, 22, 3), but these have shape "
+            f"{tuple(joints.shape)}. Save them as .json or .npy"
         )
     joints = joints.double()
     lengths = torch.linalg.vector_norm(SMPL22.bones(joints), dim=-1).mean(0)
@@ -135,7 +135,7 @@ def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
     """Returns the offsets (22, 3) and quaternions (F, 22, 4) of `solve`, without checks.
 
     Both results have the same precision as the joints. The function has no data-dependent branches
-    and solves similar joints in one batch, so that its ONNX graph is small.
+    and solves similar joints in a single batch, so that its ONNX graph is small.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)

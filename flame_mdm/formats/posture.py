@@ -7,7 +7,7 @@ import numpy as np
 
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 
-# Cosine of the maximum tilt of the chest at which the head is level on average
+# Cosine of the maximum tilt of the chest at which the head is assumed to be level on average
 UPRIGHT = np.cos(np.radians(30))
 STANDING = 0.02  # maximum height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))

@@ -51,7 +51,7 @@ ROTATED = {
     "motion272": 272,
 }
 BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAMERA_AXES}
-"""For each possible up axis in a file of SMPL's rotations, the rotation to y up.
+"""For each possible up axis in a file with SMPL's rotations, the rotation to y up.
 
 As in AMASS, the default is z.
 """
@@ -77,7 +77,7 @@ class Doubts:
     Attributes:
         upright: mean vertical component of the trunk direction, from -1 to 1. The value is NaN (not
             measured) for files of this project and for KIT-ML's skeleton.
-        lying: a message if the body lies, otherwise "".
+        lying: a message if the body is lying, otherwise "".
         jump: a message if the body jumps or a leg flips, otherwise "".
     """
 
@@ -101,7 +101,7 @@ class Recording:
         doubts: findings that look wrong. Their lines are among the notes of the motion.
         smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes; None
             if the file contains no such rotations.
-        tree: the tree of joints without frames of a rest pose, at the frame rate of the file; None
+        tree: the tree of joints without rest-pose frames, at the frame rate of the file; None
             if the file contains no tree.
     """
 
@@ -122,7 +122,7 @@ def read(
 ) -> Motion:
     """Reads a motion file.
 
-    Supported are `.npz` files of this project, of AMASS, or with joints and fps; `.bvh` files;
+    Supports `.npz` files from this project, from AMASS, or with joints and fps; `.bvh` files;
     animations in `.fbx`, `.glb`, `.vrm` and `.vrma` files; and `.amc`, `.json` and `.npy` files.
 
     Args:
@@ -229,7 +229,9 @@ def _of_tree(
     )
     notes = []
     if (people := tree.parents.count(-1)) > 1:
-        notes.append(f"{people} people in the file (ROOT): the first one is read")
+        notes.append(
+            f"the file contains {people} people (ROOT), of which only the first one is read"
+        )
 
     if standard is not None:
         tree, standard_fields = standard(tree)
@@ -241,7 +243,8 @@ def _of_tree(
         and (recorded := known_rate(path.stem, layout_name(layout), tree.fps))
     ):
         notes.append(
-            f"CMU recorded it at {recorded:g} frames per second, not {tree.fps:g} as the file states: read at that rate"
+            f"CMU recorded this motion at {recorded:g} frames per second, not {tree.fps:g} as the file states. "
+            "The recorded rate is used"
         )
         tree = replace(tree, fps=recorded)
 
@@ -272,7 +275,7 @@ def _of_scene(
     resample_to: float | None,
     fields: Mapping[str, Any],
 ) -> Recording:
-    """Returns the recording of an animation of nodes.
+    """Returns the recording of a node animation.
 
     Its positions are in meters, y up, unless `fields` override this.
     """
@@ -306,7 +309,7 @@ def _of_joints(
 ) -> Recording:
     """Returns the recording of an array of joints.
 
-    `said` contains the keys of the command, which override the keys of the file.
+    `said` contains the keys from the command, which override the keys in the file.
     """
     rate, joints = _rate(data, rate, fields), data["joints"]
     stated = {key: data[key] for key in ("up", "unit") if key in data}
@@ -430,7 +433,7 @@ def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
         raise UserError(
-            "no frame rate in the file. Set fps=20, or write `fps: 20` into skeleton.yaml"
+            "the file contains no frame rate. Set fps=20, or add `fps: 20` to skeleton.yaml"
         )
     return frame_rate(rate)
 
@@ -539,7 +542,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     expected = (len(data["joints"]), ROTATED[representation])
     if data["features"].shape != expected:
         raise UserError(
-            f"features have shape {data['features'].shape}, but {representation} has {expected}"
+            f"features have shape {data['features'].shape}, but {representation} needs {expected}"
         )
     x = torch.from_numpy(data["features"]).double()
     if representation == "motion272":

@@ -1,4 +1,4 @@
-"""Facts about published recordings that are missing or wrong in their files."""
+"""Facts about published recordings that their files omit or state incorrectly."""
 
 import re
 from pathlib import Path

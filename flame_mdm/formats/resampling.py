@@ -45,7 +45,9 @@ def frame_rate(value: Any, name: str = "fps") -> float:
 def check_frames(frames: int) -> None:
     """Raises `UserError` if a motion has more than `MAX_FRAMES` frames."""
     if frames > MAX_FRAMES:
-        raise UserError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}. Cut it")
+        raise UserError(
+            f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}. Cut the motion"
+        )
 
 
 def check_tree(frames: int, joints: int, size: int) -> None:
@@ -58,7 +60,7 @@ def check_tree(frames: int, joints: int, size: int) -> None:
     if frames * joints > most:
         raise UserError(
             f"{frames:,} frames of {joints:,} joints, but a file of this size may have at most {most // joints:,} "
-            "frames. Cut it, or remove joints that do not move"
+            "frames. Cut the motion, or remove joints that do not move"
         )
 
 

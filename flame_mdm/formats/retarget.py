@@ -1,4 +1,4 @@
-"""Motions on the skeletons of other programs and data sets.
+"""Motions for the skeletons of other programs and data sets.
 
 `rigs.yaml` contains the names, rest poses and axes of these skeletons.
 """

@@ -160,7 +160,7 @@ def matched(
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
         raise UserError(
-            f"{source}: {len(candidates[double])} joints for {double}: {same}. Rename all but one"
+            f"{source}: found {len(candidates[double])} joints for {double}: {same}. Rename all but one"
         )
     required = [
         "pelvis",
@@ -239,7 +239,7 @@ def rest_pose(
     left = at["left_hip"] + at["left_shoulder"] - at["right_hip"] - at["right_shoulder"]
     left = left - up * (up @ left)
     if np.linalg.norm(left) <= shortest:
-        raise UserError(f"{source}: left and right joints of the rest pose are at the same points")
+        raise UserError(f"{source}: left and right joints are at the same points in the rest pose")
     left = left / np.linalg.norm(left)
     nearest = np.eye(3)[np.abs(left).argmax()] * np.sign(left[np.abs(left).argmax()])
     left = nearest if nearest @ left > np.cos(np.radians(SNAP)) else left
@@ -247,7 +247,7 @@ def rest_pose(
     feet = [at[f"{side}_foot"] - at[f"{side}_ankle"] for side in SIDES if f"{side}_foot" in at]
     if feet and frame[2] @ np.sum(feet, 0) < 0:
         raise UserError(
-            f"{source}: the toes point backward. Are left and right exchanged, or mirrored?"
+            f"{source}: the toes point backward. Are left and right swapped or mirrored?"
         )
     sources = dict(joints)
     spine = [joint for joint in SPINE if joint in sources]

@@ -52,13 +52,13 @@ class Skin:
     Attributes:
         name: the name of the mesh.
         points: (V, 3) in the coordinates of the mesh. `normals` (V, 3) have length 1.
-        triangles: (T, 3), counterclockwise if seen from outside.
+        triangles: (T, 3), counterclockwise when seen from outside.
         palette: the materials.
         materials: (T,), index in `palette` of each triangle's material.
         ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's joints
             come first, in SMPL's order.
         bones: (V, K), the joints that move a vertex, as indices in `ordered`.
-        weights: (V, K), weights of these joints; the sum of a row is 1.
+        weights: (V, K), weights of these joints; each row adds up to 1.
         binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
             of each joint.
         colors: (V, 3) from 0 to 255, as on screens; (0, 3) if only the materials have colors.

@@ -1,6 +1,6 @@
 # pyright: reportAttributeAccessIssue=false
 # The modules of usd-core come from C++ and have no types.
-"""Writes a motion with its skeleton and skin as Universal Scene Description, with UsdSkel.
+"""Writes a motion with its skeleton and skin as a Universal Scene Description (UsdSkel) file.
 
 Files are .usda, .usdc or .usdz. Source: Pixar, "UsdSkel",
 https://openusd.org/release/api/usd_skel_page_front.html. Writing needs the package usd-core

@@ -87,12 +87,12 @@ def test_differences_are_shown_or_not(three, tmp_path, capsys):
     low, high = (float(x.strip("[],")) for x in lines["fid"][2:4])
     assert low < -0.2967 < high < 0
     assert lines["jitter"][-3:] == lines["static"][-3:] == ["no", "difference", "shown"]
-    assert lines["few"] == ["few", "1", "–", "not", "tested:", "one", "replication"]
+    assert lines["few"] == ["few", "1", "–", "not", "tested:", "only", "one", "replication"]
     marks = (
         "[2] mine/two − [1] mine/one",
         "-0.2967",
         "no difference shown",
-        "do not cover another training run",
+        "but not the variation between training runs",
     )
     assert all(words in text for words in marks)
 

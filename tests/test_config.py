@@ -544,7 +544,7 @@ def test_settings_with_a_data_set_compose_it(tmp_path, subtests):
     assert read_settings(InspectSettings, ["motion=synthetic"]).data == "synthetic"
     for line, message in (
         ("data=synthetic data.source.clip=5", r"Did you mean data\.source\.clips"),
-        ("data.x=5", "no data set is named"),
+        ("data.x=5", "no data set"),
         ("data=syntetic", "unknown data 'syntetic'"),
     ):
         with subtests.test(line=line, message=message), pytest.raises(UserError, match=message):

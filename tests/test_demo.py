@@ -142,7 +142,7 @@ def test_the_python_lines_and_the_files_give_the_same_motions(
             assert studio.file(EDITED, 1, ".fbx", rig).startswith(b"Kaydara FBX Binary")
     for wrong, says in (
         ((2, ".bvh"), "there are 2 motions"),
-        ((0, ".exe"), "not a format"),
+        ((0, ".exe"), "does not offer this format"),
         ((0, ".bvh", "no"), "no"),
     ):
         with subtests.test(wrong=wrong, says=says), pytest.raises(UserError, match=says):
@@ -350,7 +350,7 @@ def test_a_bad_request_gets_one_clear_line(server):
             wrong.append((bad[:40], text[:300]))
         status, body = get(f"{server}/motion.bvh?{query}")
         if status != 400 or not (
-            body.decode() in text or text in body.decode() or b"not in memory" in body
+            body.decode() in text or text in body.decode() or b"no longer in memory" in body
         ):
             wrong.append((bad[:40], body[:300]))
     assert not wrong

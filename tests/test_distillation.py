@@ -300,7 +300,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
         (["runs/no/model"], "runs/no/model: no such checkpoint"),
         ([student], f"a distilled model. Use its teacher, {trained}"),
         (["process.ckpt"], "predicts noise, so computing the clean estimate divides"),
-        (["untrained.ckpt"], "not trained by this framework"),
+        (["untrained.ckpt"], "not trained with this framework"),
         (
             [*own, "distillation.teacher=representation.ckpt"],
             "has representation.fps=30, but the student has 20. Both",

@@ -348,7 +348,7 @@ def test_files_that_are_no_motions_are_left_out_of_folders(tmp_path: Path):
         ("a.blend", "export BVH"),
         ("a.c3d", "markers"),
         ("a.pkl", "numpy.savez"),
-        ("a.xyz", "not a motion file (.npz"),
+        ("a.xyz", "neither a motion file (.npz"),
     ],
 )
 def test_files_of_other_kinds_are_refused_with_a_way_out(

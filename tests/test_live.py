@@ -180,13 +180,16 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model, subtests):
         nan = json.dumps(call | {"path": [[float("nan"), 0.0]]})
         headers = {"Content-Type": "application/json"}
         refused = client.post("/live", content=nan, headers=headers)
-        assert (refused.status_code, refused.text) == (400, "this is not a request of this page")
+        assert (refused.status_code, refused.text) == (
+            400,
+            "this request does not come from this page",
+        )
         path = {"stream": name, "begin": 60, "path": [root(second, -1)]}
         led = client.post("/live", json=call | path)
         assert led.json()["reached"] == [60]
         unknown = client.post("/live", json=call | {"stream": "0" * 32})
         assert unknown.json() == {
-            "error": "this stream has ended. Reload the page to begin another one"
+            "error": "this stream has ended. Reload the page to start another one"
         }
         assert client.get("/live.exe?stream=x").status_code == 404
         headers = {"Origin": "http://evil.example"}

@@ -348,7 +348,7 @@ def test_an_invalid_description_is_refused_in_one_line(
         (["set=locomotion", "samples=2"], "samples=2: a set determines which motions are sampled"),
         (
             ["set=locomotion", "out=walk.fbx"],
-            "out=walk.fbx: a set has several files. Use a folder",
+            "out=walk.fbx: a set consists of several files. Use a folder",
         ),
         (["set=locomotion", "format=bvh"], 'format is "bvh"'),
         (["text=a person walks", "format=fbx"], "format=fbx is for sets"),

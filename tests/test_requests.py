@@ -218,7 +218,7 @@ def test_the_command_chooses_by_a_motion_clip(tmp_path, monkeypatch, capsys, sub
     for options, message in (
         (
             ["scorer=quickstart"],
-            "scorer=quickstart chooses among motions for a text. Add text=... and candidates=8",
+            "scorer=quickstart chooses among several motions for a text. Add text=... and candidates=8",
         ),
         (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Use a run"),
         (["scorer=quickstart", "candidates=2"], "contains a motion generator, not a motion-CLIP"),
@@ -294,7 +294,7 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
     [
         (
             ["rig=unreal"],
-            "rig=unreal: motions in a folder are not converted. Name a file, such as out=walk.fbx",
+            "rig=unreal: motions in a folder are not converted. Set an output file, such as out=walk.fbx",
         ),
         (
             ["walk.glb", "mp4=true"],

@@ -270,7 +270,7 @@ def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_
     notes = [note for _, note in made(folder).parts[0].notes]
     assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
     assert "MDM, FLAME <b>: last checkpoint, not chosen by validation" in notes
-    assert "FID of real motions is 0 by construction: clips are taken whole" in rendered(
+    assert "FID of real motions is 0 by construction: clips are used whole" in rendered(
         made(folder), "md"
     )
     sampled = {"sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 5, 9]}
@@ -515,7 +515,7 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
     for wrong, message in (
         (
             "Text-to-motion: {evaluator: e, source: s, rows: [{label: x, values: {FDI: 1}}]}",
-            "no column is called FDI",
+            "unknown column FDI",
         ),
         ("Txt: {evaluator: e, source: s, rows: []}", "parts that are not in its spec: Txt"),
     ):
@@ -581,7 +581,7 @@ def test_a_legend_names_the_rows_that_are_not_ranked(folder, subtests):
         with subtests.test(suffix=suffix):
             assert f"{legend}, except sanity-check baselines." in rendered(table, suffix), suffix
     table.parts[0].lines[2].state = "QUICK"
-    both = f"{legend}, except sanity-check baselines and rows that are not valid or quick."
+    both = f"{legend}, except sanity-check baselines and rows that are quick or not valid."
     assert both in rendered(table, "md")
 
 

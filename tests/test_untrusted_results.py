@@ -75,7 +75,7 @@ SPECS = {
     "title: " + "{a: " * 20_000: "nested too deeply",
     ROWS.format(keys="note: '${oc.env:HOME}'"): "contains the interpolation",
     ROWS.format(keys="data.source._target_: os.system"): "data.source._target_",
-    ROWS.format(keys="hydra.searchpath: x"): "only keys of the data",
+    ROWS.format(keys="hydra.searchpath: x"): "only data keys",
     f"title: t\nparts: {{P: {{protocol: x, rows: [], columns: {{{COLUMNS}}}}}}}\n": "not a shorter list",
     ROWS.format(keys="note: n")
     + f"figures: [{{part: P, x: nfe, y: {['FID'] * 300}}}]\n": "300 exceed the limit",
@@ -93,7 +93,7 @@ def test_table_specs(attacked, bad):
     for content, says in SPECS.items():
         (bad / "spec.yaml").write_bytes(content.encode(errors="surrogateescape"))
         attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says=says)
-    attacked("tables", "table=mdm_9", says="no table is called 'mdm_9'. Did you mean mdm_")
+    attacked("tables", "table=mdm_9", says="unknown table 'mdm_9'. Did you mean mdm_")
 
 
 def huge(path: Path) -> None:

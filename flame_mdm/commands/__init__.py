@@ -53,7 +53,7 @@ def motion_file(key: str, source: str) -> None:
         raise unread(Path(source))
     elif ":" not in source:
         raise UserError(
-            f"{key}={source}: not a motion file ({', '.join(ENDINGS)}) and not dataset:id"
+            f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id"
         )
 
 
@@ -108,7 +108,7 @@ def above_zero(key: str, number: int) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
-    """Keys that name a model."""
+    """Keys that specify a model."""
 
     ckpt: str = required(
         "a checkpoint, run directory, model file, shipped model (package, quickstart, package_dip), or hub id"
@@ -122,7 +122,7 @@ class ModelSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class AdaptedSettings(ModelSettings):
-    """Keys that name a model and its adapters."""
+    """Keys that specify a model and its adapters."""
 
     adapter: list[str] | None = option(
         None, "adapters of this model, written by `flame-mdm adapt`, separated by spaces"
@@ -145,7 +145,7 @@ class FileSettings:
         None, "frames per second, instead of the value in the file; required for .npy and .amc"
     )
     unit: float | None = option(
-        None, "meters per length unit of the file; default: 0.01 for most .bvh files, 1 for .npy"
+        None, "meters per unit of length in the file; default: 0.01 for most .bvh files, 1 for .npy"
     )
     up: str | None = option(
         None,
@@ -208,7 +208,7 @@ class BodySettings:
 
 @dataclass(frozen=True, kw_only=True)
 class WritingSettings:
-    """Keys of written motion files."""
+    """Keys for the motion files that are written."""
 
     rig: str | None = option(
         None, "skeleton of OUT: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style"
@@ -228,7 +228,8 @@ class WritingSettings:
     def read_character(self) -> Character | BvhCharacter | None:
         """Reads `character`.
 
-        If it has joints with unknown names, prints the content of a file that the user can complete.
+        If the names of some joints are unknown, prints the content of a file that the user can
+        complete.
         """
         from flame_mdm.formats import characters
 
@@ -280,7 +281,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         return names + (["unconditioned"] if self.unconditioned else [])
 
     def request(self, **values: Any) -> SamplingRequest:
-        """Returns the request to the model; `values` replace the values of these keys.
+        """Returns the request to the model. `values` override the values of these keys.
 
         Raises `UserError` if more than one condition is requested, or if a value is invalid.
         """
@@ -350,7 +351,7 @@ class DataSettings:
             _ = self.nodes  # composed here, so that errors are reported before any work
         elif self.composed:
             raise UserError(
-                f"{self.composed[0]} belongs to a data set, but no data set is named. Add data=NAME"
+                f"{self.composed[0]} is an option of a data set, but no data set was given. Add data=NAME"
             )
 
     @cached_property
@@ -359,7 +360,8 @@ class DataSettings:
         if self.data is None:
             names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
             raise UserError(
-                f"no data set named. Add data=NAME, one of: {names}; folder is for your own motions"
+                f"no data set was given. Add data=NAME, where NAME is one of: {names}. Use folder for "
+                "your own motions"
             )
         chosen = [f"representation={self.representation}"] if self.representation else []
         return compose_data(
@@ -372,7 +374,7 @@ class DataSettings:
         if source is not None:
             if "path" not in node["source"]:
                 raise UserError(
-                    f"source={source}: {node['name']} is generated and has no source. Drop source="
+                    f"source={source}: {node['name']} is generated and has no source. Remove source="
                 )
             node["source"]["path"] = source
         return node

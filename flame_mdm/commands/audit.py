@@ -13,8 +13,8 @@ from flame_mdm.safe_io import write_json
 
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings(DataSettings):
-    """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value
-    ...] flame-mdm audit cards="A.json B.json"
+    """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
+           flame-mdm audit cards="A.json B.json"
 
     Perturbs the real motions of a data set at graded strengths, measures them like generated
     motions, and writes a card. The card shows which perturbations each metric detects, from which
@@ -26,8 +26,8 @@ class AuditSettings(DataSettings):
     OBJECTS: ClassVar = ("data", "extractor")
     extractor: str | None = option(
         None,
-        "path of the motion-CLIP or other extractor that the protocol requires; none = only "
-        "audit metrics that need no extractor",
+        "path of the motion-CLIP or other extractor that the protocol requires; none = audit "
+        "only metrics that need no extractor",
         model_source,
     )
     protocol: str | None = option(
@@ -50,7 +50,7 @@ class AuditSettings(DataSettings):
     data_root: str = option(
         "", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"
     )
-    out: str = option("runs/audit", "folder of the cards")
+    out: str = option("runs/audit", "folder for the cards")
 
 
 def main(settings: AuditSettings) -> None:
@@ -59,7 +59,7 @@ def main(settings: AuditSettings) -> None:
     if settings.cards is not None:
         if len(settings.cards) > 2:
             raise UserError(
-                f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Pass one or two"
+                f"cards={' '.join(settings.cards)}: got {len(settings.cards)} cards. Pass one or two"
             )
         paths = [Path(card) for card in settings.cards]
         name = "-and-".join(path.stem for path in paths)

@@ -33,10 +33,10 @@ class BenchmarkSettings:
     out: str | None = option(None, "folder; default: runs/benchmark/<exp>")
     jobs: int = option(
         1,
-        "number of models to train at the same time; they share the cores, and each needs about 2 GiB of memory",
+        "number of models to train at the same time; they share the CPU cores, and each needs about 2 GiB of memory",
     )
     device: str | None = option(
-        None, "device of the evaluations, such as cpu or cuda; default: cuda if available"
+        None, "device for the evaluations, such as cpu or cuda; default: cuda if available"
     )
     batch_size: int = option(64, "motions per batch")
     data_root: str = option(
@@ -48,7 +48,7 @@ def main(settings: BenchmarkSettings) -> None:
     """Prepares, trains, evaluates and tabulates all models of a benchmark."""
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if settings.exp not in names:
-        raise UserError(f"no benchmark is called '{settings.exp}'. Available: {', '.join(names)}")
+        raise UserError(f"unknown benchmark '{settings.exp}'. Available: {', '.join(names)}")
     if settings.jobs < 1:
         raise UserError(
             f"jobs={settings.jobs}: must be at least 1. Set it to the number of models to train at the same time"

@@ -18,8 +18,8 @@ class BrowseSettings(BodySettings, DataSettings):
 
     NAME is a data set, as in `prepare`; for your own motions, use data=folder data.name=NAME.
     Writes a single web page that opens from disk. It shows clips of the data set with their
-    captions, and mirrored copies next to their originals. It also has a search field, a choice of
-    splits, and statistics. motions=FOLDER also writes the shown clips as motion files, so that you
+    captions, and mirrored copies next to their originals. It also has a search field, a split
+    filter, and statistics. motions=FOLDER also writes the shown clips as motion files, so that you
     can compare generated motions with them.
     """
 
@@ -40,7 +40,7 @@ class BrowseSettings(BodySettings, DataSettings):
 
 
 def main(settings: BrowseSettings) -> None:
-    """Writes a page of motions of a prepared data set."""
+    """Writes a page with motions from a prepared data set."""
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import Store
@@ -63,7 +63,7 @@ def main(settings: BrowseSettings) -> None:
     families = find(store.clips, settings.split, search)
     if not families:
         raise UserError(
-            f"no clip of {data.folder} has '{search}' in its id or captions. Search for other words"
+            f"no clip in {data.folder} has '{search}' in its id or captions. Search for other words"
         )
     matching = sum(map(len, families))
     clips = [clip for family in choose(families, settings.clips) for clip in family]

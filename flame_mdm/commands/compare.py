@@ -52,22 +52,22 @@ class CompareSettings(BodySettings):
     )
     prompts: str | None = option(
         None,
-        "file with one prompt per line, for which the last.ckpt of each run is sampled. Default: "
-        "the captions of the first folder of motion files; without such a folder, the newest "
-        "samples of each run are compared",
+        "file with one prompt per line; the last.ckpt of each run is sampled for these prompts. "
+        "Default: the captions of the first folder of motion files; without such a folder, the "
+        "newest samples of each run are compared",
     )
     seconds: float | None = option(
         None,
         "length of the sampled motions in seconds; default: 3, or the lengths of the motions in "
         "the folder",
     )
-    seed: int = option(0, "seed of sampling, and of the order in which motions are rated")
+    seed: int = option(0, "seed for sampling, and for the order in which motions are rated")
     rate: bool = option(
         False,
         "write a rating page that compares motions of the first run with motions of each other run",
     )
     ratings: list[str] | None = option(
-        None, "files that the rating page saved; their ratings are counted"
+        None, "files saved by the rating page, whose ratings are counted"
     )
     out: str | None = option(
         None, "file to write; default: runs/compare.html, runs/rate.html or runs/ratings.json"
@@ -178,7 +178,7 @@ def _sampled(
         prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
             numbers, or all are None, which means the default length. Lengths above the model's
             maximum are shortened.
-        seed: seed of the noise. If a prompt is listed twice, its motions have different noise.
+        seed: seed for the noise. If a prompt is listed twice, its motions have different noise.
     """
     import torch
 

@@ -26,12 +26,12 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
     Converts a motion file, or all motion files in a folder and its subfolders. The nearest
     skeleton.yaml, in the folder of the file or above it, applies (docs/own-data.md).
 
-    Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from `make
-    sample` or AMASS; .json; and .npy with joint positions.
+    Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from
+    `make sample` or AMASS; .json; and .npy with joint positions.
 
     Outputs: .fbx, .glb, .bvh, .usda, .usdc and .usdz for Blender and game engines; .vrma for VRM
     avatars; .npz in the layout of AMASS; .json and .npy with joint positions; and .mp4 and .gif
-    to watch.
+    for viewing.
 
     docs/engines.md lists which files a program reads. docs/formats.md explains units, axes and
     joint names.
@@ -43,7 +43,7 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
         "joints, 3)"
     )
     out: str = required(
-        ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; or .mp4 or .gif to watch"
+        ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; or .mp4 or .gif for viewing"
     )
     format: str | None = option(
         None, "if MOTION is a folder: format of the files in the folder OUT, such as glb"
@@ -60,8 +60,8 @@ def main(settings: ConvertSettings) -> None:
         targets = _targets(settings, path, out)
     elif settings.format is not None:
         raise UserError(
-            "format=... is for folders. For one file, the ending of OUT determines "
-            "the format: remove format"
+            "format=... applies only to folders. For a single file, the extension of OUT "
+            "determines the format. Remove format="
         )
     else:
         motion_file("motion", settings.motion)

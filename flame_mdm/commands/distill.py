@@ -30,12 +30,12 @@ class DistillSettings(ModelSettings):
     """usage: flame-mdm distill CKPT [OUT] [key=value ...]
 
     Trains a student of a model that predicts the clean motion or the velocity (MDM, MFM). The
-    student samples in 1, 2 or 4 steps, with built-in guidance. Its recipe is the recipe of the
-    model with the keys of experiments/distillation/consistency.yaml, a fifth of the training
-    steps and a tenth of the learning rate. The data set is in FLAME_MDM_DATA, or in the folder of
-    the model's data set. Keys such as trainer.max_steps=1000 override keys of the recipe. Running
-    the same command again resumes the run. --multirun seed=1,2 and launch= start sweeps and jobs,
-    as in train. See docs/few-steps.md.
+    student samples in 1, 2 or 4 steps, with built-in guidance. Its recipe is the model's recipe
+    with the keys in experiments/distillation/consistency.yaml, a fifth of the training steps and a
+    tenth of the learning rate. The data set is read from FLAME_MDM_DATA or, by default, from the
+    data folder in the model's recipe. Keys such as trainer.max_steps=1000 override the recipe.
+    Running the same command again resumes the run. --multirun seed=1,2 and launch= start sweeps
+    and jobs, as in train. See docs/few-steps.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -61,7 +61,7 @@ def main(settings: DistillSettings) -> None:
 def student_recipe(settings: DistillSettings) -> Config:
     """Returns the recipe of a student: the teacher's recipe, with changes for distillation.
 
-    Raises `UserError` if the model was not trained by this framework.
+    Raises `UserError` if the model was not trained with this framework.
     """
     file = settings.model_file()
     from flame_mdm.training.distillation import read_teacher
@@ -70,7 +70,7 @@ def student_recipe(settings: DistillSettings) -> Config:
     recipe: Any = teacher.config
     if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
         raise UserError(
-            f"{settings.ckpt}: not trained by this framework, so its data and number of training "
+            f"{settings.ckpt}: not trained with this framework, so its data and number of training "
             f"steps are unknown"
         )
     name = f"{recipe['experiment']}_distilled"

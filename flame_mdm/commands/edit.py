@@ -95,6 +95,6 @@ def main(settings: EditSettings) -> None:
     )
     if moved > 0.01:
         say(
-            "a kept part after a generated part begins where the generated part ends, so its "
-            "place in the world may differ"
+            "a kept part that follows a generated part begins where the generated part ends, so its "
+            "position in the world may differ"
         )

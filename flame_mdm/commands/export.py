@@ -1,4 +1,4 @@
-"""`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file, or as ONNX graphs."""
+"""`flame-mdm export CKPT OUT`: writes the model in a checkpoint as a model file, or as ONNX graphs."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal

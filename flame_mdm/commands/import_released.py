@@ -24,7 +24,7 @@ class ImportSettings:
     )
     file: str = required("the released file: model000475000.pt, or FLAME's .ckpt", existing)
     args: str | None = option(None, "MDM's args.json, or MFM's .hydra/config.yaml", existing)
-    out: str = required("a .safetensors file, or a folder in which model.safetensors is written")
+    out: str = required("a .safetensors file, or a folder into which model.safetensors is written")
     stats: str | None = option(
         None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML", existing
     )

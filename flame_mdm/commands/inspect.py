@@ -1,4 +1,4 @@
-"""`flame-mdm inspect MOTION|FOLDER|DATASET`: finds physical faults of motions."""
+"""`flame-mdm inspect MOTION|FOLDER|DATASET`: finds physical faults in motions."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
     Finds physical faults, such as sliding feet and jumps, in a motion file, in all motion files
-    of a folder, or in a prepared data set. docs/motion-faults.md lists the limits.
+    in a folder, or in a prepared data set. docs/motion-faults.md lists the limits.
 
-    Prints the faults per frame and joint, and writes a player with marks on its time line. For a
+    Prints the faults per frame and joint, and writes a player with marks on its timeline. For a
     data set or a large folder, the player shows the worst `clips` motions. Exits with code 3 if
     there are faults.
     """
@@ -71,7 +71,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
 
 
 def main(settings: InspectSettings) -> None:
-    """Prints the faults of motion files and writes a player that shows them."""
+    """Prints the faults in motion files and writes a player that shows them."""
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
 
@@ -138,7 +138,7 @@ def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
     store = data.open()
     if settings.split not in (None, *store.info["clips"]):
         raise UserError(
-            f"no split is called {settings.split}. Available: {', '.join(store.info['clips'])}"
+            f"unknown split {settings.split}. Available: {', '.join(store.info['clips'])}"
         )
     clips = [clip for clip in store.clips if settings.split in (None, clip.split)]
     return data.folder.name, len(clips), (motion(store, representation, clip) for clip in clips)

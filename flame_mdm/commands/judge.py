@@ -31,7 +31,7 @@ class JudgeSettings(BodySettings, FileSettings):
     Reads the claims of a sentence, such as side, count, direction, posture and order, and
     measures each claim on the motion. The verdict is yes, no or cannot tell, with the joint, the
     measured number and the time. Without text=, motions are judged by their own texts. Writes a
-    player whose time line marks the evidence. Exits with code 3 if a claim is false. See
+    player whose timeline marks the evidence. Exits with code 3 if a claim is false. See
     docs/referee.md.
     """
 
@@ -68,12 +68,12 @@ def main(settings: JudgeSettings) -> None:
         _report(motion.id, judgment)
     if not judged:
         finish(failures, total, "judged")
-        raise UserError(f"{settings.motion}: no motion to judge. Name a motion file or a folder")
+        raise UserError(f"{settings.motion}: no motion to judge. Specify a motion file or a folder")
 
     answers = Counter(verdict.answer for _, judgment in judged for verdict in judgment.verdicts)
     say(
-        f"{name}: {answers['yes']} claims are true, {answers['no']} false, "
-        f"{answers['cannot tell']} cannot be told, of {len(judged)} motions"
+        f"{name}: {answers['yes']} claims are true, {answers['no']} are false, and "
+        f"{answers['cannot tell']} cannot be decided, in {len(judged)} motions"
     )
     judged.sort(key=lambda pair: pair[1].true - pair[1].decided)
     shown = judged[: settings.clips]
@@ -99,4 +99,4 @@ def _report(name: str, judgment: Judgment) -> None:
     say(f"{name}: '{shortened(judgment.text, 80)}'")
     say(*(f"  {verdict}" for verdict in judgment.verdicts))
     if not judgment.verdicts:
-        say("  no claim that can be checked")
+        say("  the text contains no claim that can be checked")

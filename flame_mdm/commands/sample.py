@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flame_mdm.sampling.targets import Targets
     from flame_mdm.visualize.body import Mesh
 
-# Maximum number of motions on the page for a file of prompts; each motion takes about 20 kB
+# Maximum number of motions on the page for a prompt file; each motion takes about 20 kB
 GALLERY = 200
 CLAIMS = "claims"  # scorer that checks the claims of the text; see docs/referee.md
 
@@ -50,7 +50,7 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT action=walk
            flame-mdm sample CKPT unconditioned=true
 
-    Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has
+    Writes motions (.npz), a GIF, and a player that opens in any browser. A prompt file has
     one prompt per line. Each prompt gets its own folder, and one page shows the first motion of
     each prompt. Prompts that cannot be sampled are listed at the end, and the exit code is 1. A
     set is a folder of clips that fit together, for game engines: loops, starts, stops and turns. If OUT is a file
@@ -76,7 +76,7 @@ class SampleSettings(OutputSettings, WritingSettings):
     format: str | None = option(None, "format of a set's files: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(
         None,
-        "how the candidate that fits the text best is chosen: claims (most true "
+        "how to choose the candidate that best fits the text: claims (most true "
         "and fewest false claims, see docs/referee.md), or a motion-CLIP (run or file)",
         scorer_source,
     )
@@ -123,17 +123,17 @@ class SampleSettings(OutputSettings, WritingSettings):
                         f"cut. Omit {entry.name}"
                     )
             if self.file is not None:
-                raise UserError(f"out={self.out}: a set has several files. Use a folder")
+                raise UserError(f"out={self.out}: a set consists of several files. Use a folder")
             return
         if self.format is not None:
             raise UserError(
-                f"format={self.format} is for sets. For one file, the ending of OUT determines "
-                f"the format"
+                f"format={self.format} applies only to sets. For a single file, the extension of OUT "
+                f"determines the format. Remove format="
             )
         if self.file is None:
             for key in ("rig", "root_motion", "resample", "character"):
                 if value := getattr(self, key):
-                    advice = "Name a file, such as out=walk.fbx"
+                    advice = "Set an output file, such as out=walk.fbx"
                     raise UserError(
                         f"{key}={str(value).lower()}: motions in a folder are not converted. "
                         f"{advice}"
@@ -156,12 +156,12 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
-        """Returns the keys that determine the motions, including a file of prompts and a set."""
+        """Returns the keys that determine the motions, including a prompt file and a set."""
         sources = [key for key in ("prompts", "set") if getattr(self, key) is not None]
         return [*super().conditions(), *sources]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
-        """Returns the request to the model. With a file of prompts, it contains the accepted prompts."""
+        """Returns the request to the model. With a prompt file, it contains the accepted prompts."""
         default = 3 if self.file is None else 1
         samples = default if self.samples is None else self.samples
         if prompts is None:
@@ -169,7 +169,7 @@ class SampleSettings(OutputSettings, WritingSettings):
         else:
             if self.path is not None:
                 raise UserError(
-                    f"path={self.path}: a path cannot be combined with a file of prompts. Use "
+                    f"path={self.path}: a path cannot be combined with a prompt file. Use "
                     "text and seconds instead"
                 )
             request = self.request(
@@ -180,14 +180,14 @@ class SampleSettings(OutputSettings, WritingSettings):
             )
         if self.scorer is not None and (request.kind != "text" or self.candidates == 1):
             raise UserError(
-                f"scorer={self.scorer} chooses among motions for a text. Add text=... and "
+                f"scorer={self.scorer} chooses among several motions for a text. Add text=... and "
                 f"candidates=8"
             )
         return request
 
 
 def main(settings: SampleSettings) -> None:
-    """Samples motions for texts, a file of prompts or a set, and writes them."""
+    """Samples motions for texts, a prompt file or a set, and writes them."""
     settings.check_output()
     if settings.set is not None:
         _sample_set(settings, settings.set)
@@ -204,7 +204,7 @@ def main(settings: SampleSettings) -> None:
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples and writes the motions of a request.
 
-    Prompts of a file that the model cannot sample are refused.
+    Prompts in a file that the model cannot sample are refused.
     """
     loaded = settings.load()  # a missing file is reported before PyTorch is imported
     character = settings.read_character()

@@ -25,21 +25,21 @@ class TablesSettings:
     """usage: flame-mdm tables [NAME ...] [evaluate=false] [out=FOLDER]
 
     Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in
-    experiments/tables, or by your own file, which names checkpoints, a protocol and columns.
+    experiments/tables, or by your own file, which lists checkpoints, a protocol and columns.
     Checkpoints without a result are evaluated first; evaluate=false only uses existing results.
-    The same results give the same bytes. Exit codes: 0 = success; 1 = invalid input, or an
+    The same results produce the same bytes. Exit codes: 0 = success; 1 = invalid input, or an
     evaluation failed; 3 = the tables are written, but a requested row is NOT VALID.
     """
 
     OBJECTS: ClassVar = ("table",)
     table: list[str] | None = option(
-        None, "tables to render: names in experiments/tables, or paths of specs; default: all"
+        None, "tables to render: names in experiments/tables, or paths to specs; default: all"
     )
     evaluate: bool = option(True, "evaluate missing results; false = only render existing results")
-    out: str = option("runs/tables", "folder of the tables")
+    out: str = option("runs/tables", "folder for the tables")
     results: str = option("runs/results", "folder of the results")
     device: str | None = option(
-        None, "device of the evaluations, such as cpu or cuda; default: cuda if available"
+        None, "device for the evaluations, such as cpu or cuda; default: cuda if available"
     )
     batch_size: int = option(64, "motions per batch")
     force: bool = option(
@@ -135,7 +135,7 @@ def evaluate_missing(
 
 
 def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
-    """Whether some of `values` need several motions per prompt, which take most of the evaluation time."""
+    """Returns whether some of `values` need several motions per prompt, which take most of the evaluation time."""
     from evaluators.protocol import protocol_config
 
     several = protocol_config(evaluation.keys["protocol"]).get("multimodality") or {"metrics": {}}

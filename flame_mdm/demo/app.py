@@ -40,10 +40,10 @@ from flame_mdm.visualize import player_page
 # Number of open pages that gradio remembers. For each page, gradio stores half a megabyte of data,
 # which the demo does not need.
 SESSIONS = 64
-# Maximum number of motion files written at the same time, and maximum number of requests that wait for a file
+# Maximum number of motion files written at the same time, and of requests waiting for a file
 WRITERS = 2
 WAITING_FILES = 32
-WAITING_BLOCKS = 32  # maximum number of requests that wait for the frames of a stream
+WAITING_BLOCKS = 32  # maximum number of requests waiting for the frames of a stream
 BUSY = "too many files are being written. Try again in a minute"
 FOLDER = Path(__file__).parent
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
@@ -82,7 +82,7 @@ def serve(
 
 
 def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
-    """Returns the limits of connections.
+    """Returns the connection limits.
 
     With `hosts`, the demo is behind a web server with these names, so all visitors have the same
     address.
@@ -123,7 +123,7 @@ class Writers:
 
 
 def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
-    """Adds routes for the blocks of streams (`/live`), the files of streams, and the page that plays them."""
+    """Adds routes for stream blocks (`/live`), stream files, and the page that plays the streams."""
     waiting = 0
 
     @app.get("/live.html")
@@ -182,7 +182,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
             options = {key: value for key, value in pairs if key in ("motion", "rig")}
             number = options.get("motion", "0")
             if not number.isdecimal() or len(number) > 3:
-                raise UserError(f"motion={one_line(number[:20])}: not the number of a motion")
+                raise UserError(f"motion={one_line(number[:20])}: not a motion number")
             request = parse_query([pair for pair in pairs if pair[0] not in options])
             async with writers.turns:
                 await web.body()  # a disconnection is only reported after the body

@@ -1,4 +1,4 @@
-"""The meaning that the demo reads from a text, as HTML.
+"""The demo's interpretation of a text, as HTML.
 
 Each action and attribute is shown as a chip, and can be changed with one click.
 """
@@ -19,7 +19,7 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
 
 
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
-    """Returns the chips of a text: its actions in order, their attributes, and ignored words.
+    """Returns the chips for a text: its actions in order, their attributes, and ignored words.
 
     The options of a chip are texts with another word for its action or attribute. The chosen text
     replaces the text in the form.
@@ -44,7 +44,7 @@ def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Readin
 def _step(
     abilities: Abilities, parts: Sequence[Part], number: int, step: Step, can_change: bool
 ) -> Iterator[str]:
-    """Yields the chips of each action of a step."""
+    """Yields the chips for each action in a step."""
     for position, mention in enumerate(step):
         if not can_change:
             yield f"<span>{escape(predicate(mention))}</span>"

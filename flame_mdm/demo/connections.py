@@ -1,4 +1,4 @@
-"""Connections of the demo's server, with deadlines and limits on their number in total and per address."""
+"""Connections to the demo's server, with deadlines and limits on their number, in total and per address."""
 
 import asyncio
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 @dataclass(frozen=True, kw_only=True)
 class ConnectionLimits:
-    """Limits of the connections of a server.
+    """Limits on the connections to a server.
 
     A connection is *waiting* until the headers of a request are complete, and again after the
     response. When the maximum number of connections is reached, a new connection replaces the
@@ -96,7 +96,7 @@ class Connection(H11Protocol):
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stops this timer, because the client reads again."""
+        """Stops this timer, because the client is reading again."""
         super().resume_writing()
         if self.stall is not None:
             self.stall.cancel()

@@ -1,4 +1,4 @@
-"""Guard of the demo's server, which passes on requests of the page itself and refuses all others."""
+"""Guard of the demo's server, which passes on requests from the page itself and refuses all others."""
 
 import asyncio
 import ipaddress
@@ -52,9 +52,9 @@ class Post(BaseModel):
 
 
 class Call(Post):
-    """A call of a function of the page.
+    """A call of one of the page's functions.
 
-    Its arguments are texts, and never objects that could name a file.
+    Its arguments are strings, and never objects that could refer to a file.
     """
 
     data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
@@ -65,7 +65,7 @@ class Call(Post):
 
 
 class Reset(Post):
-    """A message from the page that it no longer waits for a call."""
+    """A message from the page that it is no longer waiting for a call."""
 
     event_id: Id
 
@@ -146,7 +146,7 @@ class Guard:
             self._check_sender(headers, scope["path"])
             if scope["method"] == "POST" and headers.get("content-type") != "application/json":
                 raise HTTPException(
-                    HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page"
+                    HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this request does not come from this page"
                 )
             body = await _body(Request(scope, receive))
             self._check_content(scope, body)
@@ -163,7 +163,7 @@ class Guard:
     async def _until_closing(self, receive: Receive) -> Message:
         """Returns the next message.
 
-        When the server stops, this is a message of disconnection, so that open streams end.
+        When the server stops, this is a disconnect message, so that open streams end.
         """
         tasks = [asyncio.ensure_future(receive()), asyncio.ensure_future(self.closing.wait())]
         try:
@@ -206,12 +206,14 @@ class Guard:
             content = POSTS[path].model_validate_json(body)
         except ValidationError as error:
             raise HTTPException(
-                HTTPStatus.BAD_REQUEST, "this is not a request of this page"
+                HTTPStatus.BAD_REQUEST, "this request does not come from this page"
             ) from error
         if isinstance(content, Call):
             address, accepts = self.calls.get(content.fn_index, ("", bool))
             if address != path or not accepts(content.data):
-                raise HTTPException(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
+                raise HTTPException(
+                    HTTPStatus.BAD_REQUEST, "this request does not come from this page"
+                )
 
     def _check_session(self, query: QueryParams) -> None:
         sessions = query.getlist("session_hash")

@@ -1,14 +1,14 @@
 // A stream of motion on a page: clock, buffer, texts, waypoints. A source makes the blocks: a server, or a worker on the visitor's device.
-const AHEAD = 1; // seconds that are left when the next block is asked for
+const AHEAD = 1; // seconds that are left when the next block is requested
 const SLOW = 0.15; // seconds that are left when the clock begins to slow down
-const EASE = 0.15; // seconds in which the clock gets back to its speed
-const LEAD = 0.25; // least number of seconds from a new text to the first frame that follows it
-const STEP = 0.1; // longest step of the clock in seconds; a hidden page pauses the stream
+const EASE = 0.15; // seconds over which the clock returns to its speed
+const LEAD = 0.25; // minimum number of seconds from a new text to the first frame that follows it
+const STEP = 0.1; // maximum clock step in seconds; a hidden page pauses the stream
 const CHIPS = 6; // texts that can be clicked again
-const SPARE = 1.4; // time that a new text leaves for its block, in multiples of the median
-const TIMED = 5; // blocks whose median time tells how long the next one takes
+const SPARE = 1.4; // time reserved for the block of a new text, in multiples of the median
+const TIMED = 5; // number of recent blocks whose median time predicts how long the next block takes
 const MOST_POINTS = 16;
-const GOES = /\b(walk|run|jog|march|stride|stroll|skip|sneak|limp|strafe|stagger|tiptoe|crawl)(s|ing)?\b/i; // texts that waypoints keep
+const GOES = /\b(walk|run|jog|march|stride|stroll|skip|sneak|limp|strafe|stagger|tiptoe|crawl)(s|ing)?\b/i; // texts that are kept when waypoints are added
 const HINT = "Click on the floor: the person goes there";
 
 /** A clock that slows down before it reaches the end of the buffer, so that no frame is missing and none is skipped. */
@@ -33,22 +33,22 @@ export class Clock {
  * A stream in a container.
  *
  * @param container element that gets the form, the player and the buttons.
- * @param source `block({ text, from, path })` returns a promise of { from, frames, reached, motion }: the frames from number
- *   `from` on, in the format of the player, which lead along the waypoints `path`, and the numbers of the frames that reach
- *   the first of these. `cancel()`, if there is one, makes the promise of a block fail. `file(ending)` returns a promise of a
- *   file of the last minute.
+ * @param source `block({ text, from, path })` returns a promise of { from, frames, reached, motion }: the frames starting at
+ *   index `from`, in the format of the player, which lead along the waypoints `path`, and the indices of the frames that
+ *   reach the first of these waypoints. `cancel()`, if it exists, rejects the promise of a block. `file(ending)` returns a
+ *   promise of a file with the last minute.
  * @param page `player(motion)` returns the page of the player that shows a motion; `read(text)` returns what the source
- *   reads for a text, or throws an error with the texts `nearest` in meaning; `fps`; a first `text`, in which the person
- *   stands; and a text `walk` for the path to waypoints, null if there are none.
+ *   reads for a text, or throws an error with the texts `nearest` in meaning; `fps`; a first `text`, in which the person is
+ *   standing; and a text `walk` for the path to waypoints, null without waypoints.
  */
 export class Live {
   constructor(container, source, page) {
     Object.assign(this, { source, page, clock: new Clock(), end: 0, texts: [], text: page.text });
-    this.pending = null; // the change that was not asked for yet, or whose answer has not arrived: { text, from, entry }
-    this.busy = false; // a block is being made
+    this.pending = null; // the change that has not been requested yet, or whose block has not arrived: { text, from, entry }
+    this.busy = false; // a block is being generated
     this.times = []; // seconds that the last blocks took
-    this.points = []; // waypoints: { place, reached }, the number of the frame that reaches it or null
-    this.log = []; // for each new text, when it was typed and when its first frame was shown
+    this.points = []; // waypoints: { place, reached }, the index of the frame that reaches it, or null
+    this.log = []; // for each new text: when it was typed, and when its first frame was shown
     container.innerHTML = `<form><input maxlength="300" autocomplete="off" aria-label="What the person does next"
         placeholder="What the person does next"><button>Go</button></form>
       <div class="texts" role="group" aria-label="Last texts"></div><p role="status"></p>
@@ -89,10 +89,10 @@ export class Live {
   get fps() { return this.page.fps; }
   get frame() { return Math.floor(this.clock.time * this.fps); }
 
-  /** Seconds that a block takes: the lower median of the last ones, since the very first is slow. */
+  /** Seconds that a block takes: the lower median over the last blocks, because the very first block is slow. */
   get seconds() { return [...this.times].sort((a, b) => a - b)[(this.times.length - 1) >> 1]; }
 
-  /** The text of the last frames, once the pending change is made. */
+  /** The text of the last frames once the pending change has been made. */
   get next() { return this.pending?.text ?? this.text; }
 
   async timed(request) {
@@ -135,7 +135,7 @@ export class Live {
     if (!this.pending) this.stopAtLast();
   }
 
-  /** Takes over the text of a change whose frames have arrived. */
+  /** Adopts the text of a change whose frames have arrived. */
   follow({ text, entry }, from) {
     if (text !== this.text) this.remember(text);
     this.text = text;
@@ -148,13 +148,13 @@ export class Live {
     else if (!this.find("input").value) this.find("input").value = change.text;
   }
 
-  /** Lets a person who goes stop where the last waypoint is reached. */
+  /** Stops a moving person where the last waypoint is reached. */
   stopAtLast() {
     const last = this.points.at(-1)?.reached ?? null;
     if (last !== null && GOES.test(this.text)) this.replace(this.page.text, undefined, last + 1);
   }
 
-  /** Changes the text from the first frame on that can still be made in time. */
+  /** Changes the text, starting at the first frame that can still be generated in time. */
   change(text) {
     if (!text) return;
     let caption;
@@ -172,22 +172,22 @@ export class Live {
     this.pause(false);
   }
 
-  /** Asks for other frames from number `least` on, or from the first one on that can still be made in time. */
+  /** Requests new frames, starting at index `least` or at the first frame that can still be generated in time. */
   replace(text, entry = undefined, least = 0) {
     if (this.busy && this.isSpare && this.source.cancel) {
       this.isCanceled = true;
       this.source.cancel();
     }
-    // The clock does not slow down if the block takes as long as the ones before. A canceled block ends with its step.
+    // The clock does not slow down if the block takes as long as the previous blocks. A canceled block ends after its step.
     const lead = Math.ceil(this.fps * this.clock.speed * Math.max(LEAD, SPARE * this.seconds + SLOW));
     this.pending = { text, from: Math.min(this.end, Math.max(least, this.frame + 1 + lead)), entry };
   }
 
-  /** Adds a waypoint; the person goes there as the text says, or walks if the text does not say that they go. */
+  /** Adds a waypoint. The person goes there as the text says, or walks if the text describes no locomotion. */
   addPoint(place) {
     if (!this.page.walk) return;
     if (this.points.length >= MOST_POINTS) {
-      this.say(`A path has at most ${MOST_POINTS} waypoints. Click one to remove it`);
+      this.say(`A path can have at most ${MOST_POINTS} waypoints. Click one to remove it`);
       return;
     }
     this.say("");
@@ -212,7 +212,7 @@ export class Live {
 
   pause(paused) {
     this.clock.paused = paused;
-    this.find(".pause").textContent = paused ? "Go on" : "Pause";
+    this.find(".pause").textContent = paused ? "Resume" : "Pause";
   }
 
   remember(text) {

@@ -1,4 +1,4 @@
-"""Streams of motion for visitors. Their number is limited, and blocks are computed one at a time."""
+"""Motion streams for visitors. Their number is limited, and blocks are computed one at a time."""
 
 import secrets
 import tempfile
@@ -126,7 +126,7 @@ class LiveStreams:
         """Returns a motion file of the last minute of a stream.
 
         Raises:
-            UserError: If the stream has ended, or if no file format has this ending.
+            UserError: If the stream has ended, or if no file format has this extension.
         """
         if ending not in ENDINGS:
             raise UserError(
@@ -160,7 +160,7 @@ class LiveStreams:
     def _running(self, name: str) -> LiveStream:
         """Returns a stream by its name. Raises `UserError` if it has ended."""
         if name not in self._streams:
-            raise UserError("this stream has ended. Reload the page to begin another one")
+            raise UserError("this stream has ended. Reload the page to start another one")
         return self._streams[name]
 
     def _count(self, live: LiveStream) -> None:
@@ -177,5 +177,5 @@ class LiveStreams:
         live.allowance -= 1
         if live.stream.frames > LONGEST * self.model.representation.fps:
             raise UserError(
-                "this stream has reached the limit of one hour. Reload the page to begin another one"
+                "this stream has reached the limit of one hour. Reload the page to start another one"
             )

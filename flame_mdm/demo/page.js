@@ -2,7 +2,7 @@ const FAR = 20  // meters that a waypoint may be from the start
 const parse = (text) => text.split('|').map((part) => part.match(/^([^]*?)(?:@([^@]*))?$/).slice(1).map((s) => (s || '').trim()))
 const duration = (text, seconds) => parse(text).reduce((sum, part) => sum + (parseFloat(part[1]) || seconds), 0)
 
-// Rows of a sequence and a path on the floor. Both show and change fields of the form, which alone hold the values.
+// Rows of a sequence and a path on the floor. Both show and change fields of the form; only the form stores the values.
 const editor = (() => {
   const field = (id) => document.querySelector(`#${id} textarea, #${id} input`)
   const write = (id, value) =>
@@ -52,7 +52,7 @@ const editor = (() => {
   })
   function generate(text) {
     write('text', text)
-    setTimeout(() => document.querySelector('#go').click(), 50)  // after the field's value has been taken over
+    setTimeout(() => document.querySelector('#go').click(), 50)  // after the form has received the new value
   }
 
   document.addEventListener('change', (event) => {
@@ -97,7 +97,7 @@ const links = (() => {
     return String(new URLSearchParams(pairs))
   }
 
-  function read(keys, values) {  // the request of the page's address, and the values of its form
+  function read(keys, values) {  // the request in the page's address, and the values for its form
     const link = new URLSearchParams(location.search)
     if (![...link.keys()].some((key) => !key.startsWith('__'))) return [compose(keys, values), ...values]
     const shown = keys.map((key, k) => {

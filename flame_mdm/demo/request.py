@@ -1,4 +1,4 @@
-"""Requests of the demo within the limits of a public page, with links and equivalent Python programs."""
+"""Requests to the demo, within the limits of a public page, with links and equivalent Python programs."""
 
 import json
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ MAX_SAMPLES = 4
 MAX_STEPS = 1000
 MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
-# Maximum number of fields of a query string
+# Maximum number of fields in a query string
 MAX_FIELDS = 50
 # Limits of a path: number of waypoints, and meters along x and z
 MAX_WAYPOINTS, FAR = 16, 20.0
@@ -159,7 +159,7 @@ def query_pairs(query: str) -> list[tuple[str, str]]:
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
     """Returns the request in the query string of a link. Raises `UserError` if it is invalid.
 
-    Keys with "__" belong to the host.
+    Keys that begin with "__" belong to the host and are ignored.
     """
     values: dict[str, Any] = {}
     edits: list[Any] = []
@@ -169,7 +169,7 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
                 edits.append(json.loads(value))
             except (ValueError, RecursionError):
                 raise UserError(
-                    f"edit={_shown(value)}: not an edit of this page. Copy the whole link"
+                    f"edit={_shown(value)}: not a valid edit. Copy the whole link"
                 ) from None
         elif key in values:
             raise UserError(f"{_shown(key)} is given twice. Remove one of them")

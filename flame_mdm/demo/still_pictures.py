@@ -10,7 +10,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.visualize.render import thumbnail
 
 STILLS = Path(__file__).parent / "stills"
-"""Samples of the model "package" for actions that the synthetic set does not have."""
+"""Samples from the model "package" for actions that the synthetic set does not contain."""
 
 
 @cache

@@ -62,7 +62,7 @@ class Studio:
         if name not in self.files:
             near = did_you_mean(name, self.files)
             raise UserError(
-                f"unknown model {name[:60]!r}.{near} This page has: {', '.join(self.files)}"
+                f"unknown model {name[:60]!r}.{near} Available: {', '.join(self.files)}"
             )
         if name not in self._models:
             adapter = name.partition(PLUS)[2]
@@ -77,7 +77,7 @@ class Studio:
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns the reader of texts for a model whose captions describe single actions; None for other models."""
+        """Returns the text reader for a model whose captions describe single actions; None for other models."""
         self.model(name)
         return self._readers.get(name)
 
@@ -105,7 +105,7 @@ class Studio:
                     raise UserError("canceled")
                 if time.monotonic() > deadline:
                     raise UserError(
-                        f"stopped after {TIME_LIMIT:g} seconds. Take fewer steps, samples or seconds"
+                        f"stopped after {TIME_LIMIT:g} seconds. Use fewer steps or samples, or a shorter duration"
                     )
                 report(calls)
                 calls += 1
@@ -165,13 +165,13 @@ class Studio:
     def file(
         self, request: DemoRequest, number: int, extension: str, rig: str | None = None
     ) -> bytes:
-        """Returns the bytes of a file of motion `number`.
+        """Returns the content of a file with motion `number`.
 
         The motion must be in memory, so that a download does not wait for requests.
         """
         if extension not in FORMATS:
             raise UserError(
-                f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}"
+                f"{one_line(extension[:20])}: this page does not offer this format. Use {', '.join(FORMATS)}"
             )
         motions = None
         if model := self._models.get(request.model):
@@ -180,7 +180,7 @@ class Studio:
                 motions = self._made.get((request.model, repr(steps)))
         if model is None or motions is None:
             raise UserError(
-                "this motion is not in memory anymore. Open its link, and download it from there"
+                "this motion is no longer in memory. Open its link, and download it from there"
             )
         motion = _numbered(_cleaned(model, motions) if cleanup else motions, number)
         with tempfile.TemporaryDirectory() as folder:

@@ -31,7 +31,7 @@ from flame_mdm.sampling.motion_request import read_parts
 from flame_mdm.sampling.referee.judging import evidence_marks, try_judge
 from flame_mdm.visualize import player_page
 
-QUEUE = 64  # maximum number of waiting requests; further requests are refused
+QUEUE = 64  # maximum number of waiting requests; additional requests are refused
 FORM = [
     "model",
     "text",
@@ -72,7 +72,7 @@ EXAMPLES = (
     "a person talks on the phone",
     "a person does a push-up",
 )
-"""Texts to try. The page shows those that its model can do."""
+"""Texts to try. The page shows the texts whose actions its model can generate."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
 <div class="list"></div><button type="button" class="add">+ Add an action</button></div>
@@ -175,7 +175,7 @@ def _with_live(studio: Studio, live: LiveStreams) -> SimpleNamespace:
         with gr.Tab("Live"):
             gr.HTML(
                 f'<div id="live" class="live" data-fps="{fps:g}" data-stand="{STAND}" {walk}>'
-                '<button type="button" class="start">Begin a stream</button></div>'
+                '<button type="button" class="start">Start a stream</button></div>'
             )
     return ui
 
@@ -218,7 +218,7 @@ def _layout(studio: Studio) -> SimpleNamespace:
                 ui.model = gr.Dropdown(names, value=names[0], label="Model")
                 with gr.Row():
                     number: dict[str, Any] = {
-                        "placeholder": "model's",
+                        "placeholder": "default",
                         "max_length": 9,
                         "min_width": 90,
                     }
@@ -231,13 +231,17 @@ def _layout(studio: Studio) -> SimpleNamespace:
             with gr.Accordion("Words the model knows", open=False):
                 ui.words = gr.Markdown(_vocabulary(model))
     with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit") as ui.edit:
-        gr.Markdown("Choose a time, body parts, or both. They change; everything else is kept.")
+        gr.Markdown(
+            "Choose a time, body parts, or both. They change; everything else is kept."
+        )
         ui.chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
         with gr.Row():
             ui.begin = gr.Textbox(
                 label="Change from second", placeholder="start", max_length=9, min_width=120
             )
-            ui.end = gr.Textbox(label="to second", placeholder="end", max_length=9, min_width=120)
+            ui.end = gr.Textbox(
+                label="to second", placeholder="end", max_length=9, min_width=120
+            )
             ui.parts = gr.Dropdown(
                 PARTS, multiselect=True, label="Body parts that change", min_width=220
             )
@@ -249,7 +253,7 @@ def _layout(studio: Studio) -> SimpleNamespace:
         with gr.Row():
             ui.apply = gr.Button("Change")
             ui.variations = gr.Button("Three variations of the whole motion")
-    with gr.Accordion("The same motion by link and Python", open=False, elem_id="same"):
+    with gr.Accordion("The same motion as a link and in Python", open=False, elem_id="same"):
         ui.link = gr.Textbox(label="Link", interactive=False, buttons=["copy"], elem_id="link")
         ui.python = gr.Code(
             label="Python", language="python", lines=2, interactive=False, wrap_lines=True
@@ -312,7 +316,7 @@ def _verdicts(name: str, motion: Motion) -> str:
 
 
 def _understood(studio: Studio, request: DemoRequest) -> str:
-    """Returns the chips of a text and the messages about it."""
+    """Returns the chips for a text and the messages about it."""
     notes = "".join(_note("warning", line) for line in studio.advice(request))
     readings, reader = studio.readings(request), studio.reader(request.model)
     if not readings or reader is None:
@@ -361,7 +365,7 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Returns texts or actions of the training data with the addresses of their pictures; "" = no picture."""
+    """Returns texts or actions from the training data, with the addresses of their pictures; "" = no picture."""
     if model.conditioned_on == "text" and Reader.fits(model.facts):
         doable = Abilities(model.facts).actions
         return {

@@ -3,7 +3,8 @@
 An ASF file lists the bones of a subject. Each bone has a direction and length in the world in the
 rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file contains
 the angles of these degrees of freedom for each frame. If M is the rotation given by these
-angles, the bone turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied first: C = Rz Ry Rx.
+angles, the bone turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied
+first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
     """Checks that joints (F, 22, 3) form a human body.
 
     The `layout` of the file contains its unit, its up axis, and whether the body may be a child's.
-    If the size is wrong and the body is lying, the message names both the unit and the axis, so that
-    the file needs only one correction.
+    If the size is wrong and the body is lying, the message names both the unit and the axis, so
+    that the file needs only one correction.
 
     Raises:
         UserError: If the size is wrong, if a foot has no length, or if the feet point backwards.

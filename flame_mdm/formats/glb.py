@@ -1,7 +1,7 @@
 """glTF 2.0 binary files (.glb).
 
-Readers receive a validated document. Writers use `Binary` for the binary part. Source: Khronos Group,
-"glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
+Readers receive a validated document. Writers use `Binary` for the binary part. Source: Khronos
+Group, "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
 
 import json

@@ -128,7 +128,7 @@ class CitedCard:
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
     """Returns the strongest card of an extractor that fits the evaluated data; None if there is no such card.
 
-    Without an extractor, the card is about the metrics of joints. Cards are in the folder
+    Without an extractor, the card covers the metrics of joint positions. Cards are in the folder
     FLAME_MDM_AUDITS (default: runs/audit), and in the repository, whose cards are listed in
     audited.json.
     """

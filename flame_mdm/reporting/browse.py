@@ -77,7 +77,7 @@ def write_page(
     title: str,
     body: Mesh | None,
 ) -> None:
-    """Writes a player of clips, grouped by split. A mirrored copy is next to its original."""
+    """Writes a player with clips, grouped by split. A mirrored copy is next to its original."""
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],
@@ -115,7 +115,7 @@ def write_clips(
     if others:
         raise UserError(
             f"motions={folder}: the folder contains other motions, such as {others[0].name}. "
-            f"Delete it, or choose another folder"
+            f"Delete the folder, or choose another one"
         )
 
     used: set[str] = set()
@@ -138,7 +138,7 @@ def write_clips(
 
 
 def describe(store: Store) -> Markup:
-    """Returns a table of the contents of a store as HTML."""
+    """Returns an HTML table that describes a store."""
     info, fps = store.info, store.info["fps"]
     splits = {
         name: [clip for clip in store.clips if clip.split == name]

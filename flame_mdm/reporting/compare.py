@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 # The requested caption or action, and the index of a motion among the motions with the same request
 Prompt = tuple[str, int]
-# First frame, last frame (exclusive), kind and description of a span of a time line
+# First frame, last frame (exclusive), kind and description of a span on a timeline
 Mark = tuple[int, int, str, str]
 
 
@@ -122,7 +122,7 @@ def comparison(
         shown: the motions of each run and folder, by prompt. The page plays the motions for the
             prompts that all of them have.
         mesh: the body to draw.
-        evidence: function that returns the marks for the time line of a motion.
+        evidence: function that returns the marks for the timeline of a motion.
     """
     runs = only_runs(compared)
     labels = [entry.label for entry in compared]
@@ -190,7 +190,7 @@ def _player(
     body: Mesh | None,
     evidence: Callable[[Motion], Sequence[Mark]],
 ) -> str:
-    """Returns a player of the motions for the prompts that all runs have, in the order of the first run."""
+    """Returns a player with the motions for the prompts that all runs have, in the order of the first run."""
     from flame_mdm.visualize import player_page
 
     scene = [
@@ -204,10 +204,10 @@ def _player(
 
 HEAD = ["", "difference", "95 % over replications", ""]  # column titles of differences
 EXPLAINED = (
-    "Differences between motions for the same texts and noise. The intervals are over "
-    "replications, which have other captions, crops and noise; they do not cover another "
-    "training run. A difference is shown if its interval does not contain 0. Of 20 metrics that "
-    "do not differ, one is shown by chance."
+    "Differences between motions for the same texts and noise. The intervals cover "
+    "the variation between replications, which differ in captions, crops and noise, but not the "
+    "variation between training runs. A difference is shown if its interval does not contain 0. "
+    "Of 20 metrics that do not differ, one is shown by chance on average."
 )
 
 
@@ -243,7 +243,7 @@ def _difference(name: str, first: Value | None, second: Value | None) -> list[st
         return []
     mean, low, high = paired_difference(one, two)
     if count == 1:
-        return [labeled(name, first), number(mean), "–", "not tested: one replication"]
+        return [labeled(name, first), number(mean), "–", "not tested: only one replication"]
     shown = "higher" if low > 0 else "lower" if high < 0 else "no difference shown"
     return [labeled(name, first), number(mean), f"[{number(low)}, {number(high)}]", shown]
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 QUESTION = "Which animation better fits the following description?"
-"""The question of Tevet et al. 2023 (MDM), appendix D."""
+"""The question in Tevet et al. 2023 (MDM), appendix D."""
 
 # The 97.5 % quantile of the standard normal distribution, for 95 % intervals
 NORMAL_QUANTILE = 1.96
@@ -48,7 +48,7 @@ class Answers(Schema):
 
 
 class Pair(Schema):
-    """Counts of the raters' preferences between two runs."""
+    """How often raters preferred each of two runs."""
 
     a: str
     b: str
@@ -88,7 +88,7 @@ def rating_page(
     Args:
         compared: two or more runs or folders of motions.
         shown: the motions of each run, by prompt.
-        seed: seed of the order of the pairs, and of the side on which each motion is shown.
+        seed: seed for the order of the pairs, and for the side on which each motion is shown.
         body: the body to draw.
 
     Raises:

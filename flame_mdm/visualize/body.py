@@ -23,7 +23,7 @@ HELPERS = tuple(
     for side in ("left", "right")
     for name, share in TWISTED.items()
 )
-"""Joint, and share of the twist, of each bone after the 22 joints."""
+"""Joint and share of the twist for each bone after the 22 joints."""
 # The joint at which each bone begins
 ANCHORS = (
     *range(len(SMPL22)),
@@ -62,13 +62,13 @@ class Figure:
     contacts: np.ndarray | None = field(default=None, kw_only=True)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns a body that moves like the joints and "", or None and the reason why there is no body.
+        """Returns a body that moves like the joints, and ""; or None, and the reason why no body fits.
 
         Without a body, a skeleton is drawn instead.
 
-        `body` is the mesh; None = the mannequin. A body needs the rotations of the joints.
+        `body` is the mesh; None = the mannequin. Fitting a body requires the joint rotations.
         """
-        return None, "the rotations of its joints are unknown"
+        return None, "its joint rotations are unknown"
 
 
 def target(path: str | Path, motions: Sequence[Figure]) -> Path:

@@ -1,4 +1,4 @@
-"""HTML player of motions, a single file that needs no network and opens from disk."""
+"""HTML player for motions, a single file that needs no network and opens from disk."""
 
 import base64
 import html
@@ -67,7 +67,7 @@ def player_page(
         groups: for each motion, a name to filter by, such as its split; "" = none.
         beside: for each motion, the id of an earlier motion next to which it is shown, such as
             its original; "" = none.
-        marks: for each motion, spans to mark on the time line: first frame, end (exclusive), kind
+        marks: for each motion, spans to mark on the timeline: first frame, end (exclusive), kind
             and description.
         body: the body to draw; None = the mannequin.
     """

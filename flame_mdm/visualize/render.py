@@ -33,8 +33,7 @@ TOWARD = np.array(
     [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
 )
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-# Number of the color space for HD video, which players assume for large videos that declare no color
-# space
+# Code of the HD color space, which players assume for large videos that declare no color space
 BT709 = 1
 SMOOTH = 2  # images are drawn larger by this factor and then reduced
 

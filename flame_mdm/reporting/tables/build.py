@@ -193,7 +193,7 @@ def _warnings(
         for label, value, cell in cells
         if value == "fid" and cell and cell.value == 0
     }
-    why = "clips are taken whole, so that both draws of real motions, which are compared, are the same"
+    why = "clips are used whole, so the two draws of real motions that are compared are identical"
     return _by_text(texts) + [
         ("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)
     ]
@@ -447,7 +447,7 @@ def _reported(
         unknown = row["values"].keys() - columns.keys()
         if unknown:
             raise UserError(
-                f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}"
+                f"{PUBLISHED}: {part}, {row['label']}: unknown column {', '.join(sorted(unknown))}"
             )
         source, evaluator = (row.get(key) or reported[key] for key in ("source", "evaluator"))
         text = f"Reported in {source}. Measured with {evaluator}."
@@ -481,7 +481,7 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         "longest": "d",
     }
     lines, histograms = [], {}
-    notes = [("", "lengths are in frames, at the frame rate of each data set")]
+    notes = [("", "lengths are in frames, at each data set's frame rate")]
     for dataset in part["lengths"]:
         path = results / "lengths" / f"{dataset}.json"
         if not path.exists():
@@ -526,7 +526,7 @@ def _ratings(name: str, path: Path, reported: Config | None) -> Part:
     ]
 
     if path.exists():
-        notes = [("", "share of votes, with its 95 % interval (Wilson 1927)")]
+        notes = [("", "share of votes, with 95 % interval (Wilson 1927)")]
         ratings: Ratings = read_json(
             path, Ratings, "run `flame-mdm compare ratings=...` to count again"
         )

@@ -35,7 +35,7 @@ KINDS = {
 NO_RESULTS = ("NOT VALID", "QUICK")
 # Paths of audit cards in footnotes
 CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")
-# Rows with identical values of these facts share a line in the list of sources
+# Rows with identical values for these facts share a line in the list of sources
 SHARED = (
     "checkpoint sha256",
     "recipe",
@@ -72,7 +72,7 @@ class Line:
 
 @dataclass
 class Part:
-    """One table within the table of a paper."""
+    """One part of a `Table`, with its own columns and rows."""
 
     name: str
     columns: dict[
@@ -89,7 +89,7 @@ class Part:
 
 @dataclass
 class Table:
-    """A table of one or more parts, like a table of a paper.
+    """A table of one or more parts, like a table in a paper.
 
     Links are relative to the folder of the written table.
     """
@@ -149,7 +149,7 @@ def _unranked(table: Table) -> str:
     if any(line.facts.get("baseline") for line in lines):
         kinds.append("sanity-check baselines")
     if any(line.state in NO_RESULTS for line in lines):
-        kinds.append("rows that are not valid or quick")
+        kinds.append("rows that are quick or not valid")
     return " and ".join(kinds)
 
 
@@ -188,7 +188,7 @@ def _head(column: str, better: str) -> str:
 def _sources(table: Table) -> list[str]:
     """Returns the provenance of rows.
 
-    Rows with identical values of the facts in `SHARED` share a line, in which `/` separates their
+    Rows with identical values for the facts in `SHARED` share a line, in which `/` separates their
     other facts.
     """
     rows = []
@@ -228,7 +228,7 @@ def _tex(text: str) -> str:
         "λ": r"$\lambda$",
         "β": r"$\beta$",
     }
-    # LaTeX would read brackets after \\ as its option, so brackets are put into braces.
+    # LaTeX would read brackets after \\ as an optional argument, so brackets are put in braces.
     special |= {c: "\\" + c for c in "&%$#_{}"} | {
         "[": "{[}",
         "]": "{]}",

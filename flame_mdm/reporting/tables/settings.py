@@ -76,7 +76,7 @@ def settings_table(name: str, part: Config, reported: Config | None) -> Part:
     for key in part["keys"].values():
         if key not in HYPERPARAMETERS:
             raise UserError(
-                f"part {name}: no setting is called '{key}'.{did_you_mean(key, HYPERPARAMETERS)}"
+                f"part {name}: unknown setting '{key}'.{did_you_mean(key, HYPERPARAMETERS)}"
             )
     recipes = {label: hyperparameters(recipe) for label, recipe in part["recipes"].items()}
     printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}

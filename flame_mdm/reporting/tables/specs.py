@@ -1,4 +1,4 @@
-"""Specs of tables (the files in experiments/tables), and the evaluations that they require."""
+"""Table specs (the files in experiments/tables), and the evaluations that they require."""
 
 import hashlib
 import itertools
@@ -34,14 +34,14 @@ SWEPT = (
 )
 """Options of a row that may be lists. Each value of a list results in one row."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
-"""Maximum numbers of rows (after expanding lists of options), columns and plots of a table.
+"""Maximum numbers of rows (after expanding lists of options), columns and plots in a table.
 
 Tables in papers have about 20 rows.
 """
 
 
 class Options(ClosedSchema):
-    """Keys of `flame-mdm evaluate` that a part, a row or a column may set."""
+    """Keys for `flame-mdm evaluate` that a part, a row or a column may set."""
 
     protocol: str = ""
     extractor: str = ""
@@ -61,7 +61,7 @@ class ColumnSpec(Options):
 
 
 class RowSpec(Options):
-    """A row: a model or baseline, and its sampling options. Dotted keys override options of the data."""
+    """A row: a model or baseline, and its sampling options. Dotted keys override data options."""
 
     label: str
     note: str = ""
@@ -84,7 +84,7 @@ class RowSpec(Options):
         for key in row if isinstance(row, dict) else ():
             if "." in str(key) and not re.fullmatch(r"data(\.(?!_)\w+)+", str(key)):
                 raise ValueError(
-                    f"{key}: only keys of the data can be overridden, such as data.crop.max_frames"
+                    f"{key}: only data keys can be overridden, such as data.crop.max_frames"
                 )
         return row
 
@@ -153,7 +153,7 @@ class Spec(ClosedSchema):
             part = self.parts.get(figure.part)
             if part is None or figure.x not in ABOUT:
                 raise ValueError(
-                    f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}"
+                    f"a figure needs a part of the table and an x, one of {', '.join(ABOUT)}"
                 )
             for column in figure.y:
                 if column not in part.columns:
@@ -177,12 +177,12 @@ def spec_names() -> list[str]:
 
 
 def load_spec(name: str) -> Config:
-    """Loads the spec of a table by its name in experiments/tables, or the path of a .yaml file."""
+    """Loads the spec of a table by its name in experiments/tables, or by the path of a .yaml file."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
     if not path.is_file() or path == PUBLISHED:
         names = spec_names()
         raise UserError(
-            f"no table is called '{name}'.{did_you_mean(name, names)} There are: {', '.join(names)}"
+            f"unknown table '{name}'.{did_you_mean(name, names)} Available: {', '.join(names)}"
         )
     spec = load_mapping(path)
     try:
@@ -195,7 +195,7 @@ def load_spec(name: str) -> Config:
 def _at_most(noun: str, count: int, most: int) -> None:
     if count > most:
         raise UserError(
-            f"{noun}: {count:,} exceed the limit of {most:,} per table. Split it into several tables"
+            f"{noun}: {count:,} exceed the limit of {most:,} per table. Split the table into several tables"
         )
 
 
@@ -210,7 +210,7 @@ def load_mapping(path: Path) -> Config:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An evaluation of a table: the label of its row, and its keys of `flame-mdm evaluate`."""
+    """An evaluation for a table: the label of its row, and its keys for `flame-mdm evaluate`."""
 
     label: str
     keys: Mapping[str, Any]
@@ -262,5 +262,5 @@ def _evaluation(
     for level in (part, row, column):
         keys |= {name: level[name] for name in Options.model_fields if name in level}
     if "ckpt" in keys:
-        keys.pop("data", None)  # the recipe of a checkpoint names the data set
+        keys.pop("data", None)  # the recipe of a checkpoint specifies the data set
     return Evaluation(row["label"], keys)

@@ -351,7 +351,8 @@ class DataSettings:
             _ = self.nodes  # composed here, so that errors are reported before any work
         elif self.composed:
             raise UserError(
-                f"{self.composed[0]} is an option of a data set, but no data set was given. Add data=NAME"
+                f"{self.composed[0]} is an option of a data set, but no data set was given. "
+                "Add data=NAME"
             )
 
     @cached_property

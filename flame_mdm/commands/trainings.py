@@ -27,7 +27,7 @@ class Training:
     Attributes:
         words: arguments of `flame-mdm train`.
         folder: the run directory.
-        needs: numbers of the earlier training runs whose files this run reads.
+        needs: indices of the earlier training runs whose files this run reads.
     """
 
     words: Sequence[str]

@@ -21,8 +21,8 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
     """Returns the chips for a text: its actions in order, their attributes, and ignored words.
 
-    The options of a chip are texts with another word for its action or attribute. The chosen text
-    replaces the text in the form.
+    The options of a chip are texts with a different word for its action or attribute. The chosen
+    text replaces the text in the form.
 
     Args:
         abilities: the actions and attributes that the model knows. They are the options of the

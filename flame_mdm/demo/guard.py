@@ -103,8 +103,8 @@ class Guard:
     """ASGI middleware that checks a request before the application receives it.
 
     It checks host, origin, path, size and content. `hosts` are the names of this server, in
-    addition to localhost and numeric addresses. A request with another host name may come from a
-    page whose name somebody pointed at this computer (DNS rebinding). `calls` maps the numbers of
+    addition to localhost and numeric addresses. A request with a different host name may come from
+    a page whose name somebody pointed at this computer (DNS rebinding). `calls` maps the indices of
     the page's callable functions to their path, and to a check of the arguments. `is_open` returns
     whether a session has called a function, so that its results can be read.
     """

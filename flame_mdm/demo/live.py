@@ -88,9 +88,9 @@ class LiveStreams:
         Args:
             name: name of the stream. "" = begin a new stream, whose name is in the result.
             text: description of the motion.
-            begin: number of the first frame. Later frames of the stream are dropped.
+            begin: index of the first frame. Later frames of the stream are dropped.
             path: waypoints that are ahead in frame `begin`, x and z in meters. `reached` in the
-                result lists the numbers of the frames in which the first waypoints are reached.
+                result lists the indices of the frames in which the first waypoints are reached.
 
         Raises:
             UserError: If the text is not understood, if the stream has ended, or if a limit is
@@ -177,5 +177,6 @@ class LiveStreams:
         live.allowance -= 1
         if live.stream.frames > LONGEST * self.model.representation.fps:
             raise UserError(
-                "this stream has reached the limit of one hour. Reload the page to start another one"
+                "this stream has reached the limit of one hour. Reload the page to start "
+                "another one"
             )

@@ -54,7 +54,7 @@ Path = Annotated[
 
 
 class DemoEdit(BaseModel):
-    """An edit of a previous motion; `motion` is its number.
+    """An edit of a previous motion; `motion` is its index.
 
     See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part; "" =
     unconditioned. A variation of the entire motion keeps the text, parts and path of the request.
@@ -101,9 +101,9 @@ class DemoRequest(BaseModel):
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps: for each step, the number of the motion to edit, and keywords for `generate` or `edit`.
+        """Returns the steps: for each step, the index of the motion to edit, and keywords for `generate` or `edit`.
 
-        The number is None in the first step, which generates.
+        The index is None in the first step, which generates.
         """
         shared = self.model_dump(
             include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True

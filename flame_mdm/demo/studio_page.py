@@ -231,17 +231,13 @@ def _layout(studio: Studio) -> SimpleNamespace:
             with gr.Accordion("Words the model knows", open=False):
                 ui.words = gr.Markdown(_vocabulary(model))
     with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit") as ui.edit:
-        gr.Markdown(
-            "Choose a time, body parts, or both. They change; everything else is kept."
-        )
+        gr.Markdown("Choose a time, body parts, or both. They change; everything else is kept.")
         ui.chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
         with gr.Row():
             ui.begin = gr.Textbox(
                 label="Change from second", placeholder="start", max_length=9, min_width=120
             )
-            ui.end = gr.Textbox(
-                label="to second", placeholder="end", max_length=9, min_width=120
-            )
+            ui.end = gr.Textbox(label="to second", placeholder="end", max_length=9, min_width=120)
             ui.parts = gr.Dropdown(
                 PARTS, multiselect=True, label="Body parts that change", min_width=220
             )

@@ -151,7 +151,8 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     check_frames(len(values))
     if (beyond := ~(np.abs(values.astype(float)) < 1e6)).any():
         raise UserError(
-            f"numbers in {name}, frame {np.argwhere(beyond)[0][0]}, are not finite, or exceed a million"
+            f"numbers in {name}, frame {np.argwhere(beyond)[0][0]}, are not finite, or exceed "
+            "a million"
         )
 
 

@@ -94,7 +94,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
         tall = (lift - offsets[toe, 1]) / (body.sole - high)
         fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
     # Each part of the mesh is stretched along its own axes to the clip's bone lengths. Vertices
-    # between two parts get the mean of both maps, by their weights, as in linear blend skinning.
+    # between two parts use the weighted mean of both maps, as in linear blend skinning.
     turns, rest = body.turns, np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]

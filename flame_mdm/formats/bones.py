@@ -1,7 +1,7 @@
 """Rotations for SMPL's joints, computed from the bones in a BVH or AMC file.
 
 Joint positions do not show how a forearm or a head turns about its own axis, but the bones of a
-file do. Each SMPL joint gets the rotation by which its bone has turned from the rest pose. Three
+file do. Each SMPL joint takes the rotation by which its bone has turned from the rest pose. Three
 rest poses are tried, in this order: the pose of the file without rotations, a rest pose that
 precedes the motion, and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose,
 its arms and legs are turned to SMPL's directions by the smallest rotation.

@@ -161,8 +161,8 @@ def read_skinned(path: Path) -> Character:
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the pose in which the skin was bound, and the corners of a box around its meshes.
 
-    The pose consists of matrices (N, 4, 4) of the nodes. If the nodes are stored in another pose,
-    the pelvis, which is nearly upright, determines how the coordinates of the skin are turned.
+    The pose consists of matrices (N, 4, 4) of the nodes. If the nodes are stored in a different
+    pose, the pelvis, which is nearly upright, determines how the coordinates of the skin are turned.
     """
     # If the file is stored in the bind pose, joint matrix times inverse bind matrix is the same
     # for all joints. Otherwise, this product of the pelvis, with its rotation rounded to quarter
@@ -210,9 +210,9 @@ class UnknownJoints(UserError):
 
 
 def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
-    """Returns the number of the character's joint for each SMPL joint.
+    """Returns the index of the character's joint for each SMPL joint.
 
-    `names` contains the names of the character's joints by number.
+    `names` contains the names of the character's joints by index.
 
     Raises:
         UnknownJoints: If a joint cannot be identified.
@@ -282,7 +282,8 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     """
     if path.suffix.lower() != ".glb":
         raise UserError(
-            f"{path}: a .glb character can only be saved as a .glb, .fbx, .usda, .usdc or .usdz file"
+            f"{path}: a .glb character can only be saved as a .glb, .fbx, .usda, .usdc or .usdz "
+            "file"
         )
     file, (world, positions, rig) = character.file, moved(character, motion)
     document, hips = copy.deepcopy(file.document), rig.hips
@@ -294,7 +295,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
         if source >= 0 or joint in skinned:
             turns = glb.quaternions(np.concatenate([rest[None, joint], local[:, joint]]))
             # Animations need a node with translation, rotation and scale instead of a matrix. The
-            # node gets the rest pose, even if the file was stored in another pose.
+            # node takes the rest pose, even if the file was stored in a different pose.
             size = float(
                 rig.scales[joint]
                 / (rig.scales[rig.parents[joint]] if rig.parents[joint] >= 0 else 1)

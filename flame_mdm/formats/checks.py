@@ -63,7 +63,7 @@ def uprightness(joints: np.ndarray) -> float:
 
 
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
-    """Returns a message if the body is lying in most frames, with the axis that would make it stand.
+    """Returns a message if the body is lying in most frames, with the axis that makes it stand.
 
     Returns "" otherwise. `joints` (F, 22, 3) have y up. They were converted from the axes of the
     file by `axes` (3, 3). `up` is the up axis of the file.
@@ -116,7 +116,7 @@ def below_floor(joints: np.ndarray) -> str:
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:
-    """Returns the number of frames before a motion that show a rest pose or lead from it to the motion.
+    """Returns the number of frames before a motion that show a rest pose or lead from it.
 
     Several programs write a T-pose or A-pose as the first frame. In a recorded motion that begins
     with a rest pose, the first step is not longer than the following steps.

@@ -91,10 +91,10 @@ def cleanup(
     Returns:
         Joints (F, J, 3) float32.
     """
-    # Joints get smooth paths, and bones get their median lengths. Then, the body is moved over the
-    # ground so that its feet in contact stand still on average. The remaining sliding is corrected
-    # by two-bone inverse kinematics: the legs keep each toe in place during its contacts. Inverse
-    # kinematics also moves the arms out of the trunk and thighs.
+    # Joint paths are smoothed, and bones are set to their median lengths. Then, the body is moved
+    # over the ground so that its feet in contact stand still on average. The remaining sliding is
+    # corrected by two-bone inverse kinematics: the legs keep each toe in place during its contacts.
+    # Inverse kinematics also moves the arms out of the trunk and thighs.
     if len(joints) < 4:
         return np.array(joints, np.float32)
     smooth = _smooth(np.asarray(joints, float))
@@ -150,9 +150,9 @@ def _smooth(motion: np.ndarray) -> np.ndarray:
 
     Positions that jump for a few frames have little influence on the paths.
     """
-    # After each fit, positions far from the path get a lower weight, as in iteratively reweighted
-    # least squares. A pop of a few frames is thus cut off instead of being spread over its
-    # neighbors. Four fits are sufficient.
+    # After each fit, positions far from the path are given a lower weight, as in iteratively
+    # reweighted least squares. A pop of a few frames is thus cut off instead of being spread over
+    # its neighbors. Four fits are sufficient.
     smooth = motion.copy()
     for joint in range(motion.shape[1]):
         path, weight = motion[:, joint], np.ones(len(motion))
@@ -173,7 +173,7 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
-    """Bends limbs whose foot or hand has moved down because bones got their median lengths.
+    """Bends limbs whose foot or hand has moved down because bone lengths have changed.
 
     Between two very different poses of a sequence, for example from a crawl to a walk, the poses
     are averages of both and have short bones. With full lengths, they would reach through the
@@ -219,8 +219,8 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     slides = np.diff(motion[:, toes], axis=0)[..., [0, 2]]
     contact = weights = _contacts(motion[:, toes], motion[:, 0], fps, SHARE)
     drift = np.zeros((len(slides), 2))
-    # Feet that move differently from the mean get a lower weight, until one foot determines the
-    # drift.
+    # Feet that move differently from the mean are given a lower weight, until one foot
+    # determines the drift.
     for _ in range(10):
         mean = (weights[..., None] * slides).sum(1) / np.maximum(weights.sum(1), 1e-9)[:, None]
         drift = _least_squares(

@@ -25,7 +25,7 @@ MAGIC = b"Kaydara FBX Binary  \x00\x1a\x00"
 VERSION = 7400
 # First version whose records have 64-bit offsets
 WIDE_VERSION = 7500
-# Earlier files store animations in another structure
+# Earlier files store animations in a different structure
 OLDEST_VERSION = 7000
 # Maximum size of a file that is read
 LIMIT = 512 * MEBIBYTE

@@ -222,8 +222,8 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 
     Returns None if the motion turns by a very different angle or to the other side.
     """
-    # The model turns by about the requested angle. The root gets exactly this angle, and the pose
-    # turns with it.
+    # The model turns by about the requested angle. The root is turned by exactly this angle, and
+    # the pose turns with it.
     begin, end = moving(motion)
     part = motion.cut(begin, end)
     angle = part.heading[-1] - part.heading[0]

@@ -166,7 +166,7 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A skin: numbers of its K joints, inverse bind matrices, and corners of its meshes.
+    """A skin: indices of its K joints, inverse bind matrices, and corners of its meshes.
 
     Matrices are (K, 4, 4) or (0, 4, 4). Corners are (C, 3).
     """
@@ -188,7 +188,7 @@ class Glb:
     nodes: tuple[int, ...]
     # Name of each node
     names: tuple[str, ...]
-    # Number of each node's parent, -1 for a root
+    # Index of each node's parent, -1 for a root
     parents: tuple[int, ...]
     # (N, 4, 4), from each node's coordinates to its parent's coordinates
     locals: np.ndarray
@@ -216,7 +216,7 @@ def read(path: Path) -> Glb:
                 f"it requires {unread[0][:80]}, which cannot be read. Export it without this compression"
             )
         order, above = _ordered(parts.nodes)
-        rank = np.argsort(order).tolist()  # index in the document -> number
+        rank = np.argsort(order).tolist()  # index in the document -> index in `Glb`
         parents = tuple(rank[above[number]] if number in above else -1 for number in order)
         with np.errstate(all="ignore"):
             local = np.array([parts.nodes[number].local() for number in order]).reshape(-1, 4, 4)
@@ -261,7 +261,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
 
 
 def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ...]:
-    """Returns the skins. `rank` converts indices of the document to numbers of nodes."""
+    """Returns the skins. `rank` converts node indices in the document to indices in `Glb`."""
     corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
     for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
         boxes = _item(corners, node.skin, "skin")

@@ -52,7 +52,7 @@ UNITS = {  # in meters
     "the unit of CMU's recordings": 0.0564444,
 }
 
-# A joint of the file, or weights of several joints whose weighted mean is used
+# A joint in the file, or weights for several joints whose weighted mean is used
 Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
@@ -114,7 +114,7 @@ class Layout(BaseModel):
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
-        """Returns the layout with another map and the name of a supported layout."""
+        """Returns the layout with a different map and the name of a supported layout."""
         layout = self.model_copy(update={"map": dict(map)})
         layout._name = name
         return layout
@@ -476,7 +476,7 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     """Checks that an array of joints was not mistaken for another skeleton with the same number of joints.
 
     The limbs of a person have the same length on both sides, and their length does not change. With
-    another order of joints or another skeleton, these pairs of joints are not bones.
+    a different joint order or skeleton, these pairs of joints are not bones.
 
     Args:
         joints: (F, 22, 3), SMPL's joints, mapped as if the array had the joints of the skeleton.

@@ -100,7 +100,7 @@ class BoneRotations:
 def solve(joints: Tensor, fps: float) -> Poses:
     """Computes a body and its rotations, which reproduce joint positions in every frame.
 
-    Bones get their mean length over the clip. Pelvis and chest have three bones each, and get the
+    Bones have their mean length over the clip. Pelvis and chest have three bones each, and take the
     rotation that fits all three bones best (Kabsch 1976). Every other joint aims its bone at the
     next joint.
 

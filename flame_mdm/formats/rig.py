@@ -132,12 +132,12 @@ class Rig:
 def recognized(
     names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]
 ) -> dict[str, list[int]]:
-    """Returns the numbers of the joints that may correspond to each SMPL joint.
+    """Returns the indices of the joints that may correspond to each SMPL joint.
 
     The correspondence is determined by the most similar known skeleton.
 
     Args:
-        names: names of the joints by number.
+        names: joint names by index.
         skeletons: for each skeleton, a mapping from joint spellings to SMPL joints, as in
             `flame_mdm.formats.names.best_match`.
     """
@@ -153,9 +153,9 @@ def recognized(
 def matched(
     source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, int], list[str]]:
-    """Returns the numbers of a character's joints, by SMPL joint, and the missing joints.
+    """Returns the indices of a character's joints, by SMPL joint, and the missing joints.
 
-    Only required joints are reported as missing. Each SMPL joint has at most one number.
+    Only required joints are reported as missing. Each SMPL joint has at most one index.
     """
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
@@ -323,7 +323,7 @@ def follow(
     Returns:
         Rotations (F, J, 3, 3) and positions (F, J, 3) of the character, and its skeleton.
     """
-    # All joints get the rotations of the body, relative to the rest poses. The hips follow the
+    # All joints take the rotations of the body, relative to the rest poses. The hips follow the
     # scaled path. Legs with other proportions would then hover or sink. Therefore, each leg is bent
     # until its toes or its ankle reach the scaled position, at the character's own height above the
     # floor.

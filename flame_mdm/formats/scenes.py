@@ -29,9 +29,9 @@ def animations(path: Path) -> list[str]:
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
     """Returns a joint name per node, as in the layouts of skeletons.
 
-    If the file declares the bones of a humanoid, these bones get SMPL's names. A node at the tip of
-    a bone is called `NAME.end`, like the end site of a bone in a BVH file. This also applies if the
-    name of the tip is the name of the bone with another ending.
+    If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the tip
+    of a bone is called `NAME.end`, like the end site of a bone in a BVH file. This also applies if
+    the name of the tip is the name of the bone with a different ending.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

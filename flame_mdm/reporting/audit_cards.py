@@ -75,8 +75,8 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 def card_name(card: AuditCard) -> str:
     """Returns the name of a card's files: data set, extractor, number of motions, and a hash.
 
-    The hash depends on the motions and the crop, so that an audit of other motions or with another
-    crop does not overwrite a stronger card.
+    The hash depends on the motions and the crop, so that an audit of other motions or with a
+    different crop does not overwrite a stronger card.
     """
     extractor = card.extractor.sha256[:12] if card.extractor else "none"
     facts = card.model_dump(include={"protocol", "data", "split", "seed", "motions", "resamples"})

@@ -43,7 +43,7 @@ Mark = tuple[int, int, str, str]
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """A run, or a folder of motion files, with its label on pages.
+    """A run, or a folder of motion files, with its label on the page.
 
     `run` is None for a folder of motion files.
     """

@@ -18,7 +18,7 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
     "base-uri 'none'; form-action 'none'"
 )
-"""Content security policy of pages, which blocks all network access."""
+"""Content security policy for pages, which blocks all network access."""
 
 TEMPLATES = Path(__file__).parent / "templates"
 

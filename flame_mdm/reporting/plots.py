@@ -17,7 +17,7 @@ WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 # Height of a line of text
 ROW = 16
-# Maximum number of segments per curve. The lowest and the highest point of each segment are drawn.
+# Maximum number of segments per curve. The lowest and highest point of each segment are drawn.
 MOST = 300
 LOG_RANGE = 15  # positive values get a logarithmic axis if they span more than this factor
 COLORS = 8

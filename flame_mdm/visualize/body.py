@@ -62,7 +62,7 @@ class Figure:
     contacts: np.ndarray | None = field(default=None, kw_only=True)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns a body that moves like the joints, and ""; or None, and the reason why no body fits.
+        """Returns a body that moves like the joints and "", or None and why no body fits.
 
         Without a body, a skeleton is drawn instead.
 
@@ -84,7 +84,7 @@ def sides(skeleton: Skeleton) -> list[int]:
 
 
 def head(skeleton: Skeleton) -> int | None:
-    """Returns the number of the head joint; None if the skeleton has no head."""
+    """Returns the index of the head joint; None if the skeleton has no head."""
     return skeleton.joints.index("head") if "head" in skeleton.joints else None
 
 

@@ -330,7 +330,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class DataSettings:
-    """Keys of commands that open a data set."""
+    """Keys for commands that open a data set."""
 
     data: str | None = option(
         None, "data set, a file in experiments/data; data.KEY=... overrides its keys"

@@ -17,10 +17,10 @@ class AuditSettings(DataSettings):
            flame-mdm audit cards="A.json B.json"
 
     Perturbs the real motions of a data set at graded strengths, measures them like generated
-    motions, and writes a card. The card shows which perturbations each metric detects, from which
-    strength on, and which it does not detect. extractor=none audits the metrics of joint positions.
-    After an interruption, the same command continues where it stopped. cards= renders one card
-    again, or two cards side by side.
+    motions, and writes a card. The card shows which perturbations each metric detects, starting
+    at which strength, and which ones it does not detect. extractor=none audits the metrics of
+    joint positions. After an interruption, the same command continues where it stopped. cards=
+    renders one card again, or two cards side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")

@@ -28,7 +28,7 @@ class JudgeSettings(BodySettings, FileSettings):
     """usage: flame-mdm judge MOTION text="a person waves with the left hand" [OUT.html] [fps=20] [unit=0.01] [up=z]
            flame-mdm judge FOLDER [OUT.html] [clips=24]
 
-    Reads the claims of a sentence, such as side, count, direction, posture and order, and
+    Reads the claims in a sentence, such as side, count, direction, posture and order, and
     measures each claim on the motion. The verdict is yes, no or cannot tell, with the joint, the
     measured number and the time. Without text=, motions are judged by their own texts. Writes a
     player whose timeline marks the evidence. Exits with code 3 if a claim is false. See

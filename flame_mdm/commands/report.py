@@ -16,7 +16,7 @@ class ReportSettings(BodySettings):
     """usage: flame-mdm report RUN ...
 
     Writes report.html into a run directory: curves, newest samples, evaluations and provenance on one page that needs
-    no server and no network. Training also writes it at the end.
+    neither a server nor a network. Training also writes it at the end.
     """
 
     OBJECTS: ClassVar = ("runs",)
@@ -24,7 +24,7 @@ class ReportSettings(BodySettings):
 
 
 def main(settings: ReportSettings) -> None:
-    """Writes the page of each run."""
+    """Writes the page for each run."""
     for folder in settings.runs:
         check_run(Path(folder))
     body = settings.read_body()

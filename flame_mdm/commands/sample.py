@@ -202,7 +202,7 @@ def main(settings: SampleSettings) -> None:
 
 
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
-    """Samples and writes the motions of a request.
+    """Samples and writes the motions for a request.
 
     Prompts in a file that the model cannot sample are refused.
     """
@@ -347,7 +347,7 @@ def _folders(
     model: MotionGenerator,
     motions: Sequence[Motion],
 ) -> dict[Path, list[Motion]]:
-    """Returns the folders to write, with the motions of each folder.
+    """Returns the folders to write, with the motions in each folder.
 
     A prompt that is listed twice has a single folder.
     """

@@ -1,4 +1,4 @@
-"""Server of the demo: the page, motion files, and limits.
+"""The demo's server: page, motion files, and limits.
 
 It requires the extra `demo` (gradio).
 """
@@ -100,7 +100,7 @@ class Server(uvicorn.Server):
 
 
 def source(name: str) -> str:
-    """Returns the text of a file next to this one."""
+    """Returns the content of a file in the folder of this module."""
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
@@ -185,7 +185,7 @@ def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
                 raise UserError(f"motion={one_line(number[:20])}: not a motion number")
             request = parse_query([pair for pair in pairs if pair[0] not in options])
             async with writers.turns:
-                await web.body()  # a disconnection is only reported after the body
+                await web.body()  # a disconnection is reported only after the body
                 if await web.is_disconnected():
                     return Response(status_code=499)
                 content = await run_in_threadpool(

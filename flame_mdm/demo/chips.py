@@ -27,7 +27,7 @@ def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Readin
     Args:
         abilities: the actions and attributes that the model knows. They are the options of the
             chips.
-        parts: words and seconds of the parts of the text.
+        parts: words and seconds for each part of the text.
         readings: the meaning of each part.
     """
     rows = []

@@ -18,12 +18,12 @@ class ConnectionLimits:
     A connection is *waiting* until the headers of a request are complete, and again after the
     response. When the maximum number of connections is reached, a new connection replaces the
     connection that has waited longest. If no connection is waiting, the request of the new
-    connection gets status 503.
+    connection receives status 503.
 
     Attributes:
         total: maximum number of open connections.
-        per_address: maximum number of open connections per address, or per IPv6 network of 64
-            bits.
+        per_address: maximum number of open connections per address, or per 64-bit IPv6
+            network.
         header_seconds: maximum waiting time of a connection, regardless of how many bytes of the
             headers arrive.
         idle_seconds: maximum waiting time after a response, if nothing arrives.
@@ -121,7 +121,7 @@ class Connection(H11Protocol):
             self.deadline = None
 
     def _make_room(self, group: "list[Connection]", limit: int) -> None:
-        """Closes the connections of a group that have waited longest, down to the limit."""
+        """Closes the longest-waiting connections in a group until the group is within the limit."""
         excess = len(group) - limit
         if excess <= 0:
             return

@@ -28,7 +28,7 @@ READ = re.compile(
     r"|/live\.(html|bvh|glb)|/gradio_api/(queue/data|heartbeat/\w{1,40})",
     re.ASCII,
 )
-"""Paths that the page reads with GET."""
+"""Paths that the page requests with GET."""
 STREAM = "/gradio_api/queue/data"
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
@@ -37,7 +37,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
 }
-"""Headers of every response.
+"""Headers in every response.
 
 Nothing is loaded from other servers, and only Hugging Face may show the page in a frame.
 """

@@ -27,7 +27,7 @@ from flame_mdm.sampling.resolution import resolve
 KEPT = 64
 # Maximum number of seconds for which a request may occupy the model
 TIME_LIMIT = 300.0
-# Formats of downloads, and their names on the page
+# Download formats, and their names on the page
 FORMATS = {
     ".bvh": "BVH",
     ".fbx": "FBX",
@@ -38,7 +38,7 @@ FORMATS = {
 
 
 class Studio:
-    """Generates the motions of requests, only with the models in `sources`.
+    """Generates the motions for requests, using only the models in `sources`.
 
     A source is an argument of `load`, or "MODEL + ADAPTER".
     """
@@ -87,7 +87,7 @@ class Studio:
         report: Callable[[int], None] = lambda calls: None,
         stop: Event | None = None,
     ) -> Sequence[Motion]:
-        """Returns the motions of a request, from memory if possible.
+        """Returns the motions for a request, from memory if possible.
 
         `report` is called with the number of network calls.
         """
@@ -131,7 +131,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request, in which a sentence with several actions becomes a sequence.
+        """Returns the request after turning a sentence with several actions into a sequence.
 
         Raises the same errors as `generate`.
         """

@@ -54,7 +54,7 @@ PROGRAMS = {
     "Mixamo FBX": ("fbx", "&amp;rig=mixamo"),
     "Mixamo GLB": ("glb", "&amp;rig=mixamo"),
 }
-"""Buttons for programs: the file ending, and the skeleton in the address of the file.
+"""Buttons for programs: the file extension, and the skeleton in the address of the file.
 
 Other formats are under "More".
 """

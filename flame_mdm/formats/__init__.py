@@ -16,7 +16,7 @@ ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
 TREES = (".bvh", ".amc")
 # Universal Scene Description
 USD = (".usda", ".usdc", ".usdz")
-# Endings of files that can be written with the skeleton of another program
+# Extensions of files that can be written with the skeleton of another program
 RIGGED = (".bvh", ".glb", ".fbx", *USD)
 # Extensions of the files that `Motion.save` writes
 WRITTEN = (
@@ -42,7 +42,7 @@ ADVICE = {
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
 """Suffixes of AMASS files that contain a body shape but no motion."""
-# Name of the array of joints, which only motions in JSON contain
+# Name of the joint array, which occurs only in JSON files that contain a motion
 JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 
 

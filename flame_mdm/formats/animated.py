@@ -1,4 +1,4 @@
-"""Animated node hierarchies of FBX and GLB files: the positions of all nodes in each frame.
+"""Animated node hierarchies in FBX and GLB files: the positions of all nodes in each frame.
 
 Only the positions are used, and the rotations of the motion are computed from them. Therefore, the
 rest pose need not be a T-pose, and the local axes, which differ between programs, do not matter.

@@ -66,7 +66,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     else:
         data = _read_json(path)
 
-    if "posed_joints" in data:  # a file of NVIDIA's Kimodo, which does not contain its frame rate
+    if "posed_joints" in data:  # a file from NVIDIA's Kimodo, which contains no frame rate
         data = {"fps": 30.0, **data, "joints": data["posed_joints"]}
     if "poses" not in data and set(BODY) <= data.keys():
         data["poses"] = _joined([data[name] for name in BODY])

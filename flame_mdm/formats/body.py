@@ -23,7 +23,7 @@ WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)
 # Limits on the length scale of all other parts, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
-ORTHONORMAL = 0.1  # maximum error of the dot products between rows of a rotation matrix
+ORTHONORMAL = 0.1  # maximum error in the dot products between rows of a rotation matrix
 LIMBS = tuple(
     JOINT[f"{side}_{name}"]
     for side in ("left", "right")
@@ -54,7 +54,7 @@ class PosedFigure(Figure):
         return solve(joints, self.fps)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns the body of `fit_body` and "".
+        """Returns the body from `fit_body` and "".
 
         If no body fits, returns None and the reason why this motion is drawn as a skeleton.
         """
@@ -158,7 +158,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _check_rotations(world: np.ndarray) -> None:
-    """Raises `UserError` if a matrix of (F, 22, 3, 3) is not finite or not nearly a rotation."""
+    """Raises `UserError` if a matrix in (F, 22, 3, 3) is not finite or not nearly a rotation."""
     products = world @ world.mT
     near = (np.abs(products - np.eye(3)) < ORTHONORMAL).all((2, 3))
     mirrored = (np.cross(world[..., 0, :], world[..., 1, :]) * world[..., 2, :]).sum(-1) < 0

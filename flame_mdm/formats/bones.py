@@ -23,7 +23,7 @@ from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
-# Rotations agree with positions up to this mean distance between joints, in meters
+# Rotations agree with positions if the mean distance between joints, in meters, is at most this
 APART = 0.03
 # Maximum angle, as a cosine, between a limb of a known skeleton in its T-pose and SMPL's limb
 ALIKE = np.cos(np.radians(30))

@@ -146,7 +146,7 @@ def read(path: str | Path) -> Bvh:
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
         source.fail("not a BVH file (it must begin with HIERARCHY)")
     nodes: list[_Node] = []
-    blocks: list[int] = []  # numbers of the nodes whose braces are open
+    blocks: list[int] = []  # indices of the nodes whose braces are open
 
     while (keyword := source.word().upper()) != "MOTION":
         parent = blocks[-1] if blocks else -1

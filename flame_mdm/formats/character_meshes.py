@@ -15,7 +15,7 @@ from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
 # Mode of a primitive with triangles
 TRIANGLES = 4
-# Maximum number of vertices of a character
+# Maximum number of vertices in a character
 MAX_VERTICES = 2_000_000
 # Maximum size of an image file in bytes
 MAX_IMAGE = 64 * 2**20

@@ -98,7 +98,7 @@ def _read_bvh(path: Path) -> BvhCharacter:
 
 
 def _order(channels: Sequence[str]) -> str:
-    """Returns the axes of the rotation channels of a joint, such as ZXY."""
+    """Returns the axes of a joint's rotation channels, such as ZXY."""
     return "".join(name[0] for name in channels if name.endswith("rotation"))
 
 
@@ -165,7 +165,7 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     pose, the pelvis, which is nearly upright, determines how the coordinates of the skin are turned.
     """
     # If the file is stored in the bind pose, joint matrix times inverse bind matrix is the same
-    # for all joints. Otherwise, this product of the pelvis, with its rotation rounded to quarter
+    # for all joints. Otherwise, this product for the pelvis, with its rotation rounded to quarter
     # turns, is used as the frame of the skin. The bind matrices then determine the pose of all joints.
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}

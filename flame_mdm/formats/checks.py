@@ -116,7 +116,7 @@ def below_floor(joints: np.ndarray) -> str:
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:
-    """Returns the number of frames before a motion that show a rest pose or lead from it.
+    """Returns the number of frames before a motion that show a rest pose or a transition from it.
 
     Several programs write a T-pose or A-pose as the first frame. In a recorded motion that begins
     with a rest pose, the first step is not longer than the following steps.

@@ -48,7 +48,7 @@ REACH = 0.999
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
     """Returns a motion with smooth joints, constant bone lengths and feet that do not slide.
 
-    `cleanup` describes the changes of the joints. The result has no features, rotations or
+    `cleanup` describes the changes to the joints. The result has no features, rotations or
     contacts, because they would no longer match the joints.
 
     Args:
@@ -81,7 +81,7 @@ def cleanup(
     """Removes pops, changes in bone lengths, foot sliding, and hands inside the body.
 
     Args:
-        joints: (F, J, 3) in meters, y up. Motions of fewer than 4 frames are returned unchanged.
+        joints: (F, J, 3) in meters, y up. Motions with fewer than 4 frames are returned unchanged.
         fps: frames per second.
         skeleton: skeleton of the joints.
         contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor until the next
@@ -175,7 +175,7 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
     """Bends limbs whose foot or hand has moved down because bone lengths have changed.
 
-    Between two very different poses of a sequence, for example from a crawl to a walk, the poses
+    Between two very different poses in a sequence, for example from a crawl to a walk, the poses
     are averages of both and have short bones. With full lengths, they would reach through the
     floor.
     """
@@ -201,7 +201,7 @@ def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> n
     The confidence of a frame refers to the time until the next frame. `toes` are (F, 2, 3).
     """
     # A toe is on the floor if it is both low and slow. The faster the body travels, the faster a
-    # toe may slide, because feet of generated motions are carried along with the body.
+    # toe may slide, because feet in generated motions are carried along with the body.
     speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     travel = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1) * fps
     travel = gaussian_filter1d(travel, 0.15 * fps, mode="nearest")

@@ -125,10 +125,10 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
 
 
 def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
-    """Transfers a motion to the body of an adult. The path is scaled by the leg length.
+    """Transfers a motion to an adult body. The path is scaled by the leg length.
 
     Args:
-        body: the motion on the bones of its own body.
+        body: the motion with the bones of its own body.
         joints: (F, 22, 3), joints of the motion in meters.
 
     Returns:

@@ -258,7 +258,7 @@ def _write_record(content: bytearray, record: Record) -> None:
 
 
 def _packed(value: Any) -> bytes:
-    """Returns the bytes of a property."""
+    """Returns a property as bytes."""
     if isinstance(value, bool | np.bool_):
         return b"C" + struct.pack("<?", value)
     if isinstance(value, Short):

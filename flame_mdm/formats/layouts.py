@@ -95,7 +95,7 @@ class Layout(BaseModel):
     def bones(self) -> Mapping[str, str]:
         """Bones that SMPL's joints follow, by joint.
 
-        The map of positions may use means of several joints instead.
+        The position map may use the mean of several joints instead.
         """
         return self._bones
 
@@ -401,7 +401,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
         joints: (F, 22, 3), SMPL's joints in meters.
         unit: unit of the file, in meters.
         children: whether bodies may be children.
-        doubt: a line about another problem of the motion, for the message.
+        doubt: a line about another problem with the motion, for the message.
 
     Raises:
         UserError: If the leg length is not a person's. The message suggests a unit.
@@ -437,7 +437,7 @@ def _usual_unit(leg: float, unit: float) -> str:
 
 
 # Fraction of the frames in which the toes of both feet point backwards. Above this fraction, left
-# and right are exchanged.
+# and right are swapped.
 BACKWARDS = 0.25
 
 
@@ -456,7 +456,7 @@ def check_feet(joints: np.ndarray) -> None:
             )
     # The toes of a foot in the air may point backwards, for example in a run. Therefore, only the
     # lower foot of each frame counts. The toes of one foot of a kneeling person also point
-    # backwards. Therefore, left and right count as exchanged only if both feet point backwards in
+    # backwards. Therefore, left and right count as swapped only if both feet point backwards in
     # enough frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [

@@ -62,7 +62,7 @@ def spellings(name: str, opposite: str) -> list[str]:
 
 
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Returns a mapping from all spellings that `spellings` returns to the names.
+    """Returns a mapping from each spelling (see `spellings`) to its name.
 
     If two names have the same spelling, it refers to the name that is spelled exactly like it.
 
@@ -86,7 +86,7 @@ def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]])
     the order. If several prefixes match equally well, the match is ambiguous.
 
     Args:
-        names: names of the joints of a file, at least one name.
+        names: joint names in a file, at least one.
         skeletons: for each skeleton, a mapping from spellings of a joint to the skeleton's name of
             the joint. The first spelling is preferred.
     """

@@ -62,7 +62,7 @@ HEADS = {
     "foot": "toe2-1",
     "shoulder": "upperarm01",
 } | {**{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}}
-"""For each SMPL joint, the bone of Anny that begins there."""
+"""For each SMPL joint, Anny's bone that begins there."""
 CLOTHES = {
     "neck": SKIN,
     "head": SKIN,

@@ -11,7 +11,7 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 UPRIGHT = np.cos(np.radians(30))
 STANDING = 0.02  # maximum height in meters of a flat foot above its lowest position
 TOES = (0.02, 0.09, np.radians(60))
-"""Limits of the bend of the toes.
+"""Limits of the toe bend.
 
 Toes stay flat while the toe joint is below the first height, and follow the foot above the second
 height. The third number is the maximum bend.
@@ -34,9 +34,9 @@ def complete(
         The rotation (22, 3, 3) of each body part in the rest pose, the world rotations (F, 22, 3,
         3) of the parts, and the offsets (22, 3) of a body that stands on flat feet.
     """
-    # A person who stands upright looks straight ahead. Therefore, the median direction from neck to
-    # head, relative to an upright chest, is the direction of a level head. The toes stay flat on
-    # the floor while the heel rises.
+    # A person standing upright is assumed to look straight ahead. Therefore, the median direction
+    # from neck to head, relative to an upright chest, is the direction of a level head. The toes
+    # stay flat on the floor while the heel rises.
     neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
     for side in ("left", "right"):
         ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]

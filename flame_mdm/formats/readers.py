@@ -1,7 +1,7 @@
 """The reader for motion files. Writers are in `flame_mdm.formats.motion`.
 
 `docs/formats.md` describes the files. Commands, data sets and Python all use this reader, so that a
-file always gets the same skeleton, frame rate and checks.
+file always has the same skeleton, frame rate and checks.
 """
 
 import math
@@ -76,7 +76,7 @@ class Doubts:
 
     Attributes:
         upright: mean vertical component of the trunk direction, from -1 to 1. The value is NaN (not
-            measured) for files of this project and for KIT-ML's skeleton.
+            measured) for files from this project and for KIT-ML's skeleton.
         lying: a message if the body is lying, otherwise "".
         jump: a message if the body jumps or a leg flips, otherwise "".
     """
@@ -451,7 +451,7 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: str) -> None:
-    """Raises `UserError` if the file has a key that cannot have an effect on it."""
+    """Raises `UserError` if a key is set that has no effect on the file."""
     for key in without_effect:
         if key in fields:
             raise UserError(

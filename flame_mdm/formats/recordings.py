@@ -21,7 +21,7 @@ TRIAL = re.compile(r"(?<!\d)(\d{2,3})_\d{2,3}(?!\d)")
 
 
 def is_at_60(trial: str) -> bool:
-    """Returns whether CMU lists a recording, such as 60_01, with 60 frames per second."""
+    """Returns whether CMU lists a recording, such as 60_01, at 60 frames per second."""
     return not {trial, trial.partition("_")[0]}.isdisjoint(AT_60)
 
 

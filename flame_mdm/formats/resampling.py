@@ -12,7 +12,7 @@ from flame_mdm.errors import UserError
 
 # Lowest and highest frame rate of a motion file, in frames per second
 RATES = (0.1, 1000.0)
-# Maximum number of frames of a motion: 70 minutes at 120 frames per second
+# Maximum number of frames in a motion: 70 minutes at 120 frames per second
 MAX_FRAMES = 500_000
 # Maximum number of frames times joints of a tree: one hour with 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000

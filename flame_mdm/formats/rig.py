@@ -324,9 +324,9 @@ def follow(
         Rotations (F, J, 3, 3) and positions (F, J, 3) of the character, and its skeleton.
     """
     # All joints take the rotations of the body, relative to the rest poses. The hips follow the
-    # scaled path. Legs with other proportions would then hover or sink. Therefore, each leg is bent
-    # until its toes or its ankle reach the scaled position, at the character's own height above the
-    # floor.
+    # scaled path. Legs with different proportions would then hover or sink. Therefore, each leg is
+    # bent until its toes or its ankle reach the scaled position, at the character's own height
+    # above the floor.
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)
     neutral[JOINT["neck"]] = neutral[JOINT["head"]]

@@ -22,7 +22,7 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 EXTENSION = "VRMC_vrm_animation"
 LIMBS = {"shoulder": (1, 0, 0), "elbow": (1, 0, 0), "hip": (0, -1, 0), "knee": (0, -1, 0)}
-"""For each joint of the left side, the direction of the bone that begins there in VRM's T-pose."""
+"""For each joint on the left side, the direction of the bone that begins there in VRM's T-pose."""
 
 
 def rest_rig(poses: Poses) -> Rig:

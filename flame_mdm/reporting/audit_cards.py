@@ -1,4 +1,4 @@
-"""Cards of evaluator audits: one page per extractor and data set, or two cards side by side."""
+"""Cards for evaluator audits: one page per extractor and data set, or two cards side by side."""
 
 from __future__ import annotations
 

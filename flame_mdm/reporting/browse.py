@@ -94,8 +94,8 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip with several captions gets the first caption that no earlier clip has, so that captions
-    are unique if possible.
+    A clip with several captions is given the first caption that no earlier clip has, so that
+    captions are unique if possible.
 
     Args:
         folder: the folder to write.

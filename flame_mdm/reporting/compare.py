@@ -212,7 +212,7 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD`: the differences of all metrics of two results, or the reason why there is no comparison.
+    """Returns rows for `HEAD` with the differences in all metrics, or why there is no comparison.
 
     Both results must come from the same evaluation: the same protocol, data and extractor.
     """

@@ -19,7 +19,7 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 ROW = 16
 # Maximum number of segments per curve. The lowest and highest point of each segment are drawn.
 MOST = 300
-LOG_RANGE = 15  # positive values get a logarithmic axis if they span more than this factor
+LOG_RANGE = 15  # positive values have a logarithmic axis if they span more than this factor
 COLORS = 8
 # Numbers closer to 0 than this are treated as 0 on axes, because steps between ticks would
 # underflow

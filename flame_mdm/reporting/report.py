@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
-"""Training curves of speed and optimization, which are not losses."""
+"""Training curves for speed and optimization, which are not losses."""
 
 
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:

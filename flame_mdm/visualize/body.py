@@ -62,7 +62,7 @@ class Figure:
     contacts: np.ndarray | None = field(default=None, kw_only=True)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns a body that moves like the joints and "", or None and why no body fits.
+        """Returns the fitted body and "", or None and the reason why no body fits.
 
         Without a body, a skeleton is drawn instead.
 
@@ -104,7 +104,7 @@ class Mesh:
 
     Attributes:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
-        weights: (V, 28) weights of SMPL's 22 joints and of `HELPERS`. At most four weights per
+        weights: (V, 28) weights for SMPL's 22 joints and for `HELPERS`. At most four weights per
             point are not 0.
         triangles: (T, 3), counterclockwise as seen from outside.
         turns: (28, 3, 3), world rotation of each bone from SMPL's rest pose to the stored pose.
@@ -145,7 +145,7 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def mannequin() -> Mesh:
-    """Returns the body that the package contains, the mannequin."""
+    """Returns the mannequin, the body that is part of the package."""
     return Mesh(MANNEQUIN)
 
 
@@ -171,13 +171,13 @@ class FittedBody:
     neutral: np.ndarray
     # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
     turns: np.ndarray
-    # (F, B, 3), start of each bone: the joints of the motion, lifted
+    # (F, B, 3), starting point of each bone: the joints of the motion, raised by `lift`
     starts: np.ndarray
     # Height in meters of the body's joints above the motion's joints: the thickness of the sole
     lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the vertices and normals (V, 3) of a frame, by linear blend skinning."""
+        """Returns the vertices and normals (V, 3) of a frame, computed by linear blend skinning."""
         turns = self.turns[frame]
         moves = self.starts[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
         blended = self.mesh.weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)

@@ -35,7 +35,7 @@ def write_player(
         path: the .html file.
         motions: the motions to play.
         title: title of the page.
-        options: additional options of `player_page`.
+        options: additional options for `player_page`.
 
     Example:
         >>> write_player("walk.html", [motion], title="A walk")  # doctest: +SKIP
@@ -139,7 +139,7 @@ def _packed(
 
 
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
-    """Returns proportions, and a quaternion of 32 bits for each frame and bone.
+    """Returns proportions, and a 32-bit quaternion for each frame and bone.
 
     The quaternions are exact to about 0.1 degrees. The two highest bits state which of x, y, z and
     w is largest. The three other components, from -0.71 to 0.71, follow with 10 bits each.

@@ -35,7 +35,7 @@ TOWARD = np.array(
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
 # Code of the HD color space, which players assume for large videos that declare no color space
 BT709 = 1
-SMOOTH = 2  # images are drawn larger by this factor and then reduced
+SMOOTH = 2  # images are drawn larger by this factor and then downscaled
 
 
 def write_gif(

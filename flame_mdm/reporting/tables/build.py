@@ -132,7 +132,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
 
 
 def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
-    """Returns the footnote letter of the conditions of a row.
+    """Returns the footnote letter for the conditions of a row.
 
     New conditions are added to `conditions`.
     """
@@ -256,7 +256,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Returns a text with the numbers of motions and replications of most values.
+    """Returns a text with the numbers of motions and replications for most values.
 
     The number of real motions is added if it is different.
     """
@@ -344,7 +344,7 @@ def _line(
 
 
 def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
-    """Returns the numbers of replications and motions of most metrics, and the exceptions."""
+    """Returns the numbers of replications and motions for most metrics, and the exceptions."""
     counts = {}
     for result, name in zip(results, values, strict=True):
         entry = (result.values or {}).get(name) if result else None

@@ -274,8 +274,8 @@ def _inert(text: str) -> str:
 def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG. Returns None if the figure has no points.
 
-    Curves are labeled with the names of the rows. Curves of reported values are dashed. In a column
-    whose best value is the value of real motions, this value is a dotted line.
+    Curves are labeled with the names of the rows. Curves of reported values are dashed. If the
+    best value of a column is the value of real motions, this value is drawn as a dotted line.
     """
     panels = []
     for column in figure.y:

@@ -366,7 +366,7 @@ REFUSED = {
     "large claim": (claim(2**31), "arrays take more than"),
     "short array": (claim(10), "an array has"),
     "unknown encoding": (claim(10, 9), "unknown encoding 9"),
-    "nested": (nested(), "nested"),
+    "nested": (nested(), "nesting levels"),
 }
 
 

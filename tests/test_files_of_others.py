@@ -272,7 +272,7 @@ def test_legs_that_flip_are_noticed(tmp_path: Path):
     flipped = replace(flipped, fps=60.0)
     np.savez(tmp_path / "a.npz", joints=flipped.joints, fps=60)
     np.savez(tmp_path / "b.npz", joints=motion.joints, fps=60)
-    assert any("a leg flips, it moves at" in note for note in read(tmp_path / "a.npz").notes)
+    assert any("a leg flips: it moves at" in note for note in read(tmp_path / "a.npz").notes)
     source = Folder(str(tmp_path), workers=1)
     assert [clip.id for clip in source.clips(20.0)] == ["b"]
     assert "a leg flips" in source.failures[0]

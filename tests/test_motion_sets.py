@@ -351,7 +351,7 @@ def test_an_invalid_description_is_refused_in_one_line(
             "out=walk.fbx: a set consists of several files. Use a folder",
         ),
         (["set=locomotion", "format=bvh"], 'format is "bvh"'),
-        (["text=a person walks", "format=fbx"], "format=fbx is for sets"),
+        (["text=a person walks", "format=fbx"], "format=fbx applies only to sets"),
     ],
 )
 def test_keys_that_do_not_fit_a_set_are_refused(

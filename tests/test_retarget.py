@@ -318,7 +318,7 @@ def test_names_of_joints_are_read_from_a_file(
             {"left_knee": "Rig Bone-r_flac"},
             r"hero\.yaml: Rig Bone-r_flac is listed for left_knee and for another",
         ),
-        ({"left_knee": None}, r"no joint found for left_knee\. Write"),
+        ({"left_knee": None}, r"no joint found for left_knee\. Add"),
         ({"left_knee": "Rig Bone-l_hgiht", "left_hip": "Rig Bone-l_eflac"}, "upright|has no joint"),
     ):
         with subtests.test(other=other, message=message):

@@ -168,7 +168,10 @@ def test_training_starts_from_the_weights_of_another_model(tiny, trained, tmp_pa
     ("source", "says"),
     [
         ("absent/run.ckpt", "initial_weights=absent/run.ckpt: no such checkpoint"),
-        ("motion_clip_synthetic", "initial_weights=motion_clip_synthetic: no weight matches a weight"),
+        (
+            "motion_clip_synthetic",
+            "initial_weights=motion_clip_synthetic: no weight matches a weight",
+        ),
     ],
 )
 def test_initial_weights_that_cannot_be_used_are_refused(tiny, capsys, source, says):

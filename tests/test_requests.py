@@ -103,6 +103,24 @@ def test_prompts_have_parts_frames_and_unknown_words(model):
     assert warning == "'a man walks forward | jumps moonily': not understood: moonily"
 
 
+@pytest.mark.parametrize(
+    ("text", "options", "frames"),
+    [
+        ("a person kicks once with the left leg", {}, (30,)),
+        ("a person jumps twice", {}, (44,)),
+        ("a person claps three times", {}, (58,)),
+        ("a person jumps", {}, (60,)),
+        ("a person jumps twice", {"seconds": 1.5}, (30,)),
+        ("jumps twice, then walks", {}, (44, 50)),
+        ("jumps twice @1 | kicks once | walks", {}, (20, 30, 50)),
+        ("a person waves while walking", {}, (60,)),
+    ],
+)
+def test_a_motion_with_a_count_is_as_long_as_its_repetitions(text, options, frames):
+    resolved = resolve(SamplingRequest(texts=text, **options), flame_mdm.load("package"))
+    assert resolved.prompts[0].frames == frames
+
+
 def test_notes_on_the_motion_to_continue_are_warnings(model, tmp_path):
     """Joints that lie, for y is said to be up."""
     joints = synthetic("walk").joints[:, :, [0, 2, 1]] * np.array([1, -1, 1], np.float32)

@@ -97,7 +97,9 @@ def reading(reader: Reader, text: str) -> dict[str, Any]:
         return {"refused": str(error), "nearest": ()}
     predicates = [predicate(mention) for step in reading.steps for mention in step]
     names = ("captions", "texts", "changes", "ignored")
-    return {name: read[name] for name in names} | {"predicates": predicates}
+    seconds = min(3, next(iter(reading.seconds()), None) or 3)
+    added = {"predicates": predicates, "seconds": seconds}
+    return {name: read[name] for name in names} | added
 
 
 def plain(content: Any) -> Any:

@@ -51,6 +51,7 @@ from flame_mdm.formats.posture import TOES
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_npz, write_json, write_text
+from flame_mdm.sampling.motion_request import USUAL_SECONDS
 from flame_mdm.sampling.streams import check_streams
 from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
@@ -184,6 +185,9 @@ def language_constants() -> dict[str, Any]:
         "words_of_values": abilities.WORDS_OF_VALUES,
         "attributes": reading.ATTRIBUTES,
         "longest_count": reading.LONGEST_COUNT,
+        "start_and_end": reading.START_AND_END,
+        "repetition": reading.REPETITION,
+        "usual_seconds": USUAL_SECONDS,
         "shown": SHOWN,
     }
 

@@ -1,7 +1,7 @@
 """Requests to the demo, within the limits of a public page, with links and equivalent Python programs."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, urlencode
 
@@ -16,7 +16,12 @@ from pydantic import (
 )
 
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
-from flame_mdm.sampling.motion_request import path_targets, read_parts, read_path
+from flame_mdm.sampling.motion_request import (
+    USUAL_SECONDS,
+    path_targets,
+    read_parts,
+    read_path,
+)
 
 # Limits of a request, so that a visitor cannot occupy the machine for minutes
 MAX_TEXT = 300
@@ -76,7 +81,7 @@ class DemoRequest(BaseModel):
     model_config = RULES
     model: str = "package"
     text: Text = ""
-    seconds: Annotated[float, Field(gt=0, le=MAX_SECONDS)] = 3.0
+    seconds: Annotated[float, Field(gt=0, le=MAX_SECONDS)] | None = None
     samples: Samples = 1
     seed: Seed = 0
     guidance_scale: float | None = None
@@ -98,7 +103,11 @@ class DemoRequest(BaseModel):
     def targets(self, kind: str) -> dict[str, Any]:
         """Returns the targets of `flame_mdm.generate` along the path, for a model trained on `kind`."""
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
-        return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
+        return path_targets(self.path, self.total_seconds(parts))
+
+    def total_seconds(self, parts: Sequence[tuple[str, float | None]]) -> float:
+        """Returns the duration of all parts. A part without a duration counts as `USUAL_SECONDS`."""
+        return sum(seconds or self.seconds or USUAL_SECONDS for _, seconds in parts)
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
         """Returns the steps: for each step, the index of the motion to edit, and keywords for `generate` or `edit`.
@@ -109,13 +118,16 @@ class DemoRequest(BaseModel):
             include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True
         )
         path = {"targets": self.targets(kind)} if self.path else {}
+        # The waypoints of a path are spread over this duration.
+        seconds = self.seconds or (USUAL_SECONDS if self.path else None)
+        duration = {} if seconds is None else {"seconds": seconds}
         split = {} if self.split else {"split": False}
 
         def keywords(part: DemoRequest | DemoEdit, text: str, **others: Any) -> dict[str, Any]:
             condition = {} if kind == "none" or not text else {f"{kind}s": text}
             return {**condition, **others, "samples": part.samples, "seed": part.seed, **shared}
 
-        first = keywords(self, self.text, seconds=self.seconds, **split, **path)
+        first = keywords(self, self.text, **duration, **split, **path)
         steps: list[tuple[int | None, dict[str, Any]]] = [(None, first)]
         for part in self.edits:
             options = {"region_seconds", "joints", "strength"}

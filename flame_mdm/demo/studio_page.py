@@ -211,7 +211,9 @@ def _layout(studio: Studio) -> SimpleNamespace:
             ui.files = gr.HTML(elem_id="files")
         with gr.Column(elem_id="options"):
             with gr.Row():
-                ui.seconds = gr.Number(3, label="Seconds", step=0.5, min_width=90)
+                ui.seconds = gr.Number(
+                    None, label="Seconds", placeholder="automatic", step=0.5, min_width=90
+                )
                 ui.seed = gr.Number(0, label="Seed", precision=0, min_width=90)
                 ui.samples = gr.Number(1, label="Samples", precision=0, min_width=90)
             with gr.Accordion("Model and sampling", open=len(names) > 1):

@@ -55,7 +55,8 @@ def generate(
         stages: list that receives clean estimates of the first motion, at equal intervals of the
             sampling, and then the motion itself (MFM, figure 5).
         keywords: number and length of the motions, and sampling options: `actions` (instead
-            of texts), `seconds` or `frames` (default: 3 seconds), `samples` (1) per text,
+            of texts), `seconds` or `frames` (default: 3 seconds, or less for one or two
+            repetitions, as in "kicks twice"), `samples` (1) per text,
             `candidates` (1) per sample, `seed` (0), `after`, `split` (True), `loop` (False),
             `targets` or `path`, `shared_noise` (False), `cleanup` (False), and `guidance_scale`,
             `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the model's).

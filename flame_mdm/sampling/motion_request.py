@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 MAX_SAMPLES = 10_000
 # Maximum number of characters in a text. Captions in the data sets are far shorter.
 MAX_TEXT_LENGTH = 2000
+# Duration in seconds of a motion or a part, if neither the request nor a number of repetitions
+# determines it
+USUAL_SECONDS = 3.0
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
     "action": ("was trained on action labels", "action=NAME"),
@@ -185,8 +188,9 @@ class SamplingRequest:
     seconds: float | Sequence[float] | None = option(
         None,
         "length of the motion in seconds, or a list with one length per text. In a sequence, the "
-        "length of each part whose text does not state its own (as @2 does). Default: 3, or the "
-        "length of the longest training motion if that is shorter",
+        "length of each part whose text does not state its own (as @2 does). Default: the "
+        "time that a stated number of repetitions takes; otherwise 3, or the length of the longest "
+        "training motion if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
         None, "length in frames, or a list of lengths, instead of seconds"

@@ -16,6 +16,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.motion_request import (
     TRAINED_ON,
+    USUAL_SECONDS,
     SamplingRequest,
     is_timed,
     path_targets,
@@ -161,7 +162,7 @@ def _usual_frames(
     parts = len(prompt.parts)
     if requested is not None or not prompt.fitting:
         return [requested] * parts
-    longest = min(3 * model.representation.fps, model.facts["max_frames"])
+    longest = min(USUAL_SECONDS * model.representation.fps, model.facts["max_frames"])
     return [
         None if seconds is None else min(seconds * model.representation.fps, longest)
         for seconds in prompt.fitting

@@ -8,7 +8,7 @@ import torch
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, cover, spans
-from flame_mdm.sampling.motion_request import Part, SamplingRequest
+from flame_mdm.sampling.motion_request import USUAL_SECONDS, Part, SamplingRequest
 
 # Duration that neighboring windows share, in seconds; see docs/sequences.md
 OVERLAP = 0.5
@@ -42,7 +42,7 @@ def part_frames(
         text: the prompt, for messages.
         parts: its parts, with their durations in seconds if the prompt states them.
         usual: for each part, its number of frames, not rounded, if the prompt states no duration.
-            None = 3 seconds, or as many frames as fit into one window if that is less.
+            None = `USUAL_SECONDS`, or as many frames as fit into one window if that is less.
         is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
         loop: whether the last frame leads to the first one.
 
@@ -54,7 +54,7 @@ def part_frames(
         return _sequence_frames(model, text, parts, usual, loop)
 
     (frames,) = usual
-    length = min(round(3 * fps), longest) if frames is None else round(frames)
+    length = min(round(USUAL_SECONDS * fps), longest) if frames is None else round(frames)
     shown = f"{length / fps:g} seconds ({length} frames)"
     if length < 2:
         raise UserError(f"{shown} are too short. Use at least {2 / fps:g} seconds")
@@ -76,7 +76,9 @@ def _sequence_frames(
 ) -> list[int]:
     fps, shared = model.representation.fps, overlap(model)
     window = model.facts["max_frames"] - shared * (loop or len(parts) > 1)
-    default = 3 * fps if model.denoiser.context_frames else min(3 * fps, window)
+    default = USUAL_SECONDS * fps
+    if not model.denoiser.context_frames:
+        default = min(default, window)
     lengths = []
     for (_, seconds), frames in zip(parts, usual, strict=True):
         if seconds is not None:

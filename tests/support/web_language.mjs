@@ -8,7 +8,7 @@ const load = (name) => import(pathToFileURL(`${folder}/${name}`));
 const read = (name) => JSON.parse(readFileSync(`${folder}/${name}`));
 const { useTables } = await load("language_words.js");
 const { understand } = await load("language_sentences.js");
-const { Reader, predicate } = await load("language_reading.js");
+const { Reader, predicate, usualSeconds } = await load("language_reading.js");
 
 const bytes = readFileSync(`${folder}/language.bin`);
 useTables(read("language.json"), bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.length));
@@ -18,7 +18,8 @@ const readers = models.map((facts) => new Reader(facts));
 function readBy(reader, text) {
   try {
     const { steps, ...reading } = reader.read(text);
-    return { ...reading, predicates: steps.flat().map(predicate) };
+    const seconds = usualSeconds({ steps }, { fps: 20, max_frames: 60 });
+    return { ...reading, seconds, predicates: steps.flat().map(predicate) };
   } catch (error) {
     return { refused: error.message, nearest: error.nearest };
   }

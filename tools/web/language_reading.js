@@ -55,6 +55,13 @@ function participle(words) {
   return [forms.at(-1), ...rest].join(" ");
 }
 
+/** Returns the duration in seconds of a reading's first step if the visitor chooses none. */
+export function usualSeconds({ steps: [step = []] }, { fps, max_frames: longest, start }) {
+  const most = start ? constant("usual_seconds") : Math.min(constant("usual_seconds"), longest / fps);
+  const count = step.length === 1 ? step[0].attributes.count : undefined;
+  return count === undefined ? most : Math.min(most, constant("start_and_end") + constant("repetition") * count);
+}
+
 // ---- what a model knows ----
 
 /** Actions and attributes of a model, from its list of actions, its vocabulary and its captions. */

@@ -2,7 +2,7 @@
 import { Sampler, json, words } from "./sampling.js";
 import { longestOf } from "./check.js";
 import { STREAM } from "./models.js";
-import { NotUnderstood } from "./language_reading.js";
+import { NotUnderstood, usualSeconds } from "./language_reading.js";
 import { chips, languageFiles, openLanguage } from "./language.js";
 import { bvh, glb, shown } from "./figure.js";
 import { fbx } from "./fbx.js";
@@ -67,13 +67,14 @@ async function generate() {
     const shownText = reading.captions.length === 1 ? text : reading.texts[0];
     const [read] = reading.captions;
     const begin = performance.now();
-    const x = await sampler.generate(read, seconds, BigInt(seed).toString(), (share) => { element("progress").value = share; }, shownText);
+    const length = Number.isNaN(seconds) ? usualSeconds(reading, sampler.content) : seconds;
+    const x = await sampler.generate(read, length, BigInt(seed).toString(), (share) => { element("progress").value = share; }, shownText);
     const joints = await sampler.decode(x), frames = x.length / sampler.content.features;
     const milliseconds = performance.now() - begin;
     motion = { text: shownText, seed, frames, joints, milliseconds, ...(await sampler.rotations(joints)) };
     const data = JSON.stringify([shown(figure, motion)]).replaceAll("<", "\\u003c");
     element("player").srcdoc = player.replace("__DATA__", () => data);
-    const query = new URLSearchParams({ text, seconds, seed });
+    const query = new URLSearchParams({ text, ...(Number.isNaN(seconds) ? {} : { seconds }), seed });
     history.replaceState(null, "", `#${query}`);
     Object.assign(element("link"), { href: `#${query}`, hidden: false });
     for (const kind of ["bvh", "glb", "fbx"]) element(kind).disabled = false;
@@ -103,7 +104,7 @@ async function open() {
     language = openLanguage(sampler.content, files);
     element("stream").hidden = STREAM === null;
     const { fps, captions } = sampler.content, longest = longestOf(sampler.content), request = new URLSearchParams(location.hash.slice(1));
-    Object.assign(element("seconds"), { min: 2 / fps, max: longest / fps, value: Math.min(3, longest / fps) });
+    Object.assign(element("seconds"), { min: 2 / fps, max: longest / fps });
     element("text").value = captions.find((caption) => caption.startsWith("a person")) ?? captions[0] ?? "";
     for (const field of fields) if (request.get(field.id)) field.value = request.get(field.id);
     element("generate").disabled = false;

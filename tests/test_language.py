@@ -203,9 +203,16 @@ def test_other_languages_are_refused_with_one_line(text):
         Reader(FACTS).read(text)
 
 
-@pytest.mark.parametrize(
-    "text", ["photosynthesis", "a blue grenade on a shelf", "backflip", "climb a ladder"]
-)
+@pytest.mark.parametrize("text", ["photosynthesis", "xyzzy plugh"])
+def test_words_without_a_meaning_are_refused_without_suggestions(text):
+    with pytest.raises(
+        NotUnderstood, match=r"no word says what happens\. Name an action"
+    ) as refusal:
+        Reader(FACTS).read(text)
+    assert refusal.value.nearest == ()
+
+
+@pytest.mark.parametrize("text", ["a blue grenade on a shelf", "backflip", "climb a ladder"])
 def test_a_sentence_without_a_known_action_is_refused_with_three_actions(text, subtests):
     with pytest.raises(NotUnderstood) as refusal:
         Reader(FACTS).read(text)

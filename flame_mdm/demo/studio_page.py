@@ -329,10 +329,14 @@ def _refusal(error: NotUnderstood) -> str:
 
     The nearest actions are shown as buttons with pictures.
     """
-    message = (
-        f'<p class="error" role="alert">{escape(one_line(error.message))}. Nearest in meaning:</p>'
+    message = escape(one_line(error.message))
+    if not error.nearest:
+        return f'<p class="error" role="alert">{message}. Name an action</p>'
+    buttons = _buttons({text: _still(text) for text in error.nearest})
+    return (
+        f'<p class="error" role="alert">{message}. Nearest in meaning:</p>'
+        f'<p class="nearest">{buttons}</p>'
     )
-    return f'{message}<p class="nearest">{_buttons({text: _still(text) for text in error.nearest})}</p>'
 
 
 def _still(text: str) -> str:

@@ -134,12 +134,12 @@ export class Abilities {
     return [...this.actions].sort((one, other) => scores.get(other) - scores.get(one));
   }
 
-  /** Returns captions of three known actions with the meanings nearest to a sentence, or of the first ones. */
+  /** Returns captions of three known actions with the meanings nearest to a sentence. */
   nearest(understood) {
     const words = understood.text.toLowerCase().split(/\s+/u).filter((word) => /^\p{L}+$/u.test(word));
     const ranked = [...understood.nearest, ...nearestTo(words).map(([action]) => action)];
     const known = ranked.filter((action) => this.actions.includes(action));
-    return distinct([...known, ...this.actions]).slice(0, 3).map((action) => caption([{ action }]));
+    return distinct(known).slice(0, 3).map((action) => caption([{ action }]));
   }
 }
 

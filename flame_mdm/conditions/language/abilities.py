@@ -125,10 +125,9 @@ class Abilities:
     def nearest(self, understood: Understanding) -> list[str]:
         """Returns captions of the three known actions that are nearest in meaning to a sentence.
 
-        If no meaning is known, returns captions of the first three known actions.
+        Returns [] if no meaning is known.
         """
         names = [action for action in understood.nearest if action in self.actions]
         ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])
         names += [action for action, _ in ranked if action in self.actions and action not in names]
-        names += [action for action in self.actions if action not in names]
         return [caption((Mention(action),)) for action in names[:3]]

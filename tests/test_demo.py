@@ -194,7 +194,7 @@ def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
     )
     assert (
         error_of(capsys, "demo")
-        == 'error: the demo needs the package gradio. Run pip install "flame-mdm[demo]"'
+        == 'error: the demo requires the gradio package. Run pip install "flame-mdm[demo]"'
     )
 
 

@@ -96,7 +96,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
         (
             b"walks",
             ["mp4=true"],
-            'mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"',
+            'mp4=true: MP4 requires the av package. Run pip install "flame-mdm[video]"',
         ),
         (b"walks", ["text=jumps"], "text and prompts exclude each other. Use only one of them"),
         (

@@ -58,7 +58,7 @@ def motion_file(key: str, source: str) -> None:
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """Prints the errors of the files that failed, if any, and then exits with code 1.
+    """If any motions failed, prints their errors and exits with code 1.
 
     `done` is the verb for the message, such as "converted".
     """
@@ -96,7 +96,7 @@ def video(key: str, requested: bool) -> None:
     """Checks that MP4 files can be written."""
     if requested and find_spec("av") is None:
         raise UserError(
-            f'{key}=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF'
+            f'{key}=true: MP4 requires the av package. Run pip install "flame-mdm[video]", or write a GIF'
         )
 
 
@@ -189,7 +189,7 @@ def read_motions(
 
 @dataclass(frozen=True, kw_only=True)
 class BodySettings:
-    """The body in pictures, pages and files."""
+    """Key that selects the body in pictures, pages and files."""
 
     body: str = option(
         "mannequin",
@@ -198,7 +198,7 @@ class BodySettings:
     )
 
     def read_body(self) -> Mesh | None:
-        """Reads `body`; None = the default body, the mannequin."""
+        """Reads `body`. Returns None for the default body, the mannequin."""
         if self.body == "mannequin":
             return None
         from flame_mdm.formats.people import load_body
@@ -252,7 +252,7 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model for sampling, and the body to draw. A body of None is the mannequin."""
+    """A model for sampling, and the body to draw. None stands for the mannequin."""
 
     model: MotionGenerator
     body: Mesh | None
@@ -348,7 +348,7 @@ class DataSettings:
 
     def __post_init__(self) -> None:
         if self.data is not None:
-            _ = self.nodes  # composed here, so that errors are reported before any work
+            _ = self.nodes  # composed here, so that errors are reported before any work is done
         elif self.composed:
             raise UserError(
                 f"{self.composed[0]} is an option of a data set, but no data set was given. "

@@ -19,7 +19,7 @@ class AdaptSettings(ModelSettings):
 
     OBJECTS: ClassVar = ("ckpt", "out")
     COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "lr_warmup", "seed")
-    source: str = required("folder of motions with captions: docs/own-data.md")
+    source: str = required("folder of motions with captions; see docs/own-data.md")
     name: str = required("one word for prompts such as 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default: runs/adapt/NAME")
     action: bool = option(
@@ -31,7 +31,7 @@ class AdaptSettings(ModelSettings):
     force: bool = option(False, "true = accept clips that drift upward or float")
     rank: int = option(
         8,
-        "rank of the low-rank changes to the weights; increase it for motions that differ "
+        "rank of the low-rank updates to the weights; increase it for motions that differ "
         "much from the model's training data",
         above_zero,
     )

@@ -75,7 +75,7 @@ def main(settings: BenchmarkSettings) -> None:
 def check(
     table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
 ) -> list[tuple[str, bool]]:
-    """Returns a line for each expected range of a table, and whether the value is in this range."""
+    """Returns one line per expected range, and whether the value in the table is within it."""
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():

@@ -13,7 +13,7 @@ class DemoSettings:
     """usage: flame-mdm demo [CKPT ...] [adapter=FILE] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
     Serves a page where you type a sentence, watch the motion, edit it and download it. Without
-    CKPT, the demo uses the models in the package. It requires the extra demo: pip install
+    CKPT, the demo uses the models in the package. It requires the demo extra: pip install
     "flame-mdm[demo]". docs/demo.md explains the page.
     """
 
@@ -23,7 +23,7 @@ class DemoSettings:
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(
-        list, "adapters of the first model that users can choose from, separated by spaces"
+        list, "adapters for the first model, separated by spaces; users can choose one of them"
     )
     host: str = option(
         "127.0.0.1",
@@ -45,7 +45,7 @@ def main(settings: DemoSettings) -> None:
             f"port={settings.port}: expected a number from 0 to 65535; 0 = any free port"
         )
     if find_spec("gradio") is None:
-        raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"')
+        raise UserError('the demo requires the gradio package. Run pip install "flame-mdm[demo]"')
 
     from flame_mdm.demo.app import serve
     from flame_mdm.demo.request import PLUS

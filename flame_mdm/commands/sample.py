@@ -90,7 +90,7 @@ class SampleSettings(OutputSettings, WritingSettings):
 
     @property
     def file(self) -> Path | None:
-        """The motion file to write; None if a folder is written."""
+        """The motion file to write, or None if a folder is written."""
         path = Path(self.out or "")
         return path if path.suffix.lower() in WRITTEN and not path.is_dir() else None
 
@@ -204,7 +204,7 @@ def main(settings: SampleSettings) -> None:
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples and writes the motions for a request.
 
-    Prompts in a file that the model cannot sample are refused.
+    In a prompt file, prompts that the model cannot sample are refused.
     """
     loaded = settings.load()  # a missing file is reported before PyTorch is imported
     character = settings.read_character()
@@ -300,7 +300,7 @@ def _write_files(
     body: Mesh | None,
     facts: dict[str, Any],
 ) -> None:
-    """Writes the first motion as `file`, and the other motions with numbers: walk_2.fbx, walk_3.fbx."""
+    """Writes the first motion as `file`, and the others as numbered files, such as walk_2.fbx."""
     for number, motion in enumerate(motions, 1):
         path = file if number == 1 else file.with_stem(f"{file.stem}_{number}")
         written = settings.at_rate(motion)

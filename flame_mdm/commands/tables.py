@@ -97,7 +97,7 @@ def evaluate_missing(
     from evaluators.protocol import protocol_config
 
     listed: dict[Path, Evaluation] = {}
-    shown: dict[Path, set[str]] = {}  # values of each result that the tables show
+    shown: dict[Path, set[str]] = {}  # for each result, the values that the tables show
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
         for dataset in part.get("lengths", []):
             count_lengths(dataset, results, settings)
@@ -135,7 +135,10 @@ def evaluate_missing(
 
 
 def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
-    """Returns whether some of `values` need several motions per prompt, which take most of the evaluation time."""
+    """Returns whether some of `values` need several motions per prompt.
+
+    Generating these motions takes most of the evaluation time.
+    """
     from evaluators.protocol import protocol_config
 
     several = protocol_config(evaluation.keys["protocol"]).get("multimodality") or {"metrics": {}}
@@ -151,7 +154,7 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
     Args:
         path: the result.
         evaluation: the evaluation that a table needs.
-        values: the values of the result that tables show.
+        values: the values in the result that the tables show.
     """
     from evaluators.sources import sample_files, sha256_of_samples
     from flame_mdm.checkpoints.model_files import weights_sha256

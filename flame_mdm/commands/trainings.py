@@ -36,7 +36,7 @@ class Training:
 
     @property
     def title(self) -> str:
-        """The arguments in one line."""
+        """The arguments on one line."""
         return " ".join(self.words)
 
 

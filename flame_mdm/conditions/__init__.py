@@ -14,7 +14,7 @@ from flame_mdm.batch import Condition, MotionBatch
 class ConditionEncoder(nn.Module, ABC):
     """Base class for encoders of texts or actions.
 
-    An encoder returns a `Condition` for a batch, which includes the null condition.
+    For each batch, an encoder returns a `Condition` that includes the null condition.
 
     Example:
         >>> class WordCount(ConditionEncoder):  # an encoder that counts the words of a caption
@@ -35,7 +35,7 @@ class ConditionEncoder(nn.Module, ABC):
     reads: Literal["text", "action"] = "text"
     #: Maximum number of words per caption; None = no limit.
     max_words: int | None = None
-    #: Words of the training captions; None before they are known.
+    #: Words of the training captions, or None before they are known.
     seen: Collection[str] | None = None
 
     @abstractmethod

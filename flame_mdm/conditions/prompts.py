@@ -20,8 +20,8 @@ class ReadPrompt:
         summary: one line that states how the prompt was understood. It is "" unless each caption of
             the model describes a single action.
         changes: lines about differences between the prompt and what is sampled.
-        fitting: seconds that fit the stated number of repetitions of each part, None if a part states
-            no number; () if the captions do not describe single actions.
+        fitting: for each part, the seconds that fit its stated number of repetitions, or None if it
+            states no number. The tuple is empty if the captions do not describe single actions.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -49,8 +49,8 @@ def read_prompt(
             text states them.
         facts: facts of the model.
         max_words: maximum number of words that the model reads in a caption; None = no limit.
-        splits: whether a sentence with several actions is split into one part per action. Only for
-            texts with a single part.
+        splits: whether a sentence with several actions is split into one part per action. This
+            applies only to texts with a single part.
         check_words: whether the model's words for actions replace the words of the text. A text is
             then also rejected if the model knows none of its content words.
 

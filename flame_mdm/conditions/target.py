@@ -38,9 +38,9 @@ class TargetConditions:
     Args:
         joints: names of the skeleton's joints, in the order of its positions.
         facing: joint indices of right hip, left hip, right shoulder and left shoulder.
-        choices: sets of slots. Each training motion draws one of the sets with equal probability.
-            An empty set results in a target that requests nothing, which differs from having no
-            target.
+        choices: sets of slots. For each training motion, one of the sets is drawn with equal
+            probability. An empty set results in a target that requests nothing, which differs from
+            having no target.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
         heading_modulo_pi: compute the error of the heading modulo pi, as in MDM's code. A body that
@@ -73,7 +73,8 @@ class TargetConditions:
     ):
         if lacking := [name for name in JOINTS if name not in joints]:
             raise UserError(
-                f"task.targets: the skeleton has no {', '.join(lacking)}. Choose another data set, or null"
+                f"task.targets: the skeleton has no {', '.join(lacking)}. Choose another data set, "
+                "or set task.targets=null"
             )
         unknown = [name for choice in choices for name in choice if name not in SLOTS]
         if unknown or not choices:

@@ -58,9 +58,9 @@ class PretrainedText(ConditionEncoder):
         freeze: False = fine-tune the language model together with the motion model.
 
     Raises:
-        UserError: When a caption is encoded, if the model is not pinned, if its file is not the
-            published file, or if its width is not `features`.
-        FileNotFoundError: When a caption is encoded, if the model is not in the cache and cannot be
+        UserError: If a caption is encoded and the model is not pinned, its file is not the
+            published file, or its width is not `features`.
+        FileNotFoundError: If a caption is encoded and the model is neither in the cache nor can be
             downloaded.
 
     Example:

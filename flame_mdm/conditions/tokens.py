@@ -173,7 +173,7 @@ class LearnedTokens(ConditionEncoder):
         return Condition(tokens.sum(1) / counts[:, None], tokens, token_mask, self._null())
 
     def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
-        """Encodes captions as (N, S, C), 0 past their ends. Only attention processes padding.
+        """Encodes captions as (N, S, C), with zeros in the padding. Only attention processes it.
 
         Args:
             rows: (T, 2), rows of the table for all real tokens.

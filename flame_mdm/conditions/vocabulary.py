@@ -151,7 +151,7 @@ def _content(text: str) -> list[str]:
 
 
 def unread_words(text: str, max_words: int | None) -> list[str]:
-    """Returns the words of a text after the first `max_words`; None = no limit."""
+    """Returns the words of a text after the first `max_words`, or [] if `max_words` is None."""
     return [] if max_words is None else words(text)[max_words:]
 
 
@@ -186,7 +186,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 
 
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
-    """Returns the known word that an unknown word probably stands for; None if there is none.
+    """Returns the known word that an unknown word probably stands for, or None.
 
     The unknown word is a typo of the known word, or has a similar meaning.
     """
@@ -202,7 +202,7 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
     For example, "walks, turns left and waves. Then she sits" has four parts.
 
-    A text is split at ends of sentences and at "then". With `verbs`, it is also split at each comma
+    Text is split at sentence boundaries and at "then". With `verbs`, it is also split at each comma
     that is followed by a verb. After such a comma, an "and" before a verb also splits the text.
     Otherwise, "and" does not: "raises both hands and waves" is one action. A part without a verb is
     joined with its neighbor. "In limp style" at the end, which adapters teach, is added to all

@@ -1,6 +1,6 @@
 """The demo's server: page, motion files, and limits.
 
-It requires the extra `demo` (gradio).
+It requires the `demo` extra (gradio).
 """
 
 import asyncio

@@ -19,10 +19,10 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
 
 
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
-    """Returns the chips for a text: its actions in order, their attributes, and ignored words.
+    """Returns the chips for the text: its actions in order, their attributes, and ignored words.
 
-    The options of a chip are texts with a different word for its action or attribute. The chosen
-    text replaces the text in the form.
+    Each option of a chip is the text with a different word for the action or attribute. The chosen
+    option replaces the text in the form.
 
     Args:
         abilities: the actions and attributes that the model knows. They are the options of the
@@ -51,7 +51,7 @@ def _step(
             continue
 
         def text(changed: Mention, position: int = position) -> str:
-            """Returns the text of the form with a changed action."""
+            """Returns the text to put in the form if `changed` replaces this action."""
             words = caption((*step[:position], changed, *step[position + 1 :]))
             rows = [
                 (words if row == number else phrase, seconds)

@@ -52,7 +52,7 @@ class Post(BaseModel):
 
 
 class Call(Post):
-    """A call of one of the page's functions.
+    """A call to one of the page's functions.
 
     Its arguments are strings, and never objects that could refer to a file.
     """
@@ -186,7 +186,7 @@ class Guard:
             path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
         ):
             raise HTTPException(
-                HTTPStatus.FORBIDDEN, "this request comes from a page of another site"
+                HTTPStatus.FORBIDDEN, "this request comes from a page on another site"
             )
 
     def _check_content(self, scope: Scope, body: bytes) -> None:
@@ -241,7 +241,7 @@ async def _body(request: Request) -> bytes:
 
 
 def _network_location(address: str) -> str:
-    """Returns the host and port of an address in lower case; "" for an invalid address, such as http://[."""
+    """Returns the host and port of an address in lower case, or "" if the address is invalid."""
     try:
         return urlsplit(address).netloc.lower()
     except ValueError:

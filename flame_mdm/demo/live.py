@@ -41,7 +41,7 @@ class LiveStream:
     Attributes:
         stream: the stream.
         used: time in seconds of the last request.
-        joints: (F, J, 3) joints of the last minute.
+        joints: (F, J, 3) joint positions of the last minute.
         text: the current text.
         allowance: number of blocks that the stream may compute now.
     """
@@ -89,8 +89,8 @@ class LiveStreams:
             name: name of the stream. "" = begin a new stream, whose name is in the result.
             text: description of the motion.
             begin: index of the first frame. Later frames of the stream are dropped.
-            path: waypoints that are ahead in frame `begin`, x and z in meters. `reached` in the
-                result lists the indices of the frames in which the first waypoints are reached.
+            path: waypoints (x, z), in meters, that are still ahead in frame `begin`. `reached` in
+                the result lists the indices of the frames in which the first waypoints are reached.
 
         Raises:
             UserError: If the text is not understood, if the stream has ended, or if a limit is

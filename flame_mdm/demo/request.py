@@ -61,8 +61,9 @@ Path = Annotated[
 class DemoEdit(BaseModel):
     """An edit of a previous motion; `motion` is its index.
 
-    See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part; "" =
-    unconditioned. A variation of the entire motion keeps the text, parts and path of the request.
+    See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part. If it is "",
+    the new part is unconditioned. A variation of the entire motion keeps the text, parts and path
+    of the request.
     """
 
     model_config = RULES
@@ -138,8 +139,8 @@ class DemoRequest(BaseModel):
                 )
             else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-        # With a path, there is no cleanup, because it moves the root away from the waypoints, by
-        # 0.3 m in one example.
+        # With a path, motions are not cleaned up, because cleanup moves the root away from the
+        # waypoints (by 0.3 m in one example).
         if self.cleanup and not self.path:
             steps[-1][1]["cleanup"] = True
         return steps

@@ -77,7 +77,7 @@ class Studio:
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns the text reader for a model whose captions describe single actions; None for other models."""
+        """Returns the text reader of a model whose captions describe single actions, or None."""
         self.model(name)
         return self._readers.get(name)
 
@@ -143,7 +143,7 @@ class Studio:
         return checked(request.model_dump() | {"text": text})
 
     def readings(self, request: DemoRequest) -> list[Reading]:
-        """Returns the meaning of each part of a request's text; [] for models that read arbitrary words."""
+        """Returns the meaning of each part of the text, or [] if the model has no text reader."""
         reader = self.reader(request.model)
         if reader is None or not request.text or not request.split:
             return []

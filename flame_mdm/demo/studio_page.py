@@ -72,7 +72,7 @@ EXAMPLES = (
     "a person talks on the phone",
     "a person does a push-up",
 )
-"""Texts to try. The page shows the texts whose actions its model can generate."""
+"""Example texts. The page shows those whose actions its model can generate."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
 <div class="list"></div><button type="button" class="add">+ Add an action</button></div>
@@ -304,7 +304,7 @@ def _result(
 
 
 def _verdicts(name: str, motion: Motion) -> str:
-    """Returns the referee's verdicts on the claims of a motion's text; "" without claims."""
+    """Returns the referee's verdicts on the claims of a motion's text, or "" if it has none."""
     judgment = try_judge(motion)
     if judgment is None:
         return ""
@@ -340,7 +340,7 @@ def _refusal(error: NotUnderstood) -> str:
 
 
 def _still(text: str) -> str:
-    """Returns the address of a picture of the action in a text; "" without a picture."""
+    """Returns the address of a picture of the action in a text, or "" if there is none."""
     mention = understand(text).mentions[0]
     image = still(mention.action, mention.attributes.get("side"))
     if image is None:
@@ -367,7 +367,7 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Returns texts or actions from the training data, with the addresses of their pictures; "" = no picture."""
+    """Maps texts or actions from the training data to the addresses of their pictures, or to ""."""
     if model.conditioned_on == "text" and Reader.fits(model.facts):
         doable = Abilities(model.facts).actions
         return {

@@ -28,19 +28,19 @@ class Denoiser(nn.Module, ABC):
 
     Example:
         >>> import torch
-        >>> class Mean(Denoiser):  # a denoiser that sees a motion as its mean
-        ...     def forward(self, x_t, t, mask, cond):
-        ...         return x_t.mean(1, keepdim=True).expand_as(x_t)
-        >>> x_t, mask = torch.ones(2, 5, 3), torch.ones(2, 5, dtype=torch.bool)
-        >>> Mean()(x_t, torch.zeros(2), mask, Condition(x_t[:, 0], x_t[:, :0], None)).shape
-        torch.Size([2, 5, 3])
+        >>> class Mean(Denoiser):  # a denoiser that returns the mean of the motion ...     def
+        forward(self, x_t, t, mask, cond): ...         return x_t.mean(1,
+        keepdim=True).expand_as(x_t) >>> x_t, mask = torch.ones(2, 5, 3), torch.ones(2, 5,
+        dtype=torch.bool) >>> Mean()(x_t, torch.zeros(2), mask, Condition(x_t[:, 0], x_t[:, :0],
+        None)).shape torch.Size([2, 5, 3])
     """
 
     #: Whether padding has no influence on real frames. If False, the network attends to padding,
     #: and sampling uses the padded length of the training batches.
     mask_padding: bool = True
 
-    #: Number of clean frames before the motion that the network reads in `Condition.prefix`.
+    #: Number of clean frames that precede the motion. The network reads them from
+    #: `Condition.prefix`.
     context_frames: int = 0
 
     @abstractmethod
@@ -56,6 +56,6 @@ class Denoiser(nn.Module, ABC):
             cond: the condition. Dropped samples already have the null condition.
 
         Raises:
-            UserError: If a motion is too long for the network, if condition tokens are missing or
-                too many, or if the prefix does not have `context_frames` frames.
+            UserError: If a motion is too long for the network, if there are no or too many
+                condition tokens, or if the prefix does not have `context_frames` frames.
         """

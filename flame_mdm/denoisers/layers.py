@@ -29,8 +29,8 @@ def with_prefix(mask: Tensor, prefix: int) -> Tensor:
 class Attention(nn.Module):
     """Multi-head attention from x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), as in released weights, so that self-attention
-    needs only one projection.
+    Query, key and value share one matrix (3C, C), as in the released weights, so that
+    self-attention needs only one projection.
     """
 
     def __init__(self, features: int, num_heads: int, dropout: float):
@@ -195,7 +195,7 @@ class TimeAndCondition(nn.Module):
         return self.add(self.time(t), condition)
 
     def add(self, time: Tensor, condition: Tensor) -> Tensor:
-        """Adds embedded times (B, features) to the projected condition (B, C) or (B, S, C)."""
+        """Adds time embeddings (B, features) to the projected condition (B, C) or (B, S, C)."""
         if not self.cond_features:
             return time
         return self.projection(condition) + (time if condition.ndim == 2 else time[:, None])

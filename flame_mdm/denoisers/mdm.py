@@ -72,7 +72,7 @@ class MDMEncoder(Denoiser):
         """See `Denoiser.forward`.
 
         Raises:
-            UserError: If `max_tokens` is above 0, and tokens are missing or too many.
+            UserError: If `max_tokens` is above 0, and there are no or too many tokens.
         """
         token_mask = mask[:, :0]
         if self.max_tokens:
@@ -234,10 +234,10 @@ class MDMDecoder(Denoiser):
         return torch.cat([cond.prefix.to(x_t), x_t], 1)
 
     def _memory(self, time: Tensor, cond: Condition) -> tuple[Tensor, Tensor | None]:
-        """Returns the memory (B, S, C) and its mask (B, S); None = all entries are real.
+        """Returns the memory (B, S, C) and its mask (B, S), which is None if all entries are real.
 
         Args:
-            time: (B, C), embedded times.
+            time: (B, C), time embeddings.
             cond: the condition.
         """
         if not self.token_memory:

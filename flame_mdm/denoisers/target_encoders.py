@@ -1,7 +1,7 @@
 """Encoders of target conditions: where joints should be at the end of a motion.
 
-Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) contains one slot per joint. Each slot is x,
-y, z, and a flag, which is 1 if the joint is requested and 0 if it is free.
+Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) contains one slot per joint. Each slot
+contains x, y, z, and a flag, which is 1 if the joint is requested and 0 if it is free.
 """
 
 from abc import ABC, abstractmethod

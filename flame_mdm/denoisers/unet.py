@@ -29,7 +29,7 @@ class MDMUNet(Denoiser):
         in_features: D.
         out_features: D, or 2D with a learned variance.
         cond_features: C; 0 = unconditioned.
-        latent_dim: width of the embedded time and condition.
+        latent_dim: width of the time and condition embeddings.
         channels: width of each level. Each level has half the frame rate of the previous one.
         num_groups: number of groups of the group norms; divides all widths.
         dropout: probability of dropout inside the blocks.
@@ -115,7 +115,7 @@ class ResidualBlock(nn.Module):
 
         Args:
             x: (B, in_channels, F), the input.
-            token: (B, features), embedded time and condition.
+            token: (B, features), embedding of the time and the condition.
             mask: (B, 1, F), 1 = real frame, 0 = padding.
         """
         y = self.conv1(functional.silu(self.norm1(x, mask)) * mask)

@@ -60,7 +60,7 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def training_times(self, u: Tensor) -> Tensor:
-        """Returns times t (B,) of training samples, from uniform numbers (B,) in (0, 1)."""
+        """Converts uniform numbers (B,) in (0, 1) to times t (B,) of training samples."""
 
     @abstractmethod
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:

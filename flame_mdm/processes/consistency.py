@@ -38,16 +38,16 @@ def consistency_terms(
         process: process of the student and the teacher. It predicts the clean motion or the
             velocity.
         student: the network to train.
-        follower: the network that computes the target, the estimate after the step, without
+        follower: the network that computes the target (the estimate after the step), without
             gradient. It is the student or an average of its weights.
         teacher: the guided teacher.
         x: (B, F, D) normalized clean motion.
         mask: (B, F) bool, True = real frame.
         cond: conditions of the batch.
         times: (N,) times, starting from pure noise; see `Process.grid`.
-        index: (B,) int64, the index in `times` of the time of each motion, 0 ... N - 1.
+        index: (B,) int64, the index of each motion's time in `times`, from 0 to N - 1.
         noise: (B, F, D).
-        auxiliary: geometric losses of the estimate against the target.
+        auxiliary: geometric losses between the estimate and the target.
 
     Returns:
         Losses (B,) per sample by name: "consistency", the auxiliary losses, and "loss", their sum.

@@ -31,7 +31,7 @@ class GaussianDiffusion(Process):
         prediction: content of the first D channels of the denoiser's output: the clean motion, the
             noise, or the velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
         variance: variance of the reverse process. "fixed_small" is the variance of the posterior.
-            "fixed_large" is beta. "learned_range" is between the two, and is learned from D
+            "fixed_large" is beta. "learned_range" lies between the two and is learned from D
             additional channels (Nichol and Dhariwal 2021, eq. 15).
         vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is
             learned. L_vlb is a sum over T steps, so it is T times the term of one step. The value
@@ -103,7 +103,7 @@ class GaussianDiffusion(Process):
         return 2 * features if self.variance == "learned_range" else features
 
     def training_times(self, u: Tensor) -> Tensor:
-        """Returns uniform steps (B,) from 0 to T - 1, from uniform numbers (B,) in (0, 1)."""
+        """Converts uniform numbers (B,) in (0, 1) to uniform steps (B,) from 0 to T - 1."""
         return (u * len(self.schedule)).floor().clamp(max=len(self.schedule) - 1)
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -121,7 +121,8 @@ class GaussianDiffusion(Process):
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor | int) -> Tensor:
         """See `Process.to_x0`.
 
-        `output` may contain the channels of a learned variance. t may be one step for the batch.
+        `output` may contain the channels of a learned variance. t may be a single step for the
+        entire batch.
         """
         output = output[..., : x_t.shape[-1]]
         if self.prediction == "x0":

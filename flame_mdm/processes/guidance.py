@@ -37,7 +37,7 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
     MDM and FLAME (eq. 5) use, scale 1 means no guidance.
 
     Args:
-        denoise: the denoiser; its condition must have a null condition.
+        denoise: the denoiser. Its condition must contain a null condition.
         scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise` itself
             is returned.
         features: D. Channels from D on contain a learned variance. These channels are not guided;
@@ -113,7 +113,7 @@ def steer(
     Args:
         clean: returns the clean estimate (B, F, D) of a noisy motion.
         x_t: (B, F, D) noisy motions.
-        to_joints: converts normalized features (B, F, D) to joints (B, F, J, 3) in meters.
+        to_joints: converts normalized features (B, F, D) to joint positions (B, F, J, 3) in meters.
         positions: the positions.
 
     Returns:
@@ -149,7 +149,7 @@ def reach(
 
     Args:
         x: (B, F, D) normalized motions.
-        to_joints: converts normalized features (F, D) to joints (F, J, 3) in meters.
+        to_joints: converts normalized features (F, D) to joint positions (F, J, 3) in meters.
         positions: the positions.
         bones: (3, N) int64: frame, parent and child of the bones whose length the change could
             affect. All bones are listed for each frame.

@@ -112,7 +112,7 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run; its options contain eta, 0 to 1.
+        run: the run; its options contain eta, from 0 to 1.
         i: the step, N - 1 ... 0.
 
     Returns:

@@ -114,7 +114,7 @@ class Schedule:
         return len(self.tables["betas"])
 
     def number(self, name: str, i: int) -> float:
-        """Returns a coefficient at step i, for the whole batch."""
+        """Returns a coefficient at step i as one number for the entire batch."""
         return self.numbers[name][i]
 
     def at(self, name: str, i: Tensor, x: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
 
     Args:
         name: "cosine" or "linear".
-        num_train_timesteps: T, 2 to `MAX_STEPS`.
+        num_train_timesteps: T, from 2 to `MAX_STEPS`.
         noise_scale: see `with_more_noise`; 1 = unchanged.
 
     Raises:
@@ -187,7 +187,7 @@ def timesteps(
 
     Args:
         num_train_timesteps: T.
-        num_inference_steps: N, 1 to T.
+        num_inference_steps: N, from 1 to T.
         spacing: "linspace" includes both ends and rounds half to even. It is called "N" in the code
             of MDM and FLAME, after Nichol and Dhariwal 2021. "stride" counts from 0 with the
             smallest integer stride that gives N steps, so the noisiest step may be well below T -

@@ -23,7 +23,7 @@ class Windows:
     batch: MotionBatch
     #: (W,) int64, the index of each window's motion.
     rows: Tensor
-    #: (W, L) int64, the index in the motion of each frame of a window.
+    #: (W, L) int64, the index of each frame of a window in its motion.
     frames: Tensor
     #: (W, L), 0 past the end of a window. The weights of each frame of a motion sum to 1.
     weights: Tensor

@@ -45,7 +45,7 @@ class Seen:
 
 
 def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> Seen | None:
-    """Returns the response of a metric to a perturbation; None if a grade was not computed."""
+    """Returns the response of a metric to a perturbation, or None if a grade was not computed."""
     real, width = card.real[metric]
     graded = [(grade.grade, *grade.values[metric]) for grade in perturbation.grades]
     if real is None or width is None:
@@ -108,7 +108,7 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns a tuple for comparing cards. A card with a larger tuple better fits the evaluated data.
+        """Returns a tuple, which is larger for cards that fit the evaluated data better.
 
         Cards with the same length limits are best, followed by cards for the test split, cards for
         the same data, and cards with more motions.
@@ -126,7 +126,7 @@ class CitedCard:
 
 
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
-    """Returns the strongest card of an extractor that fits the evaluated data; None if there is no such card.
+    """Returns the strongest card of an extractor that fits the evaluated data, or None.
 
     Without an extractor, the card covers the metrics of joint positions. Cards are in the folder
     FLAME_MDM_AUDITS (default: runs/audit), and in the repository, whose cards are listed in
@@ -325,7 +325,7 @@ def _cell(
 
 
 def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> str:
-    """Returns a text with the grades at which a metric has no value."""
+    """Returns text that lists the grades at which a metric has no value."""
     grades = [grade.grade for grade in perturbation.grades if None in grade.values[metric][2:]]
     if None in card.real[metric] or len(grades) == len(perturbation.grades):
         return "not computed"
@@ -335,7 +335,7 @@ def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: st
 def _curve(
     card: AuditCard, perturbation: AuditedPerturbation | None, metric: str
 ) -> dict[str, str] | None:
-    """Returns the response curve over real motions and all grades; None if the metric never changes."""
+    """Returns the response curve over real motions and all grades, or None if it is constant."""
     if perturbation is None or metric not in card.metrics:
         return None
     pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]

@@ -54,7 +54,7 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
-    """Returns the first `SECONDS` seconds of a clip as a motion that stands on the floor."""
+    """Returns the first `SECONDS` seconds of a clip as a motion that is placed on the floor."""
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()

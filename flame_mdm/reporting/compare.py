@@ -212,7 +212,7 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD` with the differences in all metrics, or why there is no comparison.
+    """Returns rows for `HEAD` with the differences in all metrics, or a reason not to compare.
 
     Both results must come from the same evaluation: the same protocol, data and extractor.
     """
@@ -234,7 +234,7 @@ def differences(first: Result, second: Result) -> list[list[str]] | str:
 
 
 def _difference(name: str, first: Value | None, second: Value | None) -> list[str]:
-    """Returns a row of cells for second - first; [] if the results have no pairs of values."""
+    """Returns a row of cells for second - first, or [] if the results have no pairs of values."""
     if first is None or second is None or first.n != second.n:
         return []
     count = min(len(first.per_replication), len(second.per_replication))
@@ -276,7 +276,7 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 
 
 def in_common(runs: Mapping[str, Run]) -> list[str]:
-    """Returns the reason why no evaluation can be compared; [] if two runs have the same evaluation."""
+    """Returns why no evaluations can be compared, or [] if two runs have the same evaluation."""
     groups = grouped(runs)
     if len(runs) < 2 or any(
         len({label for label, _ in columns}) > 1 for columns in groups.values()

@@ -55,7 +55,7 @@ def _environment() -> Environment:
 
 
 def number(value: float | None) -> str:
-    """Formats a number with four digits for a table. A missing value is a dash."""
+    """Formats a number with four digits for a table. A missing value is shown as a dash."""
     if value is None:
         return "–"
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:

@@ -19,7 +19,7 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 ROW = 16
 # Maximum number of segments per curve. The lowest and highest point of each segment are drawn.
 MOST = 300
-LOG_RANGE = 15  # positive values have a logarithmic axis if they span more than this factor
+LOG_RANGE = 15  # positive values that span more than this factor get a logarithmic axis
 COLORS = 8
 # Numbers closer to 0 than this are treated as 0 on axes, because steps between ticks would
 # underflow
@@ -77,7 +77,7 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
 
 
 def svg_file(drawing: Markup) -> str:
-    """Returns the text of a standalone file with a drawing, which includes the styles."""
+    """Returns the text of a standalone SVG file with a drawing and its styles."""
     style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
     return str(drawing).replace(">", f"><style>{style}</style>", 1)
 

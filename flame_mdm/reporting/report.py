@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
-"""Training curves for speed and optimization, which are not losses."""
+"""Training curves that are not losses but show speed and optimization."""
 
 
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
@@ -62,7 +62,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
 
 
 def last(curve: Curve) -> float | None:
-    """Returns the value at the last step of a curve; None for an empty curve."""
+    """Returns the value at the last step of a curve, or None if the curve is empty."""
     return curve[max(curve)] if curve else None
 
 

@@ -53,7 +53,8 @@ class Edited(Motion):
     keep: np.ndarray
     #: Maximum change of the kept values, in normalized features. It is 0 if the method is exact.
     feature_error: float
-    #: Maximum distance in meters of kept joints in the world, before and after the edit.
+    #: Maximum distance in meters between the world positions of kept joints before and after the
+    #: edit.
     joint_error: float
 
 
@@ -91,8 +92,8 @@ def edit(
 
     Args:
         model: the model, from `flame_mdm.load`.
-        motion: a file or clip that `read_motion` reads; a motion, generated or read; or joints
-            (F, J, 3) in meters, y up, in the order of a known skeleton.
+        motion: a file or clip that `read_motion` reads; a generated or read motion; or joint
+            positions (F, J, 3) in meters, with y up and in the joint order of a known skeleton.
         texts: what the person does in the new part; one text or several. Default: unconditioned,
             unless `actions` are given.
         fps: frames per second of an array or an .npy file. For other files, it overrides the rate

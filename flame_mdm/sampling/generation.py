@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motion sampling with text, action, or no condition."""
+"""Sampling of motions from text, from actions, or without a condition."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence

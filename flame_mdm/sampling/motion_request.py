@@ -99,8 +99,8 @@ class EditRequest:
     )
     strength: float | None = option(
         None,
-        "varies the motion: noise is added to it, and this fraction of the sampling steps, above "
-        "0 and up to 1, is taken. A smaller fraction gives a result closer to the motion",
+        "varies the motion: noise is added to it, and only this fraction of the sampling steps "
+        "(above 0, up to 1) is taken. A smaller fraction gives a result closer to the motion",
     )
 
     def __post_init__(self) -> None:
@@ -127,7 +127,7 @@ class EditRequest:
 
     @property
     def ranges(self) -> list[tuple[float, float]] | None:
-        """The ranges in `region` or `region_seconds`; None if neither contains ranges."""
+        """The ranges in `region` or `region_seconds`, or None if neither contains ranges."""
         name = "region" if self.region_seconds is None else "region_seconds"
         value: Any = getattr(self, name)
         if value is None or (name == "region" and isinstance(value, str)):
@@ -163,10 +163,10 @@ class SamplingRequest:
 
     Motions are sampled for texts or actions. If neither is given, motions are unconditioned.
 
-    A text or action may have several parts with their durations in seconds, "walks forward @3 |
-    turns left | sits down @2". The parts are generated together as one motion, in overlapping
-    windows; see docs/sequences.md. A single part with a duration, "walks forward @10", is also
-    generated in windows. Such a part may be longer than the training motions.
+    A text or action may consist of several parts, which may state their durations in seconds, as in
+    "walks forward @3 | turns left | sits down @2". The parts are generated together as one motion,
+    in overlapping windows; see docs/sequences.md. A single part with a duration, such as "walks
+    forward @10", is also generated in windows. Such a part may be longer than the training motions.
 
     `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
 
@@ -363,7 +363,7 @@ class SamplingRequest:
 
     @property
     def prompts(self) -> tuple[str, ...]:
-        """The texts or actions; a single empty text if there are none."""
+        """The texts or actions, or a single empty text if there are none."""
         return tuple(self.texts or self.actions or ("",))
 
     @cached_property
@@ -384,7 +384,10 @@ class SamplingRequest:
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
-        """Returns the requested length of each prompt in frames, not rounded; None if none is set."""
+        """Returns the requested length of each prompt as an unrounded number of frames.
+
+        The length is None if no length was requested.
+        """
         value: Any = self.frames if self.seconds is None else self.seconds
         lengths = value if isinstance(value, tuple) else [value] * len(self.prompts)
         return [
@@ -447,7 +450,7 @@ def is_range(value: Any) -> bool:
 
 
 def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
-    """Returns the waypoints (x, z) in meters from a text "x,z x,z ..." or from pairs.
+    """Returns the waypoints (x, z) in meters from a string "x,z x,z ..." or from pairs.
 
     Raises:
         UserError: If there are no waypoints, or they cannot be read.

@@ -146,7 +146,7 @@ def _check_rig(content: MotionSet, name: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class MadeSet:
-    """The clips of a set, and the reasons for omitted motions, by name."""
+    """The clips of a set, and the reasons for omitting motions, by the names of the motions."""
 
     clips: list[Clip]
     left_out: dict[str, str]
@@ -202,7 +202,7 @@ def _takes(
 ) -> list[GroundedMotion]:
     """Samples the candidates for a motion.
 
-    Candidates for a loop have three repetitions + 1 frame.
+    Candidates for a loop have three repetitions plus one frame.
     """
     is_loop, representation = motion.kind == "loop", model.representation
     sampling: SamplerKeywords = {**options}  # type: ignore[typeddict-item]
@@ -231,7 +231,7 @@ def _takes(
 def _clips(
     name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray
 ) -> tuple[float, list[Clip]] | None:
-    """Returns the score of a candidate, lower is better, and its clips.
+    """Returns the score of a candidate (lower is better) and its clips.
 
     Returns None if the candidate does not show the motion.
     """

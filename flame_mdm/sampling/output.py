@@ -55,7 +55,7 @@ def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
 
 
 def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
-    """Returns a warning if the features of some frames determine no rotations; otherwise []."""
+    """Returns a warning if the features of some frames determine no rotations, or [] otherwise."""
     degenerate = sum(motion.degenerate for motion in motions)
     if not degenerate:
         return []

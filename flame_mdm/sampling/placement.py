@@ -45,7 +45,7 @@ class Placement:
         return cls(turn, to_center - rotate_y(from_center, turn))
 
     def apply(self, joints: Tensor) -> Tensor:
-        """Moves joints (B, ..., 3) to the world, float64."""
+        """Moves joint positions (B, ..., 3) to the world, in float64."""
         ones = (1,) * (joints.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(joints.shape[:-1])
         return rotate_y(joints.double(), turn) + self.shift.view(-1, *ones, 3)
@@ -67,7 +67,7 @@ def step_after(representation: Representation, last: Tensor, world: Tensor) -> P
     Args:
         representation: the representation of the features.
         last: (B, D), features of the last frame.
-        world: (B, J, 3), joints of the last frame in the world.
+        world: (B, J, 3), world joint positions of the last frame.
     """
     joints = representation.decode(torch.stack([last, last], 1))
     here = Placement.fit(joints[:, 0], world)

@@ -41,7 +41,7 @@ def read_motion(
 
     Args:
         representation: the representation of the model.
-        source: a motion file, or `dataset:id`, a clip of a prepared data set.
+        source: a motion file, or `dataset:id` for a clip of a prepared data set.
         fps, unit, up, animation: descriptions of the file, as in
             `flame_mdm.formats.readers.read`.
         cut: the part to use, as [begin, end] in seconds. Default: the entire motion.

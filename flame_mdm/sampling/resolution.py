@@ -31,7 +31,7 @@ from flame_mdm.sampling.targets import Targets, read_targets
 
 @dataclass(frozen=True)
 class ResolvedPrompt:
-    """A text or an action in the form that a model samples.
+    """A text or an action, resolved for a model.
 
     Attributes:
         text: the prompt. A sentence with several actions becomes a sequence, "walks | sits".
@@ -154,7 +154,7 @@ def resolve(
 def _usual_frames(
     prompt: ReadPrompt, requested: float | None, model: MotionGenerator
 ) -> list[float | None]:
-    """Returns the number of frames of each part without a stated duration; None = the default.
+    """Returns the number of frames of each part without a stated duration, or None for the default.
 
     A requested number applies to all parts. Otherwise, a part with a stated number of repetitions
     is as long as the repetitions take, because a longer motion would repeat the action more often.

@@ -41,7 +41,7 @@ def part_frames(
         model: the model that samples the motion.
         text: the prompt, for messages.
         parts: its parts, with their durations in seconds if the prompt states them.
-        usual: for each part, its number of frames, not rounded, if the prompt states no duration.
+        usual: the (unrounded) number of frames of each part whose duration the prompt does not state.
             None = `USUAL_SECONDS`, or as many frames as fit into one window if that is less.
         is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
         loop: whether the last frame leads to the first one.

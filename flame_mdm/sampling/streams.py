@@ -55,12 +55,12 @@ def stream(
     Args:
         model: a model that continues frames (DiP), from `flame_mdm.load`.
         text: what the person does at first.
-        start: the motion to continue: a motion, a file, or "dataset:id", a clip of a prepared
+        start: the motion to continue: a motion, a file, or "dataset:id" for a clip of a prepared
             data set. Only its last frames are used. Default: a person who is standing still.
         seed: seed of the noise.
-        block: number of frames per block. The maximum and the default are the frames that the
-            model predicts at once. Shorter blocks react sooner to a new text, but cost more per
-            second of motion.
+        block: number of frames per block. The maximum, which is also the default, is the number of
+            frames that the model predicts at once. Shorter blocks react sooner to a new text, but
+            cost more per second of motion.
         cleanup: smooth the motions, keep bone lengths constant, and keep feet from sliding. Each
             block is returned only after the next one was computed, because the two must fit
             together.
@@ -283,7 +283,7 @@ class Schedule:
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames from a frame to the next change; None if no change follows."""
+        """Returns the number of frames from a frame to the next change, or None without one."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 
@@ -404,7 +404,7 @@ class Streams(Iterator[list[Motion]]):
         self.frames = [frame]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
-        """Returns the next frames (F, D) of each stream, normalized; `lengths` are their numbers."""
+        """Returns the next `lengths` normalized frames (F, D) of each stream."""
         ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
         parts: list[list[Tensor]] = [[] for _ in ends]
         while self.frames != ends:
@@ -430,7 +430,7 @@ class Streams(Iterator[list[Motion]]):
     def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Samples the next block. Each stream keeps the first `kept` frames of the block.
 
-        Returns normalized features (B, P, D), and joints (B, P, J, 3) in the world, float64.
+        Returns normalized features (B, P, D), and world joint positions (B, P, J, 3) in float64.
         """
         representation, count = (
             self.model.representation,
@@ -482,7 +482,7 @@ class Streams(Iterator[list[Motion]]):
         return cond, edit
 
     def _led(self) -> Edit | None:
-        """Returns the edit that leads the next block to the waypoints; None if there are no waypoints."""
+        """Returns the edit that leads the next block to the waypoints, or None if none are left."""
         representation, points = self.model.representation, self.waypoints.left
         if not points or not isinstance(representation, HumanML):
             return None

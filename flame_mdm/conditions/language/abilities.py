@@ -30,14 +30,14 @@ WORDS_OF_VALUES: dict[Value, tuple[str, ...]] = {
     "backward": ("back", "reverse"),
     "circle": ("circle",),
 }
-"""Parts of words by value of an attribute.
+"""Word parts for each value of an attribute.
 
 A caption that states the value contains one of these parts.
 """
 
 
 class Abilities:
-    """Actions and attributes that a model knows. Each of its captions names one action from a list.
+    """Actions and attributes of a model whose captions each name one action from a list.
 
     Args:
         facts: facts of the model: "actions", "vocabulary" and, if known, "captions".
@@ -51,7 +51,7 @@ class Abilities:
 
     @cached_property
     def actions(self) -> list[str]:
-        """The actions that the model knows, by their names in `actions.yaml`."""
+        """Names in `actions.yaml` of the actions that the model knows."""
         listed: dict[str, None] = {}
         for name in self.names:
             plain = name.replace("_", " ").lower()
@@ -119,7 +119,7 @@ class Abilities:
         return {name: values for name, values in listed.items() if values}
 
     def ranked(self, action: str) -> list[str]:
-        """Returns the actions that the model knows, ordered by similarity of meaning."""
+        """Returns the actions that the model knows, sorted by similarity in meaning to `action`."""
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:

@@ -64,7 +64,7 @@ class Reader:
         return {name: value for name, value in self.attributes.items() if name in self.entry.takes}
 
     def _word(self, position: int) -> str:
-        """Returns the word at a position in the clause; "" outside the clause."""
+        """Returns the word at a position in the clause, or "" if the position is outside it."""
         return self.tokens[self.numbers[position]].word if 0 <= position < len(self.numbers) else ""
 
     def _state(self, name: str, value: Value, *numbers: int) -> None:
@@ -127,7 +127,7 @@ class Reader:
         self._state("direction", self._around(value), number)
 
     def _around(self, value: str) -> str:
-        """Returns a direction. In a circle, left and right are converted to the direction of turning."""
+        """Returns a direction. In a circle, left and right become clockwise or counterclockwise."""
         earlier = str(self.attributes.get("direction", ""))
         turns = {"left": "counterclockwise", "right": "clockwise"}
         if earlier == "circle":

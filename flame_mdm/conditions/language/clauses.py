@@ -41,7 +41,7 @@ AT_THE_END = {
 NEED_SUBJECT = ("once", "as")
 """Connectors that only occur before a subject: "once they have", but not "jumps once"."""
 NEED_CLAUSE = ("next", "later")
-"""Connectors that only occur at the beginning of a clause, so not in "next to the table"."""
+"""Connectors that only occur at the beginning of a clause, unlike in "next to the table"."""
 
 
 @dataclass
@@ -50,8 +50,8 @@ class Clause:
 
     Attributes:
         numbers: indices of its tokens.
-        link: when the clause happens, relative to the previous clause; "" if the sentence does not
-            state it.
+        link: when the clause happens relative to the previous clause, or "" if the sentence does
+            not say.
         is_first: whether it is the first clause of its sentence.
         after_comma: whether a comma precedes it.
         matches: phrases in it that name actions.
@@ -107,7 +107,7 @@ def _clauses(tokens: Sequence[Token], matches: Sequence[Match]) -> Iterator[Clau
 
 
 def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
-    """Returns the words of the connector at a token; () if no connector begins there."""
+    """Returns the words of the connector at a token, or () if no connector begins there."""
     for words in CONNECTORS:
         if tuple(token.word for token in tokens[number : number + len(words)]) != words:
             continue

@@ -19,9 +19,9 @@ class Match:
 
     Attributes:
         phrase: the phrase.
-        used: indices of its tokens in the sentence, increasing.
-        is_weak: whether it counts as an action only if the sentence has no other action, such as
-            "go".
+        used: indices of its tokens in the sentence, in increasing order.
+        is_weak: whether the phrase, such as "go", counts as an action only if the sentence has no
+            other action.
     """
 
     phrase: Phrase
@@ -72,7 +72,7 @@ def _longest_at(tokens: Sequence[Token], start: int) -> tuple[tuple[int, ...], P
 
 
 def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[int, ...] | None:
-    """Returns the indices of the tokens that match a phrase at `start`; None if there is no match."""
+    """Returns the indices of the tokens that match a phrase at `start`, or None."""
     if not words:
         return ()
     if words[0] == GAP:

@@ -66,7 +66,7 @@ def is_thing(word: str) -> bool:
 
 
 def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
-    """Returns the actions by score.
+    """Returns the actions with their scores, highest score first.
 
     The score is the mean of the similarities to the action's nearest word and to its center.
     """

@@ -14,7 +14,7 @@ from flame_mdm.errors import UserError, shortened
 ATTRIBUTES = ("direction", "amount", "speed", "count", "side")
 # Maximum number of repetitions that are sampled as several parts
 LONGEST_COUNT = 12
-# Duration in seconds of a motion with stated repetitions: a start and an end, and each repetition
+# Seconds that a motion takes for its start and end together, and for each stated repetition
 START_AND_END, REPETITION = 0.8, 0.7
 
 
@@ -28,7 +28,7 @@ class Reading:
         captions: one caption per step, for the model.
         texts: the words of the sentence for each step.
         changes: differences between the sentence and the sampled motion, one line each.
-        ignored: words and attributes that have no effect, as typed or as words.
+        ignored: words (as typed) and attributes (in words) that have no effect.
     """
 
     understanding: Understanding
@@ -47,7 +47,7 @@ class Reading:
         )
 
     def seconds(self) -> tuple[float | None, ...]:
-        """Returns how many seconds fit the stated count of each step; None = no count is stated."""
+        """Returns the seconds that fit the stated count of each step, or None without a count."""
         counts = [
             step[0].attributes.get("count") if len(step) == 1 else None for step in self.steps
         ]

@@ -25,7 +25,7 @@ FREQUENT = (
 
 
 def distance(first: str, second: str, most: int) -> int:
-    """Returns the number of edits between two words; `most` + 1 if there are more than `most`.
+    """Returns the number of edits between two words, or `most` + 1 if it exceeds `most`.
 
     An edit inserts, removes or replaces a letter, or swaps two neighboring letters. This is the
     optimal string alignment distance (Damerau 1964; Levenshtein 1966).
@@ -54,7 +54,7 @@ def distance(first: str, second: str, most: int) -> int:
 
 @cache
 def corrections(word: str) -> tuple[str, ...]:
-    """Returns the words of the tables that a misspelled word may stand for; () if none is similar.
+    """Returns the words of the tables that a misspelled word may stand for; possibly none.
 
     All returned words are equally likely: they differ from the misspelled word by the same number
     of edits of the same kind. A word of up to five letters may have one wrong letter, and a longer

@@ -15,7 +15,7 @@ class Mention:
         attributes: side, count, direction, speed and amount, if the sentence states them.
         text: the words of the sentence for the action.
         start, end: position of its verb in the sentence.
-        typed: the word that was read as this action because of its meaning; "" if the sentence
+        typed: the word that was read as this action because of its meaning, or "" if the sentence
             names the action.
     """
 
@@ -32,7 +32,7 @@ class Mention:
 
 
 Step = Sequence[Mention]
-"""Actions at the same time."""
+"""Simultaneous actions."""
 
 
 @dataclass(frozen=True)

@@ -30,16 +30,16 @@ class WordTable:
         return word in self._rows
 
     def rank(self, word: str) -> int | None:
-        """Returns the frequency rank of a word or of its base form; None if both are missing."""
+        """Returns the frequency rank of a word or of its base form, or None if both are missing."""
         return next((self._rows[form] for form in base_forms(word) if form in self._rows), None)
 
     def vector(self, word: str) -> np.ndarray | None:
-        """Returns the vector (D,) of a word or of its base form; None if both are missing."""
+        """Returns the vector (D,) of a word or of its base form, or None if both are missing."""
         row = self.rank(word)
         return None if row is None else self.vectors[row]
 
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
-        """Returns the mean vector (D,) of words, scaled to norm 1; None if all are missing.
+        """Returns the mean vector (D,) of words, scaled to norm 1, or None if all are missing.
 
         Frequent words have less weight: smooth inverse frequency (Arora et al. 2017), with
         frequencies from Zipf's law.

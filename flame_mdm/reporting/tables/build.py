@@ -256,7 +256,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Returns a text with the numbers of motions and replications for most values.
+    """Returns text that states the numbers of motions and replications for most values.
 
     The number of real motions is added if it is different.
     """

@@ -143,7 +143,7 @@ def rendered(table: Table, suffix: str) -> Markup:
 
 
 def _unranked(table: Table) -> str:
-    """Returns the kinds of rows that are not ranked; "" if all rows are ranked."""
+    """Returns the kinds of rows that are not ranked, or "" if all rows are ranked."""
     lines = [line for part in table.parts for line in part.lines]
     kinds = []
     if any(line.facts.get("baseline") for line in lines):

@@ -58,7 +58,7 @@ def _sizes(config: Config) -> dict[str, float]:
 
 
 def setting_text(value: Any) -> str:
-    """Returns the value of a setting as a cell of a table."""
+    """Returns the value of a setting as the text of a table cell."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):

@@ -129,7 +129,7 @@ def as_list(value: Any) -> list[Any]:
 
 
 class Figure(ClosedSchema):
-    """A figure that plots columns of a part over an option of its rows; a scatter plot with `points`."""
+    """Plots columns of a part over an option of its rows; with `points`, as a scatter plot."""
 
     part: str
     x: str

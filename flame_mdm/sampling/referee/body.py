@@ -30,14 +30,14 @@ SHOULDERS, ELBOWS, WRISTS = (pair(name) for name in ("shoulder", "elbow", "wrist
 
 
 class Body:
-    """A motion with joints (F, 22, 3), resampled, smoothed, and scaled to legs of `LEG` meters.
+    """A motion that is resampled, smoothed, and scaled so that the legs are `LEG` meters long.
 
     Its frame rate is `RATE`. All distances are measured on the scaled body, in meters. Body
     coordinates have the axes left, up and forward, relative to the heading of the body. Their
     origin is the point on the floor below the pelvis.
 
     Args:
-        joints: (F, 22, 3) joints of SMPL in meters, y up.
+        joints: (F, 22, 3) positions of SMPL's joints in meters, y up.
         fps: frames per second.
 
     Raises:
@@ -82,7 +82,7 @@ class Body:
 
     @cached_property
     def height(self) -> np.ndarray:
-        """Height (F, 22) of all joints above the floor."""
+        """Heights (F, 22) of all joints above the floor."""
         return self.joints[..., 1] - self.floor[:, None]
 
     @cached_property
@@ -109,7 +109,7 @@ class Body:
 
     @cached_property
     def seen(self) -> np.ndarray:
-        """Joints (F, 22, 3) in body coordinates: left, up, forward."""
+        """Joint positions (F, 22, 3) in body coordinates: left, up, forward."""
         offset = (self.joints - self.joints[:, [PELVIS]])[..., [0, 2]]
         aside = (offset * self.left[:, None]).sum(-1)
         ahead = (offset * self.forward[:, None]).sum(-1)

@@ -29,7 +29,7 @@ BREAK = 0.5
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer to the question whether a motion shows a claim, with the evidence.
+    """The answer to the question of whether a claim about a motion is true, with the evidence.
 
     Attributes:
         claim: the claim.
@@ -99,7 +99,7 @@ class Judgment:
 
     @property
     def accuracy(self) -> float | None:
-        """Fraction of the decided claims that are true; None if no claim is decided."""
+        """Fraction of the decided claims that are true, or None if no claim is decided."""
         return self.true / self.decided if self.decided else None
 
     def __str__(self) -> str:
@@ -117,13 +117,13 @@ def judge(
     "no" or "cannot tell". docs/referee.md lists what can be checked.
 
     Args:
-        motion: a motion on SMPL's 22 joints, or joints (F, 22, 3) in meters, y up.
+        motion: a motion on SMPL's 22 joints, or joint positions (F, 22, 3) in meters, y up.
         text: the sentence. Default: the motion's own text.
-        fps: frames per second; required for joints.
+        fps: frames per second; required for joint positions.
 
     Raises:
-        UserError: If the motion has a different skeleton, is shorter than 0.4 seconds, or is not
-            finite; if there is no text; or if joints are passed without `fps`.
+        UserError: If the motion has a different skeleton, is shorter than 0.4 seconds, or contains
+            NaN or infinity; if there is no text; or if joints are passed without `fps`.
     """
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
@@ -174,7 +174,7 @@ def claim_score(motions: Sequence[Motion]) -> list[float]:
 
 
 def verdicts(joints: np.ndarray, fps: float, claims: Sequence[Claim]) -> list[Verdict]:
-    """Returns the verdict on each claim about joints (F, 22, 3) in meters, y up."""
+    """Returns the verdict on each claim about joint positions (F, 22, 3) in meters, y up."""
     if not claims:
         return []
     body = Body(joints, fps)
@@ -205,7 +205,7 @@ def decide(body: Body, claim: Claim) -> Verdict:
 
 
 def _order(body: Body, claim: Claim) -> Reading:
-    """Measures how many seconds after the first part of an order the second part begins.
+    """Measures the seconds from the start of an order's first part to the start of its second part.
 
     If a part happens several times, the pair of times with the largest difference counts. An order
     is undecided if the answer for one of its parts is not "yes", or if the reverse order also happens.
@@ -251,7 +251,7 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 
 
 def _duration(body: Body, claim: Claim) -> Reading:
-    """Measures how long a claim is true, with interruptions of at most `BREAK` seconds.
+    """Measures for how long a claim is true, including interruptions of up to `BREAK` seconds.
 
     The score is -|log2(measured / claimed)|. The claim is undecided if it is not true without its
     duration.

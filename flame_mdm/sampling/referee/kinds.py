@@ -33,18 +33,19 @@ GROUPS = (
     "end",
 )
 ORDER = "order"
-# In binary logarithms: a duration that is off by at least 0.7 is false, by at most 0.4 true
+# In binary logarithms: a duration is false if it is off by at least 0.7, and true if it is off by
+# at most 0.4
 DURATION = (-0.7, -0.4)
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of claims.
+    """A kind of claim.
 
     Attributes:
         group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration, a
             side, a direction or a speed belongs to that group instead.
-        measure: function of a body and a claim.
+        measure: function that measures a claim on a body.
         no, yes: scores that were set by hand. A claim is false for scores up to `no`, and true from
             `yes` on. In between, the claim is undecided.
         is_timed: whether the spans of the reading show when the claimed event happens, so that an

@@ -26,9 +26,9 @@ SIDES = ("left", "right")
 MOVING = 0.25
 # Pelvis height of a standing body of normal size, in meters
 STANDING = 0.9
-# Smallest change in height, in meters, that counts as standing up or getting down without doubt
+# Smallest change in height, in meters, that undoubtedly counts as standing up or getting down
 RISE = 0.25
-# Distance in meters below `STANDING` at which the pelvis of a body that has already crouched begins
+# A body is low from the beginning if its pelvis starts more than this many meters below `STANDING`
 LOW = 0.1
 # Change of the angle of the trunk, in degrees, by which a person straightens up
 STRAIGHTENED = 30
@@ -64,7 +64,7 @@ def kneel(body: Body, claim: Claim) -> Reading:
 
 
 def lie(body: Body, claim: Claim) -> Reading:
-    """Measures the height of the pelvis and the neck above the floor; the higher one counts."""
+    """Measures the height above the floor of the pelvis or the neck, whichever is higher."""
     top = np.maximum(body.height[:, PELVIS], body.height[:, NECK])
     return existence(-top, "m above the floor", "trunk", 0.2)
 

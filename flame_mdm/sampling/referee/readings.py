@@ -24,7 +24,7 @@ class Reading:
         joint: joint or part of the body.
         spans: start and end, in seconds, of each time span where the claim is true or nearly true.
         unclear: reason why a high score does not make the claim true; "" = none.
-        signal: values (F,) that show for each frame whether the claim is true; None if
+        signal: values (F,) that show for each frame whether the claim is true, or None if
             individual frames do not show it.
         level: minimum value of `signal` at which the claim is true; None = the middle of the kind's
             band.

@@ -107,7 +107,7 @@ def read_claims(text: str) -> list[Claim]:
 
 
 def _plain(text: str) -> str:
-    """Converts a text to lower case, and removes hyphens and apostrophes.
+    """Converts text to lower case, and removes hyphens and apostrophes.
 
     Joined phrases become one word.
     """
@@ -300,7 +300,7 @@ def _side(text: str, limb: str) -> str | None:
 
 
 def _amount(text: str, kind: str) -> int | None:
-    """Returns the number of repetitions that a clause states for a kind; None if it states none."""
+    """Returns the number of repetitions that a clause states for a kind, or None."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     nouns = COUNT_NOUNS[kind]

@@ -252,7 +252,7 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model for sampling, and the body to draw. None stands for the mannequin."""
+    """A model for sampling, and the body to draw (None = the mannequin)."""
 
     model: MotionGenerator
     body: Mesh | None
@@ -272,7 +272,9 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         False,
         "also draw the clean estimates of the first motion during sampling, as trajectory.png",
     )
-    mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
+    mp4: bool = option(
+        False, 'also write motions.mp4; requires pip install "flame-mdm[video]"', video
+    )
     device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:

@@ -20,7 +20,7 @@ from flame_mdm.safe_io.paths import check_tree
 RECIPE = "student.yaml"
 """File name of the student's recipe in its run directory.
 
-Training reads the recipe from this file, also in jobs that a launcher starts.
+All training processes read this file, including jobs that a launcher starts.
 """
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 

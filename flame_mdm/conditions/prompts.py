@@ -41,7 +41,7 @@ def read_prompt(
     splits: bool = False,
     check_words: bool = True,
 ) -> ReadPrompt:
-    """Reads a text as a model reads it.
+    """Reads a prompt as the model reads it.
 
     Args:
         prompt: the text.
@@ -51,8 +51,8 @@ def read_prompt(
         max_words: maximum number of words that the model reads in a caption; None = no limit.
         splits: whether a sentence with several actions is split into one part per action. This
             applies only to texts with a single part.
-        check_words: whether the model's words for actions replace the words of the text. A text is
-            then also rejected if the model knows none of its content words.
+        check_words: whether the model's words for actions replace the words of the text. The text
+            is then also rejected if the model knows none of its content words.
 
     Raises:
         UserError: If the model does not understand a part.
@@ -83,10 +83,10 @@ def _with_actions(
     max_words: int | None,
     splits: bool,
 ) -> ReadPrompt:
-    """Reads a text for a model whose captions describe single actions.
+    """Reads a prompt for a model whose captions describe single actions.
 
-    Unless it is split, a text keeps its parts. If a part names several actions, the model reads the
-    words of the part unchanged.
+    Unless it is split, the prompt keeps its parts. If a part names several actions, the model reads
+    the words of the part unchanged.
     """
     readings: list[Reading]
     if splits:

@@ -60,7 +60,7 @@ class PretrainedText(ConditionEncoder):
     Raises:
         UserError: If a caption is encoded and the model is not pinned, its file is not the
             published file, or its width is not `features`.
-        FileNotFoundError: If a caption is encoded and the model is neither in the cache nor can be
+        FileNotFoundError: If a caption is encoded and the model is not in the cache and cannot be
             downloaded.
 
     Example:

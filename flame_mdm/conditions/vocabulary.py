@@ -55,7 +55,7 @@ SUBJECT = (
 
 
 def words(text: str) -> list[str]:
-    """Returns the words of a text, lowercased, without punctuation."""
+    """Returns the words of the text in lower case, without punctuation."""
     return WORD.findall(text.lower())
 
 
@@ -134,7 +134,7 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
 
 def check_known(text: str, facts: Mapping[str, Any]) -> None:
-    """Checks that a model knows at least one content word of a text.
+    """Checks that a model knows at least one content word of the text.
 
     Raises:
         UserError: If the model knows no content word of the text.
@@ -151,12 +151,12 @@ def _content(text: str) -> list[str]:
 
 
 def unread_words(text: str, max_words: int | None) -> list[str]:
-    """Returns the words of a text after the first `max_words`, or [] if `max_words` is None."""
+    """Returns the words of the text after the first `max_words`, or [] if `max_words` is None."""
     return [] if max_words is None else words(text)[max_words:]
 
 
 def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
-    """Returns the content words of a text that the model does not know in any form."""
+    """Returns the content words of the text that the model does not know in any form."""
     seen = facts.get("vocabulary")
     return (
         [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
@@ -164,7 +164,7 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 
 
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
-    """Returns the question " Did you mean '...'?" for a text with unknown words.
+    """Returns the question " Did you mean '...'?" for text with unknown words.
 
     The question quotes the text with its unknown words replaced by known words. If there are no
     such words, it quotes the nearest training caption that contains a content word of the text.
@@ -262,7 +262,7 @@ def plainest(captions: Iterable[str]) -> list[str]:
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
-    """Returns the captions that share the largest fraction of their words with a text, best first.
+    """Returns the captions that share the largest fraction of their words with the text, best first.
 
     The list is empty if no caption shares a word with the text.
     """

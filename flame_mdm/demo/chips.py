@@ -1,4 +1,4 @@
-"""The demo's interpretation of a text, as HTML.
+"""The demo's interpretation of the text, as HTML.
 
 Each action and attribute is shown as a chip, and can be changed with one click.
 """

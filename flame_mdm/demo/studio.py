@@ -209,7 +209,7 @@ def _plan(
 
 
 def check_length(request: DemoRequest) -> None:
-    """Raises `UserError` if the parts of a text are longer than the page allows."""
+    """Raises `UserError` if the parts of the text are longer than the page allows."""
     parts = read_parts(request.text) if request.text else []
     if request.total_seconds(parts) > MAX_SECONDS:
         raise UserError(f"the parts are too long. Use at most {MAX_SECONDS} seconds in total")

@@ -227,7 +227,7 @@ def _layout(studio: Studio) -> SimpleNamespace:
                     ui.guidance_scale = gr.Textbox(label="Guidance", **number)
                     ui.num_inference_steps = gr.Textbox(label="Steps", **number)
                     ui.sampler = gr.Dropdown(samplers, value=None, label="Sampler", min_width=120)
-                label = "Clean up: smooth motion, feet that do not slide (not with a path)"
+                label = "Clean up: smooth the motion and keep feet from sliding (not with a path)"
                 ui.cleanup = gr.Checkbox(True, label=label)
                 ui.split = gr.Checkbox(True, label="Split a sentence into its actions")
             with gr.Accordion("Words the model knows", open=False):
@@ -314,7 +314,7 @@ def _verdicts(name: str, motion: Motion) -> str:
 
 
 def _understood(studio: Studio, request: DemoRequest) -> str:
-    """Returns the chips for a text and the messages about it."""
+    """Returns the chips for the text and the messages about it."""
     notes = "".join(_note("warning", line) for line in studio.advice(request))
     readings, reader = studio.readings(request), studio.reader(request.model)
     if not readings or reader is None:
@@ -325,7 +325,7 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 
 def _refusal(error: NotUnderstood) -> str:
-    """Returns the message for a text without an action that the model knows.
+    """Returns the message for text without an action that the model knows.
 
     The nearest actions are shown as buttons with pictures.
     """
@@ -340,7 +340,7 @@ def _refusal(error: NotUnderstood) -> str:
 
 
 def _still(text: str) -> str:
-    """Returns the address of a picture of the action in a text, or "" if there is none."""
+    """Returns the address of a picture of the action in the text, or "" if there is none."""
     mention = understand(text).mentions[0]
     image = still(mention.action, mention.attributes.get("side"))
     if image is None:

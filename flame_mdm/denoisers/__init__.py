@@ -28,11 +28,12 @@ class Denoiser(nn.Module, ABC):
 
     Example:
         >>> import torch
-        >>> class Mean(Denoiser):  # a denoiser that returns the mean of the motion ...     def
-        forward(self, x_t, t, mask, cond): ...         return x_t.mean(1,
-        keepdim=True).expand_as(x_t) >>> x_t, mask = torch.ones(2, 5, 3), torch.ones(2, 5,
-        dtype=torch.bool) >>> Mean()(x_t, torch.zeros(2), mask, Condition(x_t[:, 0], x_t[:, :0],
-        None)).shape torch.Size([2, 5, 3])
+        >>> class Mean(Denoiser):  # a denoiser that returns the mean of the motion
+        ...     def forward(self, x_t, t, mask, cond):
+        ...         return x_t.mean(1, keepdim=True).expand_as(x_t)
+        >>> x_t, mask = torch.ones(2, 5, 3), torch.ones(2, 5, dtype=torch.bool)
+        >>> Mean()(x_t, torch.zeros(2), mask, Condition(x_t[:, 0], x_t[:, :0], None)).shape
+        torch.Size([2, 5, 3])
     """
 
     #: Whether padding has no influence on real frames. If False, the network attends to padding,

@@ -77,7 +77,7 @@ class FlowMatching(Process):
         return features
 
     def training_times(self, u: Tensor) -> Tensor:
-        """Converts uniform numbers (B,) to times (B,) in (0, 1) with the `time_distribution`."""
+        """Converts uniform numbers (B,) to times (B,) in (0, 1), following `time_distribution`."""
         return u if self.time_distribution == "uniform" else torch.special.ndtri(u).sigmoid()
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:

@@ -212,7 +212,7 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD` with the differences in all metrics, or a reason not to compare.
+    """Returns rows for `HEAD` with the differences in all metrics, or why there are none.
 
     Both results must come from the same evaluation: the same protocol, data and extractor.
     """

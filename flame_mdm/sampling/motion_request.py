@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # Maximum number of samples per request. All samples are kept in memory until the last one is
 # complete.
 MAX_SAMPLES = 10_000
-# Maximum number of characters in a text. Captions in the data sets are far shorter.
+# Maximum number of characters per text. Captions in the data sets are far shorter.
 MAX_TEXT_LENGTH = 2000
 # Duration in seconds of a motion or a part, if neither the request nor a number of repetitions
 # determines it
@@ -405,7 +405,7 @@ def _selected(keywords: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
 
 
 def check_length(text: str) -> None:
-    """Raises `UserError` if a text has too many characters."""
+    """Raises `UserError` if the text has too many characters."""
     if len(text) > MAX_TEXT_LENGTH:
         raise UserError(
             f"{shortened(text, 60)}: {len(text):,} characters are too many. Use at most {MAX_TEXT_LENGTH:,}"

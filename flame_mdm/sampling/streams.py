@@ -241,7 +241,7 @@ class OnlineCleanup:
 
 
 class PastBlock(NamedTuple):
-    """A past block of a single stream, which can be cut.
+    """A past block of a single stream, which `go_back` can cut.
 
     `begin` is the index of its first frame. `number` is the index of the block, which determines
     its noise.
@@ -283,7 +283,7 @@ class Schedule:
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames from a frame to the next change, or None without one."""
+        """Returns the number of frames from a frame to the next change, or None if none follows."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 
@@ -566,7 +566,7 @@ def check_streams(model: MotionGenerator) -> None:
 
 
 def read_text(model: MotionGenerator, text: str) -> str:
-    """Returns a text in the form that a model reads.
+    """Returns the text in the form that the model reads.
 
     If the text names one action of the model's captions, it is rewritten in the words of these
     captions.

@@ -71,7 +71,7 @@ class Abilities:
         return any(len(step) > 1 for text in marked for step in understand(text).steps)
 
     def has_words(self, text: str) -> bool:
-        """Returns whether all words of a text are in the vocabulary."""
+        """Returns whether all words of the text are in the vocabulary."""
         return all(word in self.vocabulary for word in text.replace("-", " ").split())
 
     def supports(self, action: str, name: str, value: Value) -> bool:

@@ -54,11 +54,11 @@ def distance(first: str, second: str, most: int) -> int:
 
 @cache
 def corrections(word: str) -> tuple[str, ...]:
-    """Returns the words of the tables that a misspelled word may stand for; possibly none.
+    """Returns the words of the tables that a misspelled word may stand for.
 
-    All returned words are equally likely: they differ from the misspelled word by the same number
-    of edits of the same kind. A word of up to five letters may have one wrong letter, and a longer
-    word may have two. Numbers are not corrected.
+    The tuple is empty if no word is similar. All returned words are equally likely: they differ
+    from the misspelled word by the same number of edits of the same kind. A word of up to five
+    letters may have one wrong letter, and a longer word may have two. Numbers are not corrected.
     """
     if len(word) <= NEVER_CORRECTED or any(char.isdecimal() for char in word):
         return ()

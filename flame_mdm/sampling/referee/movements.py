@@ -35,7 +35,10 @@ SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backwa
 
 
 def travel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled in the claimed direction of the body or, if none, in any."""
+    """Measures the distance traveled in the claimed direction, or in any if none is claimed.
+
+    The direction is relative to the body.
+    """
     speed = body.speed
     if claim.direction:
         toward = body.velocity @ np.array(SEEN[claim.direction])

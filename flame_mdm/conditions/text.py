@@ -37,8 +37,8 @@ class PretrainedText(ConditionEncoder):
         features: C, width of the model's outputs.
         max_tokens: maximum number of word pieces per caption, including special tokens. Longer
             captions are truncated.
-        pooling: how a caption is converted to one vector. "projection" is CLIP's projected text
-            embedding, not normalized. "mean" is the mean of the real tokens, including special
+        pooling: how a caption is converted to one vector. "projection" is CLIP's projected,
+            unnormalized text embedding. "mean" is the mean of the real tokens, including special
             tokens (Reimers & Gurevych 2019). "pooler" is tanh of a linear map of the first token,
             as in BERT. RoBERTa is published without this map, and transformers initializes it with
             new random numbers each time. FLAME was trained with one such map. In this

@@ -1,4 +1,4 @@
-"""Connections to the demo's server, with deadlines and limits on their number, in total and per address."""
+"""Connections to the demo's server, with deadlines, a total limit and a limit per address."""
 
 import asyncio
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Guard of the demo's server, which passes on requests from the page itself and refuses all others."""
+"""The guard of the demo's server, which refuses all requests except those from the page."""
 
 import asyncio
 import ipaddress

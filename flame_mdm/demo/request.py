@@ -1,4 +1,4 @@
-"""Requests to the demo, within the limits of a public page, with links and equivalent Python programs."""
+"""Requests to the demo: their limits, their links, and equivalent Python programs."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -113,7 +113,7 @@ class DemoRequest(BaseModel):
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
         """Returns the steps: for each step, the index of the motion to edit, and keywords for `generate` or `edit`.
 
-        The index is None in the first step, which generates.
+        The index is None in the first step, which generates motions.
         """
         shared = self.model_dump(
             include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True

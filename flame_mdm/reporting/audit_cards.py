@@ -108,7 +108,7 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns a tuple, which is larger for cards that fit the evaluated data better.
+        """Returns a sort key, which is larger for cards that fit the evaluated data better.
 
         Cards with the same length limits are best, followed by cards for the test split, cards for
         the same data, and cards with more motions.

@@ -80,7 +80,7 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
 
 
 def _direct_motions(folder: Path) -> list[Path]:
-    """Returns the sorted motion files directly in a folder, without hidden files."""
+    """Returns the sorted motion files directly in a folder, except hidden files."""
     files = (
         path for path in folder.iterdir() if path.suffix.lower() in ENDINGS and path.name[0] != "."
     )

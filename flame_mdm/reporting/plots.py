@@ -30,7 +30,7 @@ Curve = Mapping[int, float]  # values by step
 
 @dataclass
 class Series:
-    """Points (x, y) in one color, in ascending order, drawn as a line, a dashed line or dots.
+    """Points (x, y) in ascending order, drawn in one color as a line, a dashed line or dots.
 
     Each point may have the half width of a 95 % interval.
     """

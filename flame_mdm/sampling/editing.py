@@ -60,11 +60,11 @@ class Edited(Motion):
 
 @dataclass(frozen=True)
 class ResolvedEdit:
-    """An edit for one model, with the original motion.
+    """An edit resolved for one model, together with the original motion.
 
     Attributes:
-        resolved: the request, with the kept part.
-        original: the motion, with the features of the model.
+        resolved: the resolved request, which includes the kept part.
+        original: the original motion, with the model's features.
         keep: (F, D) bool, features to keep.
         kept_joints: (F, J) bool, joints to keep.
     """
@@ -209,7 +209,7 @@ def _original(
     fps: float | None,
     cut: Sequence[float] | None,
 ) -> Motion:
-    """Returns the motion to edit, or its part `cut`, with features of the representation."""
+    """Returns the motion to edit (or its part `cut`) with features of the representation."""
     if isinstance(motion, str | Path):
         return read_motion(representation, motion, fps=fps, cut=cut)
     if not isinstance(motion, Motion):

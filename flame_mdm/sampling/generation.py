@@ -50,8 +50,8 @@ def generate(
         texts: what the person does; one text or several.
         score: function that scores the `candidates` without faults. The candidate with the highest
             score is kept. Default: the candidate with the fewest faulty frames is kept.
-        edit: part of a motion of the same length to keep in every sample, with `known` and `keep`
-            (1, F, D).
+        edit: an edit that keeps part of a motion of the same length in every sample. `known` and
+            `keep` have the shape (1, F, D).
         stages: list that receives clean estimates of the first motion, at equal intervals of the
             sampling, and then the motion itself (MFM, figure 5).
         keywords: number and length of the motions, and sampling options: `actions` (instead

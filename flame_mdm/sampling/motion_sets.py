@@ -275,7 +275,7 @@ def motion_of(clip: Clip) -> Motion:
 
 
 def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
-    """Returns in-place clips on one skeleton, with one skin.
+    """Returns in-place clips that share one skeleton and one skin.
 
     The rotations of all clips are computed together. Programs apply all animations of a set to the
     skeleton of the first file, so all clips must have the same rest pose.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motions from files and prepared data sets, with the features of a model."""
+"""Reads motions from files and prepared data sets, and computes the features of a model."""
 
 import math
 from collections.abc import Sequence

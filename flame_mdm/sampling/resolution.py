@@ -67,7 +67,8 @@ class ResolvedRequest:
         is_sequence: whether the motions are sampled in overlapping windows.
         before: features (F, D), in the data's units, of the motion that all motions continue.
         targets: positions and poses to reach.
-        edit: part of a motion that all motions keep, with `known` and `keep` (1, F, D).
+        edit: an edit that keeps part of a motion in all motions. `known` and `keep` have the shape
+            (1, F, D).
         warnings: lines for the user about the motion to continue (what was left out of its file, or
             looks wrong), about differences between a text and what is sampled, and about words that
             the model does not know or read.

@@ -1,4 +1,4 @@
-"""`Body`: a motion on which claims are measured, with its frame rate, size and position normalized."""
+"""`Body`: a motion with normalized frame rate, size and position, for measuring claims."""
 
 from functools import cached_property
 

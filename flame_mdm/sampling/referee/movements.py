@@ -169,7 +169,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures how much slower the body travels in the last 0.3 seconds than at its fastest, as a fraction."""
+    """Measures the fraction by which the last 0.3 seconds are slower than the fastest 0.3 seconds."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan

@@ -57,7 +57,7 @@ def sit(body: Body, claim: Claim) -> Reading:
 
 
 def kneel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance between a knee and the floor, with the pelvis above the knee."""
+    """Measures the distance between a knee and the floor while the pelvis is off the floor."""
     is_up = body.height[:, PELVIS] > 0.25
     knee = body.height[:, KNEES].min(1)
     return existence(np.where(is_up, -knee, -0.5), "m above the floor", "knee", 0.2)
@@ -161,7 +161,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the final distance from the start, relative to the largest distance from the start."""
+    """Measures the final distance from the start as a fraction of the largest one."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])

@@ -1,4 +1,4 @@
-"""The training step of the authors' code, GuyTevet/motion-diffusion-model, run from a clone of it.
+"""The training step of the authors' code, GuyTevet/motion-diffusion-model, run from a clone.
 
 The authors' network, diffusion, optimizer and loss logging are unchanged. CLIP is replaced with a
 stub that returns zeros, as in the framework's step. The body model is left out, because a step on

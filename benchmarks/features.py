@@ -17,7 +17,7 @@ STILL = 0.002  # squared displacement of a foot that is in contact with the floo
 
 
 def motion(seed: int) -> Tensor:
-    """Returns the joints (FRAMES, 22, 3) in meters of a body that bends its limbs and moves in a circle."""
+    """Returns joint positions (FRAMES, 22, 3), in meters, of a body that moves in a circle."""
     rng = torch.Generator().manual_seed(seed)
     phase = torch.linspace(0, 2 * torch.pi, FRAMES, dtype=torch.float64)
     bend = (

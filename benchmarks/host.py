@@ -6,10 +6,10 @@ trains the same network with the same masked loss, fused optimizer and clipping 
 in memory. It logs nothing and has no averaged weights, loggers or checkpoints. All measurements run
 on one thread and alternate.
 
-The time of a step is the mean over all steps after the first ones, so that it also includes work for
-several steps: planned batches, logged values, and checks of the losses. Times are thread times,
-which exclude other programs on the machine. The parts of the framework's step are timed one by one,
-without Lightning.
+The time of a step is the mean over all steps after the first ones, so that it also includes work
+that serves several steps: planned batches, logged values, and checks of the losses. Times are
+thread times, which exclude other programs on the machine. The parts of the framework's step are
+timed one by one, without Lightning.
 """
 
 import io
@@ -39,7 +39,7 @@ from flame_mdm.task import GeneratorTask
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.fit import fit
 
-WARM = 50  # number of first steps that are not counted
+WARM = 50  # number of initial steps that are not counted
 TINY = [
     "trainer.accelerator=cpu",
     "trainer.val_check_interval=1000000",

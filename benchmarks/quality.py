@@ -83,7 +83,9 @@ def measure(settings: Settings) -> Section:
     for name, speeds in read_runs(folder).items():
         seeds = sorted(speeds["reference"])
         if len(seeds) < 2 or seeds != sorted(speeds["fast"]):
-            raise SystemExit(f"{folder}: {name}: needs two or more seeds, the same at both speeds")
+            raise SystemExit(
+                f"{folder}: {name}: requires two or more seeds, the same at both speeds"
+            )
 
         rows = tables.setdefault(f"{name}, {len(seeds)} seeds", [])
         for metric in speeds["reference"][seeds[0]]:

@@ -40,7 +40,7 @@ RUNS = [
     (FlowMatching(), "rk4", 10),
     (FlowMatching(), "dopri5", 1),
 ]
-"""Process, sampler and number of steps; dopri5 chooses its own steps."""
+"""Process, sampler and number of steps. dopri5 chooses its own steps."""
 
 
 class Counted:

@@ -1,7 +1,7 @@
 """Times text encoding with the language model and from the cache: `python benchmarks/text.py`.
 
-The language model is sentence-BERT from the extra `offline`, with tokens, so that nothing is
-downloaded.
+The language model is sentence-BERT from the extra `offline`, so that nothing is downloaded. It
+returns token features.
 """
 
 import itertools

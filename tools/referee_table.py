@@ -1,4 +1,4 @@
-"""Compares systems by the referee and by R-precision; writes docs/benchmarks/referee_systems.json.
+"""Compares systems with the referee and R-precision, for docs/benchmarks/referee_systems.json.
 
     python tools/referee_table.py [data/bandai-humanml-clean-smpl22 ... runs/bandai/mdm_small/default ...]
 

@@ -256,7 +256,7 @@ def real_windows(count: int, length: int, fps: float, seed: int) -> np.ndarray:
 
 
 def value(metric: FootSkating | Jitter, joints: np.ndarray) -> float:
-    """Returns the value of a metric for motions (B, F, 22, 3)."""
+    """Returns a metric computed over motions (B, F, 22, 3)."""
     mask = torch.ones(joints.shape[:2], dtype=torch.bool)
     metric.update(torch.from_numpy(joints), mask, keys=torch.arange(len(joints)))
     return metric.compute()

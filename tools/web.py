@@ -78,7 +78,7 @@ def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None =
 
     Args:
         model: the model for single motions.
-        out: the folder.
+        out: folder in which the page is written.
         streaming: the model for the stream, which continues frames. Default: `model`, if it
             continues frames. Otherwise, there is no page with a stream.
 
@@ -139,7 +139,7 @@ def write_model(model: MotionGenerator, folder: Path) -> None:
 
 
 def write_language(out: Path) -> None:
-    """Writes `language.json` and `language.bin`, the tables with which the page understands texts.
+    """Writes `language.json` and `language.bin`, the tables with which the page interprets text.
 
     `language.bin` contains the word vectors, with 8 bits per number, followed by the words.
     """
@@ -239,7 +239,7 @@ def fetch_runtime(folder: Path) -> None:
             archive.
     """
     if shutil.which("npm") is None:
-        raise UserError("make web needs npm to download onnxruntime-web. Install Node.js")
+        raise UserError("make web requires npm to download onnxruntime-web. Install Node.js")
     with tempfile.TemporaryDirectory() as temporary:
         command = ["npm", "pack", RUNTIME, "--silent", "--pack-destination", temporary]
         if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode:

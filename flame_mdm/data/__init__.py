@@ -49,8 +49,8 @@ class Clip:
     # (first, length): the part of the motion that is the clip. Consecutive clips with the same
     # array object share its frames in the store. Only for representations with one row per frame.
     window: tuple[int, int] | None = None
-    # Joints (F', J, 3) in meters at the frame rate of the recording, for protocols that compare
-    # motions at that rate.
+    # Joint positions (F', J, 3) in meters at the frame rate of the recording, for protocols that
+    # compare motions at that rate.
     reference: np.ndarray | None = None
     # Identifier of the license of this motion, such as "MIT". Empty if one license applies to all
     # motions of the data set.
@@ -75,7 +75,7 @@ class MotionSource(ABC):
     # Empty = sentences are not split.
     verbs: tuple[str, ...] = ()
     license: str = ""
-    """License of all motions, a key in `licenses.yaml` such as "MIT".
+    """License of all motions, given as a key in `licenses.yaml`, such as "MIT".
 
     It is empty if the license is unknown, or if clips have individual licenses.
     """
@@ -98,9 +98,9 @@ class MotionSource(ABC):
     The list is complete once `clips` is exhausted. Commands then exit with code 1, because the user
     should correct the files.
     """
-    # Number of processes that read and encode; 0 = one per core, 1 = only this process
+    # Number of processes that read and encode motions; 0 = one per core, 1 = only this process
     workers: int = 0
-    # Names to leave out
+    # Names of motions to leave out
     exclude: Collection[str] = ()
 
     @cached_property
@@ -149,12 +149,15 @@ class MotionSource(ABC):
     def may_share_captions(self, license: str) -> bool:
         """Returns whether a checkpoint may contain the captions of a clip with this license.
 
-        "" = the license of the data set.
+        An empty string stands for the license of the data set.
         """
         return self.captions_may_be_shared
 
     def licenses(self) -> set[str]:
-        """Returns the licenses of all motions without reading the motions; "" = unknown license."""
+        """Returns the licenses of all motions without reading the motions.
+
+        An empty string stands for an unknown license.
+        """
         return {self.license}
 
     @abstractmethod
@@ -179,7 +182,7 @@ class MotionSource(ABC):
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def suit(self, representation: "Representation") -> None:  # noqa: B027 (most sources yield one kind of motion)
-        """Configures the source for a representation, so that `clips` yields its raw motions.
+        """Configures the source for a representation, so that `clips` yields raw motions for it.
 
         Raises:
             UserError: If the options do not fit the representation.
@@ -188,7 +191,7 @@ class MotionSource(ABC):
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns the mean and std (D,) that are published with encoded features.
 
-        None = they are computed from the training clips.
+        Returns None if they must be computed from the training clips.
         """
         return None
 
@@ -269,7 +272,7 @@ def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -
 
 
 def swap_sides(text: str) -> str:
-    """Swaps left with right, and clockwise with counterclockwise, in a text."""
+    """Swaps left and right, and clockwise and counterclockwise, in the text."""
     pairs = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
     pairs |= {"counterclockwise": "clockwise", "anticlockwise": "clockwise"}
 
@@ -281,7 +284,7 @@ def swap_sides(text: str) -> str:
 
 
 def mirrored(clip: Clip, motion: np.ndarray, actions: Sequence[str]) -> Clip:
-    """Returns the mirror image of a clip; `motion` is its mirrored motion.
+    """Returns the mirror image of a clip, given its mirrored motion.
 
     Left and right are swapped in the captions, the action and the attributes.
     """

@@ -89,7 +89,7 @@ class Lesson(MotionSource):
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips, with their style in the captions, then the clips of the store.
+        """Yields the user's clips, whose captions name their style, then the clips of the store.
 
         Raises:
             UserError: If one of the user's motions cannot be read. The folder contains only a few
@@ -112,7 +112,7 @@ def styled(caption: str, name: str) -> str:
 def check_clips(path: str | Path, fps: float) -> None:
     """Checks the motions in a folder before training.
 
-    Prints the skeletons of the motions, and what was left out of them.
+    Prints the skeletons of the motions, and the parts of them that were left out.
 
     Raises:
         UserError: If a motion cannot be read, its floor rises, or its body floats.
@@ -150,7 +150,7 @@ def fault_of(joints: np.ndarray, fps: float) -> str:
 
 
 class LessonBatches(Sampler[list[Draw]]):
-    """Joins the batches of several streams into one.
+    """Joins the corresponding batches of several streams into one batch.
 
     Args:
         rows: for each stream, the indices of its clips in the data set.
@@ -170,7 +170,7 @@ class LessonBatches(Sampler[list[Draw]]):
 
 
 class LessonData(MotionDataModule):
-    """Data module for a `Lesson`: half of each batch are the user's clips, half are prior clips."""
+    """Data module for a `Lesson`. Half of the clips in each batch are the user's clips."""
 
     def halves(self) -> list[np.ndarray]:
         """Returns the indices of the user's training clips, and the indices of the prior store's clips."""

@@ -38,11 +38,11 @@ _DAMAGE = (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError)
 
 
 def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
-    """Yields names and contents of the files in a zip or tar archive for which `is_wanted` is true.
+    """Yields the names and contents of the files that `is_wanted` selects in a zip or tar archive.
 
     Raises:
-        UserError: If the archive is damaged, expands disproportionately or has too many members.
-            Also if a wanted file is a link, sparse or encrypted.
+        UserError: If the archive is damaged, expands disproportionately or has too many members,
+            or if a wanted file is a link, sparse or encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -60,10 +60,10 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
 
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
-    """Returns a path that is a folder, or a temporary folder with the `members` of an archive.
+    """Returns `path` if it is a folder, or a temporary folder with the `members` of the archive.
 
-    The temporary folder is removed together with `owner`. The returned folder is the deepest
-    subfolder that contains all members.
+    The temporary folder is removed together with `owner`. In this folder, the deepest subfolder
+    that contains all members is returned.
 
     Raises:
         UserError: For the same reasons as `members`, and if a member would be unpacked outside

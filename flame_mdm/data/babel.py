@@ -20,7 +20,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.safe_io import naming, read_json
 
 FPS = 20.0
-# Number of frames in a clip, and between the starts of windows for the same label
+# Number of frames in a clip, and number of frames between the starts of windows for the same label
 LENGTH, STRIDE = 128, 10
 # Words, categories, start and end
 Segment = tuple[str, list[str] | None, float | None, float | None]
@@ -34,7 +34,7 @@ PARTS = {
 
 
 class Label(NamedTuple):
-    """A label: a text for a segment of a motion."""
+    """A label: the text that describes a segment of a motion."""
 
     motion: str  # key of the AMASS recording, as returned by `amass.key_of`
     text: str
@@ -63,9 +63,10 @@ class Babel(MotionSource):
     frames. If a label is shorter than a clip, the clip continues past the end of the label. The
     label is left out if the motion ends before the clip.
 
-    Both splits train on BABEL's entire train part, and test on 20 % of its val part. The project's
-    own split draws 20 % of the motions, not of the clips, so that no motion is in both val and
-    test. FLAME's split takes every fifth clip, so overlapping windows are in both val and test.
+    Both splits use BABEL's entire train part for training, and 20 % of its val part for testing.
+    The project's own split draws 20 % of the motions, not of the clips, so that no motion is in
+    both val and test. FLAME's split takes every fifth clip, so overlapping windows are in both val
+    and test.
 
     Args:
         path: folder of BABEL v1.0.

@@ -38,7 +38,7 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""Joint in the files for each SMPL joint, in order. spine1 lies between Hips and Spine."""
+"""Name of the joint in the files for each SMPL joint. spine1 lies between Hips and Spine."""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
 _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's left foot
@@ -92,7 +92,9 @@ WORDS = read_package_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styl
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Number of published takes per style in data set 2, by content; styles as in `STYLES_2`.
+"""Number of published takes per style in data set 2, by content.
+
+The styles are in the order of `STYLES_2`.
 
 Splits are drawn from these numbers, so that they do not depend on which files exist.
 """
@@ -216,7 +218,9 @@ class Bandai(MotionSource):
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
-    """Converts a BVH file to joints (F, 22, 3) float32 in meters, y up, or to an SMPL motion.
+    """Converts a BVH file to joint positions or to an SMPL motion.
+
+    Joint positions (F, 22, 3) are float32, in meters, with y up.
 
     Args:
         file: the BVH file.

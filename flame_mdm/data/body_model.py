@@ -54,10 +54,10 @@ def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
 def _rest_joints(
     regressor: Any, vertices: Any, tree: Any, joints: int, parents: tuple[int, ...]
 ) -> np.ndarray:
-    """Returns the rest joints (J, 3) of a model.
+    """Returns the rest positions (J, 3) of a model's joints.
 
     Raises:
-        ValueError: If the parents of its first joints are not `parents`.
+        ValueError: If the parents of the model's first joints are not `parents`.
     """
     regressor, vertices = np.asarray(regressor, np.float64), np.asarray(vertices, np.float64)
     numbers = np.asarray(tree)[0, 1 : len(parents)].tolist()
@@ -77,10 +77,10 @@ def _rest_joints(
 
 
 class Body(NamedTuple):
-    """The first 22 rest joints of SMPL+H as a function of the body's shape, in meters.
+    """Rest positions of SMPL+H's first 22 joints, in meters, as a function of the body's shape.
 
     Args:
-        rest: (22, 3), joints of the mean shape.
+        rest: (22, 3), joint positions of the mean shape.
         shape: (22, 3, 10), displacement of the joints per unit of each beta.
     """
 
@@ -88,9 +88,9 @@ class Body(NamedTuple):
     shape: torch.Tensor
 
     def joints(self, recording: Recording) -> np.ndarray:
-        """Returns the joints (F, 22, 3) float64 of a recording in meters.
+        """Returns the joint positions (F, 22, 3) float64 of a recording, in meters.
 
-        As in HumanML3D, y is up: AMASS's (-x, z, y).
+        As in HumanML3D, y is up: the coordinates are AMASS's (-x, z, y).
         """
         betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
         rest = self.rest + self.shape[..., : len(betas)] @ betas

@@ -39,7 +39,7 @@ def table_rows(
             where = f"{path}, line {rows.line_num}"
             if None in row or None in row.values():
                 raise UserError(
-                    f"{where}: the row needs one cell per column. Put texts that contain a comma in quotes"
+                    f"{where}: the row needs one cell per column. Put quotes around text that contains a comma"
                 )
             yield where, {name: cell.strip() for name, cell in row.items()}
 
@@ -55,7 +55,7 @@ def known_split(split: str) -> Split:
 def drawn_splits(
     sources: Mapping[str, str], stated: Mapping[str, Split | None]
 ) -> dict[str, Split]:
-    """Returns the split of each motion: the split in the table or, if it states none, a drawn split.
+    """Returns the split of each motion, which is either stated in the table or drawn.
 
     Splits are drawn with a hash of the source, so that all motions from a source are in one split.
     If no motion is drawn for training, the source with the highest hash in the largest split is
@@ -63,7 +63,7 @@ def drawn_splits(
 
     Args:
         sources: source of each motion, by name.
-        stated: split of each motion in the table, by name; None = not stated.
+        stated: split of each motion in the table, by name, or None if the table states no split.
     """
     of_sources: dict[str, Split] = {sources[name]: split for name, split in stated.items() if split}
     free = sorted(set(sources.values()) - set(of_sources))

@@ -1,6 +1,7 @@
 """The CMU motion capture database, with captions from HumanML3D, KIT-ML or the user.
 
-The motions are from http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH.
+The motions are from http://mocap.cs.cmu.edu, as ASF/AMC or converted to BVH. They are free for all
+uses.
 Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML).
 `docs/cmu.md` lists the required downloads, and how this data differs from HumanML3D and KIT-ML.
 """
@@ -104,7 +105,7 @@ class Item(NamedTuple):
 
 
 class CMU(MotionSource):
-    """Recordings of the CMU database with captions, on SMPL's 22 joints.
+    """Captioned recordings of the CMU database, converted to SMPL's 22 joints.
 
     The clips are HumanML3D's clips, recordings with KIT-ML's captions, or motions with the user's
     captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
@@ -171,7 +172,7 @@ class CMU(MotionSource):
 
     @cached_property
     def table(self) -> Path | None:
-        """The user's caption table; None if there is no table."""
+        """The user's caption table, or None if there is no table."""
         required(self.captions, f"it is the folder with the captions: {GET_IT}")
         path = self.captions / TABLE
         return path if path.exists() else None
@@ -376,7 +377,7 @@ def _parts(table: Path) -> dict[str, _Part]:
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
     """Returns the parts of each recording.
 
-    Their splits are stated in the table. Otherwise, they are drawn by source or, without a source,
+    If the table does not state their splits, the splits are drawn by source or, without a source,
     by subject.
     """
     sources = {
@@ -584,7 +585,7 @@ def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh
 
 
 def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:
-    """Returns a part as joints, or as an SMPL motion.
+    """Returns a part as joint positions or as an SMPL motion.
 
     An SMPL motion (F, 75) consists of the translation and the SMPL rotations of the adult body, in
     AMASS's coordinates.

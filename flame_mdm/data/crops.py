@@ -20,9 +20,9 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-# Index of a clip, and the number of the batch for which it is drawn; -1 in evaluation
+# Index of a clip, and the number of the batch for which it is drawn, which is -1 in evaluation
 Draw = tuple[int, int]
-# Id, features x (F, D), caption and action of a clip: the input of `collate`
+# Id, features x (F, D), caption and action of a clip, which `collate` takes as input
 Sample = tuple[str, Tensor, str | None, int | None]
 # Draws uniform integers, 0 <= integer < argument. The argument is a number or an array (B,).
 Below = Callable[[Any], Any]
@@ -49,7 +49,7 @@ class Crop(ABC):
 
         Args:
             frames: (B,) number of frames of each clip.
-            below: draws random integers.
+            below: function that draws random integers.
 
         Returns:
             First frame (B,) and number of frames (B,) of each sample.
@@ -80,8 +80,8 @@ class Units(Crop):
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
             raise UserError(
-                f"data.crop={self}: expected 1 <= unit <= min_frames <= max_frames, and "
-                "max_frames a multiple of unit"
+                f"data.crop={self}: expected 1 <= unit <= min_frames <= max_frames, "
+                "where max_frames is a multiple of unit"
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
@@ -101,7 +101,7 @@ class Whole(Crop):
     max_frames: int = 471
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns frame 0, and the length of the clip, at most `max_frames`."""
+        """Returns frame 0 and the length of the clip, limited to `max_frames`."""
         length = np.minimum(frames, self.max_frames)
         return np.zeros_like(length), length
 

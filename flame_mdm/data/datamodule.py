@@ -241,7 +241,7 @@ class MotionDataModule(LightningDataModule):
         self.choose_device()
 
     def choose_device(self, more: int = 0) -> torch.device | None:
-        """Returns the device on which the data set is kept; None = no device.
+        """Returns the device on which the data set is kept, or None if it is not kept on a device.
 
         `more` is the size of the text encoder's cache, in bytes.
         """

@@ -41,7 +41,7 @@ MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
-    """A file, and the name of one of its animations; None = the only animation."""
+    """A file, and the name of one of its animations, or None for its only animation."""
 
     path: Path
     animation: str | None = None
@@ -70,7 +70,8 @@ class Folder(MotionSource):
         motion: "joints" for representations of joint positions; "smpl" for representations of
             SMPL's rotations. AMASS files contain rotations, and the bones of BVH files determine
             them. For other files, rotations are fitted to the joints.
-        mirror: yield a mirrored copy after each clip of the training split; joints only.
+        mirror: whether a mirrored copy follows each clip of the training split. This requires
+            `motion="joints"`.
         exclude: motions to leave out, by their path in the folder without extension.
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about as many. Each clip
@@ -102,7 +103,7 @@ class Folder(MotionSource):
                 f"data.source.balance={balance}: expected a number of clips per action, or 0"
             )
         if mirror and motion == "smpl":
-            raise UserError("data.source.mirror=true: needs data.source.motion=joints")
+            raise UserError("data.source.mirror=true: requires data.source.motion=joints")
         self.path, self.motion, self.mirror, self.exclude = (
             Path(path),
             motion,
@@ -128,7 +129,7 @@ class Folder(MotionSource):
         self._representation: Representation | None = None
 
     def suit(self, representation: Representation) -> None:
-        """Configures the source for a representation, so that `clips` yields its raw motions.
+        """Configures the source for a representation, so that `clips` yields raw motions for it.
 
         Raises:
             UserError: If `motion` does not fit the representation.
@@ -250,7 +251,7 @@ class Folder(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, MotionFile]:
-        """Files, sorted, by their path in the folder without extension.
+        """Files by their path in the folder without extension, sorted by this path.
 
         If a file has several animations, each animation is named `PATH/ANIMATION`.
         """
@@ -318,7 +319,7 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Split of each motion, from the table or, if it states none, drawn as in `drawn_splits`."""
+        """Split of each motion, which is stated in the table or drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 
@@ -327,9 +328,9 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
     """Inserts a word before the captions of some actions.
 
     Args:
-        prefixes: the word, by action.
+        prefixes: the word to insert, by action.
         notes: captions and labels of all motions.
-        table: the file that contains the actions, for the message.
+        table: the file with the actions, which the error message names.
 
     Raises:
         UserError: If no motion has one of the actions.
@@ -349,7 +350,7 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
     """Raises `UserError` if the body is lying in most motions of a layout.
 
     Args:
-        folder: the folder, for the message.
+        folder: the folder named in the error message.
         uprights: `upright` of each motion (see `Doubts`), by layout.
     """
     for layout, values in uprights.items():

@@ -122,7 +122,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
 
 def find(path: Path, name: str) -> Path:
-    """Returns `path`, or the file of this name in `path` or a subfolder.
+    """Returns `path`, or the file with this name in `path` or a subfolder.
 
     The error for a missing file states where the data set is published.
     """
@@ -136,7 +136,7 @@ def find(path: Path, name: str) -> Path:
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns lists from a pickled dictionary, by name. Checks that they have equal length."""
+    """Returns the named lists in a pickled dictionary. Checks that they have equal length."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (

@@ -148,7 +148,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Files with HumanAct12's joints by name; empty if they are missing."""
+        """Files with HumanAct12's joint positions, by name. Empty if the files are missing."""
         path = self._beside("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
         folder = archives.as_folder(path, self, lambda name: name.endswith(".npy"))
         return {file.stem: file for file in folder.rglob("*.npy")}
@@ -270,7 +270,8 @@ def _read_joints(path: Path) -> np.ndarray:
         or joints.shape[2] != 3
     ):
         raise UserError(
-            f"{path}: it has shape {joints.shape} and type {joints.dtype}, not numbers (frames, 22 joints or more, 3)"
+            f"{path}: has shape {joints.shape} and type {joints.dtype}. Expected numbers of "
+            "shape (frames, 22 or more joints, 3)"
         )
     return joints[:, :22]
 

@@ -32,7 +32,7 @@ class KIT(T2MFolder):
 
 
 class KITTemos(MotionSource):
-    """Joints of the MMM model at 12.5 frames per second, with TEMOS's splits and limits.
+    """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
 
     The recordings have 100 frames per second, of which every eighth frame is used. Source:
     Petrovich, Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. Training and validation
@@ -63,7 +63,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def ghosh_test(self) -> set[str]:
-        """Names in Ghosh et al.'s test split; empty if their list is missing."""
+        """Names in Ghosh et al.'s test split, or an empty set if their list is missing."""
         file = self.splits / "ghosh-test"
         return set(read_text(file).split()) if file.is_file() else set()
 
@@ -151,15 +151,15 @@ def _recording(task: tuple[Path, int]) -> np.ndarray:
 
 
 def read_joints(path: Path, step: int = 8) -> np.ndarray:
-    """Reads joints (F, 21, 3) float32 in meters, y up, of every `step`-th frame.
+    """Reads the joint positions (F, 21, 3) float32 in every `step`-th frame.
 
-    KIT's unit is about 1/640 m.
+    The positions are in meters, with y up. KIT's unit is about 1/640 m.
     """
     lines = read_text(path).splitlines()[1::step]
     with naming(path, ValueError, prefix="damaged, exclude it by its number: "):
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         if rows.shape[1] != 64 or not len(rows) or not np.isfinite(rows).all():
             raise UserError(
-                f"rows have shape {rows.shape}, not a row number and 63 coordinates each, or are not finite"
+                f"rows have shape {rows.shape}. Expected a row number and 63 finite coordinates each"
             )
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)

@@ -24,15 +24,15 @@ class Mixture(MotionSource):
     """Clips from several data sets, one data set after the other.
 
     Args:
-        parts: the data sets, by a name of your choice.
+        parts: the data sets, each under a name of your choice.
         use: purpose of the trained model. "any" refuses data sets with motions whose license is
             unknown or permits only research. "research" accepts all data sets.
     """
 
     name = "mixture"
     named_by_recipe = True
-    # Increase this number with the version of any data set, because its motions are then also read
-    # differently in a mixture
+    # Increase this number whenever the version of any data set increases, because the motions of
+    # that data set are then also read differently in a mixture
     version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):

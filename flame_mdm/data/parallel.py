@@ -38,8 +38,8 @@ def in_order(
     pool.
 
     Args:
-        function: must be picklable, like its tasks and results.
-        tasks: any number of tasks.
+        function: called with each task. It must be picklable, like its tasks and results.
+        tasks: the arguments of the function.
         workers: number of processes. 1 = work in this process. 0 = start one process per core once
             the work has taken `PATIENCE` seconds.
 
@@ -115,7 +115,8 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def _first(pending: deque[Future[Result]]) -> Result:
     """Returns the result of the first task, or raises the first error of any task.
 
-    Errors of later tasks are raised immediately, because the first task may take long or never end.
+    Errors of later tasks are raised immediately, because the first task may take a long time or
+    never end.
     """
     while True:
         for future in pending:

@@ -52,7 +52,7 @@ def free_memory(device: torch.device) -> int:
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns the frames of a store on a device, (N + 1, D). The last row contains zeros, for padding.
+    """Returns the frames (N + 1, D) of a store on a device. The last row is zero, for padding.
 
     The frames are normalized unless the representation adapts clips that were cut. In this case,
     they are normalized later.
@@ -79,7 +79,7 @@ class ResidentLoader:
 
     Args:
         clips: clips of the split.
-        batches: draws of each batch.
+        batches: the draws that make up each batch.
         features: (N + 1, D), see `resident_features`.
         multiple: batches are padded to multiples of this number of frames.
     """

@@ -3,12 +3,12 @@
 All clips are in one memory-mapped array. A store is a folder that is written once and never
 changed:
 
-    features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
+    features.npy     (N, D) float32, the unnormalized frames of all clips, concatenated
     clips.jsonl      one clip per line: id, start, length, split, source, captions,
                      action, attributes
     statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
-    references.npz   joints (F', J, 3) float32 by clip id, at the frame rate of the recording, if the data
-                     set contains them
+    references.npz   joint positions (F', J, 3) float32 by clip id, at the frame rate of the
+                     recording; written only if the data set contains them
     store.json       representation, frame rate, options of the source, counts, hashes of the other
                      files, fingerprint
 
@@ -141,16 +141,16 @@ class Store:
                 raise ValueError("its fingerprint does not match the clips")
 
     def motion(self, clip: Entry) -> np.ndarray:
-        """Returns the features (F, D) float32 of a clip, not normalized.
+        """Returns the unnormalized features (F, D) float32 of a clip.
 
         The result is a view of the memory-mapped array.
         """
         return self.features[clip.start : clip.start + clip.length]
 
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
-        """Returns the joints of clips at the frame rate of their recordings.
+        """Returns the joint positions of clips at the frame rate of their recordings.
 
-        Returns None if a clip has no such joints.
+        Returns None if they are missing for a clip.
         """
         if "references.npz" not in self.info["sha256"]:
             return None
@@ -159,7 +159,7 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns the name of each license, with the clips, minutes and actions of its motions.
+        """Returns each license with its number of clips, its minutes and its actions.
 
         The list is empty if the data set states no licenses. Copies of a clip are counted once.
         """
@@ -287,7 +287,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 def _line(entry: Entry) -> str:
-    """Returns the line of a clip. Without a license, the key is left out, as in older stores."""
+    """Returns the line of a clip. If it has no license, the key is left out, as in older stores."""
     values = asdict(entry)
     if not entry.license:
         del values["license"]
@@ -426,7 +426,7 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     if not np.isfinite(features).all():
         frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
         raise UserError(
-            f"clip {name}: the features of frame {frame} are not finite. Exclude it by name"
+            f"clip {name}: the features of frame {frame} are not finite. Exclude the clip by name"
         )
     return features
 

@@ -33,7 +33,7 @@ from flame_mdm.safe_io import read_package_yaml
 MIN_SECONDS, MAX_SECONDS = 2.0, 3.0
 # Captions per clip
 CAPTIONS = 8
-# Fraction of clips that show two simultaneous actions, with actions="all"
+# With actions="all", the fraction of clips that show two simultaneous actions
 SIMULTANEOUS = 0.08
 # Fraction of clips that show a part of a cycle, such as two steps of a walk
 CYCLIC = 0.04
@@ -215,10 +215,10 @@ class Synthetic(MotionSource):
         clips: number of clips.
         seed: seed of the clips; 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
-        actions: "core", 22 actions, or "all", which adds 54 actions, clips of two simultaneous
+        actions: "core" for 22 actions, or "all" to add 54 actions, clips of two simultaneous
             actions, and parts of cycles.
-        core_share: with all actions, the fraction of clips that show one of the 22 actions, drawn
-            as with "core". All other clips are drawn from all actions.
+        core_share: if `actions` is "all", the fraction of clips that are drawn from the 22 core
+            actions, as with "core". All other clips are drawn from all actions.
     """
 
     name = "synthetic"
@@ -245,7 +245,7 @@ class Synthetic(MotionSource):
             raise UserError(f'synthetic: actions={actions!r}: choose "core" or "all"')
         if not 0 <= core_share <= 1 or (core_share and actions == "core"):
             raise UserError(
-                f"synthetic: core_share={core_share}: expected a number from 0 to 1, with actions=all"
+                f"synthetic: core_share={core_share}: expected a number from 0 to 1. Values above 0 require actions=all"
             )
         self.size, self.seed, self.workers, self.everything = clips, seed, workers, actions == "all"
         self.core_share = core_share
@@ -327,7 +327,7 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
     They are used for samples on dashboards and for `evaluators.metrics.attributes`.
 
     Args:
-        count: number of prompts, counted from the first. Default: all.
+        count: number of prompts to return, starting with the first. Default: all.
     """
     return [
         (row["text"], {name: row[name] for name in row if name != "text"})
@@ -338,7 +338,7 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
     """Returns the joints (F, 22, 3) of a three-second motion with at least the given attributes.
 
-    The attributes may, for example, be those of a prompt.
+    For example, these may be the attributes of a prompt.
     """
     name = str(attributes["action"])
     drawn = attributes

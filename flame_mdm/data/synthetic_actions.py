@@ -28,8 +28,8 @@ class Action(NamedTuple):
     motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
     # Frequency of the action, relative to the other actions
     share: float = 1
-    # Values of each attribute, equally frequent or with their probabilities. Attributes are drawn
-    # in this order. `speed` is drawn only for the direction forward.
+    # Values of each attribute, either equally likely or with probabilities. Attributes are drawn in
+    # this order. `speed` is drawn only for the direction forward.
     values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
     # Minimum duration
     seconds: float = 0.0

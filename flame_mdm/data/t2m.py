@@ -86,9 +86,9 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion with `frames` frames, in the published order.
 
-    The description of a part yields a separate item, NAME@from-to, and a second description of the
-    same part in NAME@from-to#2. As in the published code, a motion that is too short or too long
-    yields no items, even if parts of it would fit.
+    The description of a part yields a separate item, NAME@from-to. A second description of the same
+    part yields the item NAME@from-to#2. As in the published code, a motion that is too short or too
+    long yields no items, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
@@ -208,7 +208,7 @@ class T2MFolder(MotionSource):
                 )
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the published mean and std of all motions of all splits."""
+        """Returns the published mean and std, computed over all motions in all splits."""
         mean, std = (self._array(f"{name}.npy", 1).astype(np.float32) for name in ("Mean", "Std"))
         if mean.shape != std.shape or not np.isfinite(mean).all() or not (std > 0).all():
             raise UserError(
@@ -251,7 +251,8 @@ class T2MFolder(MotionSource):
         array = read_npy(required(path, self.get_it), mmap=mmap)
         if array.ndim != dimensions or array.dtype.kind not in "fiu":
             raise UserError(
-                f"{path}: it has shape {array.shape} and type {array.dtype}, not numbers with {dimensions} dimensions"
+                f"{path}: has shape {array.shape} and type {array.dtype}. Expected an array of "
+                f"numbers with {dimensions} dimensions"
             )
         return array
 

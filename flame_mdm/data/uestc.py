@@ -173,10 +173,10 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
         pose: (F, 72), axis-angle vectors.
         root: (F, 3), root position relative to the body.
         camera: (F, 4), scales sx (used) and sy, followed by the shift.
-        video: the video.
+        video: the fields of the video's file name.
 
     Returns:
-        The translation relative to the first frame, and the pose, in camera axes.
+        The translation relative to the first frame, followed by the pose, both in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)

@@ -45,7 +45,7 @@ class Frames:
 class Representation(nn.Module, ABC):
     """Base class for representations, which convert motions to features and back.
 
-    Mean and std are buffers, so that sampling needs no data set.
+    Mean and std are buffers, so that sampling does not require the data set.
 
     Args:
         name: name in stores and checkpoints. Features with different names are never combined.
@@ -104,9 +104,9 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3).
+        """Decodes features (..., F, D) in the data's units to joint positions (..., F, J, 3).
 
-        The joints are in meters, y up. The decoding is differentiable.
+        The positions are in meters, with y up. The decoding is differentiable.
         """
 
     def rotations6d(self, features: Tensor) -> Tensor:
@@ -127,13 +127,13 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for features of these joints.
+        """Returns a bool mask (D,) that is True for features of these joints.
 
         Features of the root trajectory belong to joint 0.
         """
 
     def joint_mask(self, joints: Iterable[int]) -> Tensor:
-        """Returns (J,) bool, True for these joints."""
+        """Returns a bool mask (J,) that is True for these joints."""
         mask = torch.zeros(len(self.skeleton), dtype=torch.bool)
         mask[list(joints)] = True
         return mask
@@ -162,9 +162,9 @@ class Representation(nn.Module, ABC):
         return x * self.std + self.mean
 
     def to_joints(self, x: Tensor) -> Tensor:
-        """Decodes normalized features (..., F, D) to joints (..., F, J, 3).
+        """Decodes normalized features (..., F, D) to joint positions (..., F, J, 3).
 
-        The joints are in meters, y up. The decoding is differentiable.
+        The positions are in meters, with y up. The decoding is differentiable.
         """
         return self.decode(self.denormalize(x))
 
@@ -198,7 +198,7 @@ def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tu
 
 
 def moments(features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-    """Returns the mean (D,) of frames (N, D), and the sum (D,) of squared deviations, float64."""
+    """Returns the float64 mean (D,) and sum of squared deviations (D,) of frames (N, D)."""
     size, zero = 1 << 16, torch.zeros(())  # all frames of a data set would not fit in memory
     mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
     return mean, sum(

@@ -28,10 +28,10 @@ class HumanML(Representation):
 
     | name | width | content |
     |---|---|---|
-    | turn | 1 | heading change to the next frame, radians |
+    | turn | 1 | heading change to the next frame in radians |
     | root_velocity | 2 | x and z of the root's displacement to the next frame, in body coordinates |
     | root_height | 1 | y of the root |
-    | positions | 3 (J - 1) | joints except the root, in body coordinates: root at x = z = 0, facing +z |
+    | positions | 3 (J - 1) | joint positions without the root, in body coordinates: root at x = z = 0, facing +z |
     | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the previous one; shortest arcs, not SMPL's |
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
     | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves until the next frame |
@@ -54,8 +54,8 @@ class HumanML(Representation):
     first and last heading. Rotations are computed after the body is turned to +z, and are relative
     to the parent in the skeleton.
 
-    Input and output joints are in meters. Features are in units of 1 / `units_per_metre` meters
-    (KIT: 1/640).
+    Input and output joint positions are in meters. Features are in units of 1 / `units_per_metre`
+    meters (KIT: 1/640).
 
     Args:
         skeleton: key in `SKELETONS`.
@@ -114,7 +114,10 @@ class HumanML(Representation):
         self.units_per_metre, self.contact_threshold = units_per_metre, contact_threshold
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes finite joints (T >= 3, J, 3) in meters, y up, as (T - 1, D) float32."""
+        """Encodes finite joint positions (T >= 3, J, 3) as features (T - 1, D) float32.
+
+        The positions are in meters, with y up.
+        """
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
@@ -144,9 +147,9 @@ class HumanML(Representation):
         return list(rows.split([length - 1 for length in lengths]))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes turn, root and positions of features (..., F, D) to joints (..., F, J, 3).
+        """Decodes the turn, root and positions in features (..., F, D).
 
-        Joints are in meters. The decoding is differentiable.
+        Returns the joint positions (..., F, J, 3) in meters. The decoding is differentiable.
         """
         heading, root = self._root(features)
         local = features[..., self.slices["positions"]].unflatten(-1, (-1, 3))
@@ -174,7 +177,10 @@ class HumanML(Representation):
         return turn, features[..., self.slices["root_velocity"]] / self.units_per_metre
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Equals MDM's `HML_LOWER_BODY_MASK` for the lower body, including the root."""
+        """Returns a bool mask (D,) that is True for features of these joints.
+
+        For the lower body, including the root, the mask equals MDM's `HML_LOWER_BODY_MASK`.
+        """
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
         others = [part[1:].repeat_interleave(size) for size in (3, 6)]
@@ -255,9 +261,9 @@ class HumanML(Representation):
         return torch.from_numpy(smooth - smooth[0])
 
     def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
-        """Returns the shortest arcs from rest to the bones, as 6D columns (N, J - 1, 6).
+        """Returns the shortest arcs from the rest directions to the bones.
 
-        Arcs are relative to the arc of the parent.
+        The arcs (N, J - 1, 6) are 6D columns. They are relative to the arc of the parent.
         """
         rest = joints.new_tensor(self.skeleton.raw_offsets)
         arcs = rotation.between(rest, self.skeleton.bones(joints))

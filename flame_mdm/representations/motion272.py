@@ -21,7 +21,7 @@ class Motion272(Representation):
     |---|---|---|
     | root_velocity | 2 | x and z of the root's displacement from the previous frame, in that frame's body coordinates |
     | turn | 6 | rotation about y from the previous frame's body coordinates to this frame's, 6D rows |
-    | positions | 66 | joints in body coordinates: the root is at x = z = 0, the lowest joint of the motion at y = 0 |
+    | positions | 66 | joint positions in body coordinates: root at x = z = 0, lowest joint of the motion at y = 0 |
     | velocities | 66 | differences of `positions` from the previous frame, without the root's displacement and turn |
     | rotations | 132 | SMPL's rotations as 6D rows; the root's rotation is in body coordinates |
 
@@ -49,7 +49,7 @@ class Motion272(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F >= 2, 3 + 3 K) of `smpl.read_pose` as (F, 272) float32."""
+        """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError(
@@ -66,9 +66,9 @@ class Motion272(Representation):
         return self.features_of(joints, rotations)
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
-        """Returns features (F, 272) float32 for joints (F, 22, 3) and rotations (F, 22, 3, 3).
+        """Returns features (F, 272) float32 for joint positions and rotations (F, 22, 3, 3).
 
-        Both have y up and face +z.
+        The joint positions (F, 22, 3) and the rotations have y up and face +z.
         """
         joints = joints.double() - torch.stack(
             [joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]]
@@ -97,9 +97,9 @@ class Motion272(Representation):
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes the velocity, turn and positions of features (..., F, 272) to joints (..., F, 22, 3).
+        """Decodes the velocity, turn and positions in features (..., F, 272).
 
-        The decoding is differentiable.
+        Returns the joint positions (..., F, 22, 3) in meters. The decoding is differentiable.
         """
         inverse, ground = self._root(features)
         local = features[..., self.slices["positions"]].unflatten(-1, (22, 3))
@@ -152,7 +152,7 @@ class Motion272(Representation):
         return cut
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (272,) bool, True for features of these joints.
+        """Returns a bool mask (272,) that is True for features of these joints.
 
         The root trajectory belongs to joint 0.
         """

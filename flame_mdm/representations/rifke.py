@@ -27,8 +27,8 @@ class Rifke(Representation):
     | columns | content |
     |---|---|
     | 0 | height of the root above the floor |
-    | 1:61 | joints except the root, in body coordinates: root at x = z = 0, facing +z; y above the floor |
-    | 61 | heading change since the previous frame, radians, 0 in the first frame |
+    | 1:61 | joint positions without the root, in body coordinates: root at x = z = 0, facing +z; y above the floor |
+    | 61 | heading change since the previous frame in radians; 0 in the first frame |
     | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |
 
     Three peculiarities of the published code are kept. The floor is a soft minimum, which depends
@@ -37,8 +37,8 @@ class Rifke(Representation):
 
     Args:
         fps: frames per second.
-        units_per_metre: units of the features per meter. KIT's unit is 1/640 meters. The joints are
-            in meters.
+        units_per_metre: units of the features per meter. KIT's unit is 1/640 meters. Input
+            and output joint positions are in meters.
 
     Example:
         >>> representation = Rifke()
@@ -52,7 +52,10 @@ class Rifke(Representation):
         self.units_per_metre = units_per_metre
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes finite joints (T, 21, 3) in meters, y up, as features (T, 64) float32."""
+        """Encodes finite joint positions (T, 21, 3) as features (T, 64) float32.
+
+        The positions are in meters, with y up.
+        """
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
             raise UserError(
                 f"motion: it has shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)"
@@ -69,9 +72,9 @@ class Rifke(Representation):
         return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], step[:, ::2]], 1).float()
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., T, 64) to joints (..., T, 21, 3) in meters.
+        """Decodes features (..., T, 64) to joint positions (..., T, 21, 3) in meters.
 
-        The first root is at 0, facing +z. The decoding is differentiable.
+        In the first frame, the root is at x = z = 0 and faces +z. The decoding is differentiable.
         """
         turned, step = features[..., 61].cumsum(-1), features[..., 62:]
         heading = turned - turned[..., :1]
@@ -96,14 +99,14 @@ class Rifke(Representation):
     def heading(self, joints: Tensor) -> Tensor:
         """Returns the heading (T,) of joints (T, 21, 3) in radians, in (-pi, pi].
 
-        0 = +z; the heading is positive toward +x.
+        A body with heading 0 faces +z. Positive headings turn toward +x.
         """
         left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (64,) bool, True for features of these joints.
+        """Returns a bool mask (64,) that is True for features of these joints.
 
         The root trajectory belongs to joint 0.
         """

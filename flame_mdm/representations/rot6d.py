@@ -13,15 +13,15 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 
 
 class Rot6D(Representation):
-    """25 x 6 features of Petrovich et al. 2021 (ACTOR), not normalized.
+    """The 25 x 6 unnormalized features of Petrovich et al. 2021 (ACTOR).
 
-    The features are 24 rotations as 6D rows, then (x, y, z, 0, 0, 0). (x, y, z) is the root's
-    translation relative to the first frame, in camera coordinates: meters, y down, z away from
-    the camera. `smpl.read_pose` describes raw motions.
+    The features are 24 rotations as 6D rows, followed by (x, y, z, 0, 0, 0). (x, y, z) is the
+    root's translation relative to the first frame, in camera coordinates: meters, y down, z away
+    from the camera. `smpl.read_pose` describes raw motions.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets of the body used for decoding, in meters, like `ADULT`.
+        offsets: (24, 3) offsets, in meters, of the body used for decoding, like `ADULT`.
 
     Example:
         >>> representation = Rot6D()
@@ -37,7 +37,7 @@ class Rot6D(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K) of `smpl.read_pose` as (F, 150) float32."""
+        """Encodes a raw motion (F, 3 + 3 K) as features (F, 150) float32; see `smpl.read_pose`."""
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
@@ -54,7 +54,7 @@ class Rot6D(Representation):
         return features[..., :144].unflatten(-1, (24, 6))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, 150) to joints (..., F, 24, 3) in meters.
+        """Decodes features (..., F, 150) to joint positions (..., F, 24, 3) in meters.
 
         y is up: the camera coordinates are rotated 180 degrees about x.
         """
@@ -66,7 +66,7 @@ class Rot6D(Representation):
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (150,) bool, True for features of these joints.
+        """Returns a bool mask (150,) that is True for features of these joints.
 
         The translation belongs to joint 0.
         """

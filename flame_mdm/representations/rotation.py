@@ -138,7 +138,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 def _shorter(normalized: Tensor) -> Tensor:
     """Returns (..., 1) bool: whether a normalized vector (..., 3) is shorter than 1.
 
-    The original vector was about 0.
+    In this case, the original vector was about 0.
     """
     return (
         torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
@@ -274,7 +274,7 @@ def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
 
 
 def continuous(quaternion: Tensor, dim: int) -> Tensor:
-    """Flips signs along the time axis `dim`, so that neighboring quaternions are in one hemisphere.
+    """Flips signs along the time axis `dim`, so that neighboring quaternions share a hemisphere.
 
     The first quaternion is unchanged.
     """

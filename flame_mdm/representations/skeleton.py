@@ -30,7 +30,7 @@ class Skeleton:
     parents: tuple[int, ...]
     # Kinematic chains of HumanML3D's inverse kinematics
     chains: tuple[tuple[int, ...], ...]
-    # (J, 3), rest direction of the bone that ends in each joint, with unit length; 0 for the root.
+    # (J, 3), unit vector in the rest direction of the bone that ends in each joint; 0 for the root.
     # From HumanML3D's `paramUtil.py`.
     raw_offsets: tuple[tuple[int, int, int], ...]
     # Right hip, left hip, right shoulder, left shoulder. They define the heading.
@@ -73,11 +73,11 @@ class Skeleton:
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def bones(self, joints: Tensor) -> Tensor:
-        """Returns the vectors (..., J, 3) from the parents to the joints; 0 for the root."""
+        """Returns the vectors (..., J, 3) from the parents to the joints, with 0 for the root."""
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
-        """Returns joints (..., J, 3) from `bones` vectors and the root's position (..., 3)."""
+        """Returns joint positions (..., J, 3), given the vectors `bones` and the root position."""
         paths = [[0.0] * len(self)]
         for joint, parent in enumerate(self.parents[1:], 1):
             paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])
@@ -87,7 +87,9 @@ class Skeleton:
 def forward_kinematics(
     skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor
 ) -> Tensor:
-    """Computes joint positions (..., J, 3) in the unit of `offsets`. Differentiable.
+    """Computes joint positions (..., J, 3) in the unit of `offsets`.
+
+    The computation is differentiable.
 
     Args:
         skeleton: the tree of joints.
@@ -190,7 +192,7 @@ SMPL22 = Skeleton(
 )
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
-"""Joints of `SMPL22` by name."""
+"""Index of each joint of `SMPL22`, by name."""
 
 SMPL24 = Skeleton(
     name="smpl24",
@@ -253,9 +255,9 @@ SKELETONS: dict[str, Skeleton] = {skeleton.name: skeleton for skeleton in (SMPL2
 
 
 def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
-    """Returns the joints of body parts.
+    """Returns the indices of the joints in each body part.
 
-    As in MDM, lower_body is the root and the legs, and upper_body is everything else.
+    As in MDM, lower_body consists of the root and the legs, and upper_body of all other joints.
     """
     parts: dict[str, list[int]] = {}
     for side in ("left", "right"):

@@ -34,11 +34,11 @@ The entries are for the body alone, SMPL, SMPL+H and SMPL-X.
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Splits a raw SMPL motion (F, 3 + 3 K) into a translation and rotation matrices, float64.
+    """Splits a raw SMPL motion (F, 3 + 3 K) into a translation and rotation matrices.
 
     The motion consists of a translation in meters, followed by the axis-angle vectors of K = 24, 52
-    or 55 joints. The results are (F, 3) and (F, 24, 3, 3). As in FLAME's code, the first 24 of
-    SMPL+H's 52 joints are used, so the hands are its left_index1 and left_index2.
+    or 55 joints. The results are (F, 3) and (F, 24, 3, 3), both float64. As in FLAME's code, the
+    first 24 of SMPL+H's 52 joints are used, so the hands are its left_index1 and left_index2.
 
     Raises:
         UserError: If the motion has the wrong shape, for example 24 rotation matrices, or if a
@@ -55,14 +55,14 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class SMPL(Representation):
-    """147 features of Kim et al. 2023 (FLAME), not normalized.
+    """The 147 unnormalized features of Kim et al. 2023 (FLAME).
 
-    The features are the translation (3), then 24 rotations as 6D rows, in world coordinates as in
+    The features are the translation (3) and 24 rotations as 6D rows, in world coordinates as in
     AMASS: meters, z up, neither centered nor rotated. `read_pose` describes raw motions.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets of the body used for decoding, in meters, like `ADULT`. The first
+        offsets: (24, 3) offsets, in meters, of the body used for decoding, like `ADULT`. The first
             offset leads from the translation to the pelvis.
 
     Example:
@@ -90,9 +90,9 @@ class SMPL(Representation):
         return features[..., 3:].unflatten(-1, (24, 6))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, 147) to joints (..., F, 24, 3) in meters.
+        """Decodes features (..., F, 147) to joint positions (..., F, 24, 3) in meters.
 
-        y is up as in HumanML3D: (-x, z, y).
+        As in HumanML3D, y is up: the coordinates are (-x, z, y).
         """
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         offsets = features.new_tensor(self.offsets)
@@ -102,7 +102,7 @@ class SMPL(Representation):
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (147,) bool, True for features of these joints.
+        """Returns a bool mask (147,) that is True for features of these joints.
 
         The translation belongs to joint 0.
         """

@@ -148,9 +148,9 @@ def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
 
     Args:
         context: Blender's context.
-        armature: the armature.
+        armature: the armature to animate.
         name: name of the action.
-        motion: the motion.
+        motion: the motion to key.
         own: whether `new_armature` created the armature. If so, every joint is moved to its
             position in the motion.
     """

@@ -257,7 +257,7 @@ def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
     """Moves a body to a seat on a chair behind its feet.
 
     Args:
-        body: the body.
+        body: the body to seat.
         seated: (F,) progress from standing, 0, to sitting, 1.
         bent: (F,) lean of the trunk.
     """

@@ -91,7 +91,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
 
 
 def frames_of(body: Body, frames: np.ndarray) -> Body:
-    """Returns a body that shows frames (N,) of another body, at the same frame rate."""
+    """Returns a body with frames (N,) of another body, at the same frame rate."""
     part = copy.copy(body)
     part.t = np.arange(len(frames)) * (body.t[1] - body.t[0])
     for name, axis in FRAMES.items():

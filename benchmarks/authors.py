@@ -34,7 +34,7 @@ class _Rotation2xyz:
 
 
 def _stubs() -> dict[str, ModuleType]:
-    """Returns the stubs for CLIP and for the body model, as modules."""
+    """Returns the modules that replace CLIP and the body model."""
     clip: Any = ModuleType("clip")
     clip.load = lambda *_, **__: (_Clip(), None)
     clip.tokenize = lambda texts, context_length=CLIP_TOKENS, **_: torch.zeros(

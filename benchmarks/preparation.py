@@ -24,7 +24,7 @@ MEMORY = ("main process, MiB", "worker, MiB", "private to main, MiB", "private t
 
 
 def private(process: int) -> int:
-    """Returns the private memory of a process in bytes; 0 after its end, and on systems without /proc."""
+    """Returns the private memory of a process in bytes, or 0 if it has ended or /proc is missing."""
     try:
         lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
     except OSError:

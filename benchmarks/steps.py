@@ -177,7 +177,7 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
 
 
 def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
-    """Returns one row per network in `BACKBONES`, in its CPU size."""
+    """Returns one row per network in `BACKBONES`. The networks have their CPU size."""
     rows: list[Row] = []
     lengths = np.random.default_rng(1).integers(36, 61, 32)
     for name in names:

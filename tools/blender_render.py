@@ -1,10 +1,12 @@
 """Imports motion files in Blender and renders frames with Cycles, as small PNG files.
 
 Run `PYTHON blender_render.py JOB.json` with a Python that has the package bpy (Blender 4.2 or
-later). The job contains `width`, `height`, `samples`, and a list of `files`. Each file contains
-`path`; `out`, the prefix of its picture names, which end in _000.png and so on; `every`,
-the number of frames between pictures (0 = `count` pictures from the first to the last frame); and
-`bones` (true = the skeleton without the skin).
+later). The job contains `width`, `height`, `samples`, and a list of `files` with these keys:
+
+path     path of the motion file
+out      prefix of the picture names, which end in _000.png and so on
+every    number of frames between pictures; 0 = `count` pictures from the first to the last frame
+bones    true = draw the skeleton without the skin
 """
 
 import json

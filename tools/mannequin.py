@@ -110,7 +110,7 @@ def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarr
 
 
 def model() -> dict[str, Field]:
-    """Returns the parts of the left half; the legs and the arm are on the left side."""
+    """Returns the parts of the left half of the body: trunk, left leg, left arm and head."""
     return {**trunk(), **leg(), **arm(), "head": head()}
 
 
@@ -283,7 +283,7 @@ def head() -> Field:
 
 
 def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
-    """Returns the signed distance of the entire body; points have x >= 0."""
+    """Returns the signed distance of the entire body for points with x >= 0."""
     mirrored = points * [-1, 1, 1]
     leg = union(
         union(parts["thigh"](points), parts["calf"](points), 0.02), parts["foot"](points), 0.03
@@ -325,7 +325,7 @@ def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
 
 
 def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices (V, 3) and outward-facing triangles (T, 3) of the left half; its border is at x = 0."""
+    """Returns vertices (V, 3) and outward-facing triangles (T, 3) of the left half, whose border is at x = 0."""
     axes = [np.arange(low, high, CELL) for low, high in ((0, 0.76), (-1.01, 0.84), (-0.18, 0.22))]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     values = np.concatenate(

@@ -55,7 +55,7 @@ BESIDE = {"travel", "veer", "pace"}
 MOST_SYNTHETIC = 600  # maximum number of procedural motions, from the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
 # false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
-# are stated by the functions in `postures.py` and `movements.py`; a score is negative if less supports the claim.
+# are stated by the functions in `postures.py` and `movements.py`; a score is negated if lower values support the claim.
 """
 
 
@@ -72,7 +72,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Case:
-    """A claim about a motion, and the change that falsified it ("": no change, so the claim is true).
+    """A claim about a motion, and the change that falsified it ("" if the claim is unchanged and true).
 
     `is_built`: whether the claim comes from `built_cases`, not from a caption.
     """
@@ -217,7 +217,7 @@ def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[
 
 
 def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Counts true and falsified claims, decided claims and right verdicts, by set and group."""
+    """Counts true and falsified claims, decided claims and right verdicts in each set and group."""
     counts: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(
         lambda: dict.fromkeys(
             ("true", "true_decided", "true_right", "false", "false_decided", "false_right"), 0

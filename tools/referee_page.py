@@ -50,7 +50,7 @@ def read(name: str) -> dict[str, Any]:
 
 
 def share(right: int, total: int) -> str:
-    """Returns a share in percent and its total, such as "50.0 % of 8"; "–" if the total is 0."""
+    """Returns a share in percent and its total, such as "50.0 % of 8", or "–" if the total is 0."""
     return f"{100 * right / total:.1f} % of {total}" if total else "–"
 
 

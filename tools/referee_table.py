@@ -33,7 +33,7 @@ from flame_mdm.seeds import key
 OUT = Path(__file__).resolve().parents[1] / "docs" / "benchmarks" / "referee_systems.json"
 FPS = 20.0
 COUNT = 128  # motions per row
-CLIPS = 1600  # number of synthetic clips; their test split is used
+CLIPS = 1600  # number of synthetic clips, of which the test split is used
 SHIPPED = ("quickstart", "package", "package_dip")
 LONGEST = 3.0  # duration in seconds of the longest motion from the package's model
 REAL, MIRRORED, SHUFFLED = "real motions", "mirrored real motions", "captions of other motions"

@@ -265,7 +265,7 @@ def value(metric: FootSkating | Jitter, joints: np.ndarray) -> float:
 def recognized(
     joints: np.ndarray, requests: Sequence[Sequence[tuple[str, Attributes]]], fps: float
 ) -> dict[str, Any]:
-    """Returns how many requested actions are recognized in a window that ends in time, by action."""
+    """Returns how often each requested action is recognized in a window that ends in time."""
     right: dict[str, list[int]] = {}
     for motion, request in zip(joints, requests, strict=True):
         for number, (_, attributes) in enumerate(request):

@@ -1,4 +1,4 @@
-"""Builds the web page that needs no installation, in build/web: `make web`.
+"""Builds the web page that requires no installation, in build/web: `make web`.
 
 The page runs the model from this package in the browser. onnxruntime-web comes from npm at a pinned
 version.
@@ -204,7 +204,7 @@ def write_pictures(out: Path, actions: Sequence[str]) -> None:
 
 
 def figure(example: Motion) -> dict[str, Any]:
-    """Returns the body of the example motion, with which the page draws motions as the mannequin."""
+    """Returns the body of the example motion, which the page uses to draw motions as the mannequin."""
     body, names = fit_body(example), list(SMPL22.joints)
     offsets = np.asarray(example.posed().offsets)
     helpers = []

@@ -105,7 +105,7 @@ class MotionSource(ABC):
 
     @cached_property
     def excluded(self) -> Counter[str]:
-        """Number of clips or labels left out, by reason; saved in the store.
+        """Number of clips or labels left out for each reason, which is saved in the store.
 
         It is complete once `clips` is exhausted.
         """
@@ -174,7 +174,7 @@ class MotionSource(ABC):
         return [f"error: {failure}" for failure in self.failures]
 
     def check(self, fps: float) -> list[str]:
-        """Returns lines to print about existing and missing files, without preparing the data.
+        """Returns lines to print about existing and missing files. Does not prepare the data.
 
         Args:
             fps: frames per second.
@@ -215,7 +215,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice for a split without clips, with a leading space.
+    """Returns advice for a split without clips, which begins with a space.
 
     The advice is "" for a published data set, because its splits are fixed.
     """

@@ -59,7 +59,7 @@ class Lesson(MotionSource):
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
-        """Returns the known clips, at most `PRIOR` per split."""
+        """Returns at most `PRIOR` known clips per split."""
         kept: list[Entry] = []
         for split, most in PRIOR.items():
             clips = [clip for clip in self.store.clips if clip.split == split]

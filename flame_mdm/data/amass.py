@@ -145,13 +145,13 @@ class Amass:
 
     @cached_property
     def files(self) -> dict[str, Path]:
-        """The file of each unpacked recording, by key."""
+        """Maps the key of each unpacked recording to its file."""
         paths = required(self.root, GET_IT).rglob("*.npz")
         return {key: path for path in paths if (key := key_of(str(path.relative_to(self.root))))}
 
     @cached_property
     def archives(self) -> dict[str, Path]:
-        """The archive of each subset, recognized by its file name."""
+        """Maps each subset to its archive, which is recognized by its file name."""
         paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
         return {
             subset: path

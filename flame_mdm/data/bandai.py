@@ -56,7 +56,7 @@ def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the axes of a joint in the left limb and, mirrored, in the right limb.
+    """Returns the axes of a joint in the left limb, and the mirrored axes for the right limb.
 
     In the right limb, the bone points along -x.
     """

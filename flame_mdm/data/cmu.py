@@ -64,7 +64,7 @@ COLUMNS = (
     "split",
     "source",
 )
-# Number of frames assumed for a recording of unknown length; any number above `SHORTEST` works
+# Number of frames assumed for a recording of unknown length. Any number above `SHORTEST` works.
 UNKNOWN = 1000
 # The arguments `seconds`, `last` and `is_sixty` of `decide_rate`
 Evidence = tuple[float | None, int | None, bool]
@@ -352,7 +352,7 @@ class _Part:
 
 
 def _parts(table: Path) -> dict[str, _Part]:
-    """Returns the parts of recordings in a table, by name.
+    """Returns the parts of recordings that a table lists, by their names.
 
     Rows for the same part contain captions for the same clip.
     """
@@ -449,7 +449,7 @@ def _recording(key: str) -> str:
 
 
 def _test_captions(path: Path) -> dict[str, list[Description]]:
-    """Returns the captions in a JSON list of test captions, by name.
+    """Returns the captions of each motion in a JSON list of test captions.
 
     `segment` is the described part, in seconds.
     """

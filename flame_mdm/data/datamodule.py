@@ -60,7 +60,7 @@ class TrainingBatches(Sampler[list[Draw]]):
             yield [(int(index), number) for index in batches[number % per_pass]]
 
     def batches(self, number: int, per_pass: int) -> list[np.ndarray]:
-        """Returns the batches of one pass over the data, as indices of clips."""
+        """Returns the indices of the clips in each batch of one pass over the data."""
         generator = np.random.default_rng((self.seed, number))
         order = generator.permutation(len(self.lengths))
         order = np.resize(order, max(len(order), self.batch_size))[: per_pass * self.batch_size]

@@ -59,9 +59,9 @@ class Note:
 
 
 class Folder(MotionSource):
-    """Motions and captions in a folder, as joints or as SMPL motions.
+    """Motions and captions in a folder.
 
-    Joints are SMPL's 22 joints. SMPL motions are raw motions of the SMPL representation. If the
+    Motions are positions of SMPL's 22 joints, or raw motions of the SMPL representation. If the
     table states no splits, 85 % of the sources are used for training, 5 % for validation and 10 %
     for testing, selected by a hash of their names.
 
@@ -76,8 +76,8 @@ class Folder(MotionSource):
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about as many. Each clip
             occurs at most 16 times. 0 = clips are not repeated.
-        license: license for motions without a license in the table; a key in `licenses.yaml`. Empty
-            = unknown.
+        license: license of motions whose row in the table states no license. This is a key in
+            `licenses.yaml`, or "" if the license is unknown.
         prefixes: words to insert before captions, each with a list of actions: the word is inserted
             before the captions of these actions. A model can then distinguish these motions from
             motions with the same action name in another data set.

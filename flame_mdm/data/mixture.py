@@ -94,7 +94,7 @@ class Mixture(MotionSource):
         self.failures = [line for part in self.parts.values() for line in part.failures]
 
     def findings(self) -> list[str]:
-        """Returns the findings of each part, with its name."""
+        """Returns the findings of each part, preceded by its name."""
         return [f"{name}: {line}" for name, part in self.parts.items() for line in part.findings()]
 
     def failure_lines(self) -> list[str]:

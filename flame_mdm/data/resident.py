@@ -52,7 +52,7 @@ def free_memory(device: torch.device) -> int:
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns the frames (N + 1, D) of a store on a device. The last row is zero, for padding.
+    """Returns (N + 1, D) on a device: the frames of a store, and a row of zeros for padding.
 
     The frames are normalized unless the representation adapts clips that were cut. In this case,
     they are normalized later.

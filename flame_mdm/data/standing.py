@@ -1,4 +1,4 @@
-"""A motion of a person standing still, with which streams start by default."""
+"""A motion of a person standing still, which is the default start of streams."""
 
 import numpy as np
 from torch import Tensor

@@ -213,7 +213,7 @@ class Synthetic(MotionSource):
 
     Args:
         clips: number of clips.
-        seed: seed of the clips; 0 or more.
+        seed: seed of the clips, which must be 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
         actions: "core" for 22 actions, or "all" to add 54 actions, clips of two simultaneous
             actions, and parts of cycles.

@@ -111,7 +111,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns the figures of a report that differ from the published figures, with the differences."""
+    """Returns the figures in a report that differ from the published ones, and the differences."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()

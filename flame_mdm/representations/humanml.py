@@ -32,7 +32,7 @@ class HumanML(Representation):
     | root_velocity | 2 | x and z of the root's displacement to the next frame, in body coordinates |
     | root_height | 1 | y of the root |
     | positions | 3 (J - 1) | joint positions without the root, in body coordinates: root at x = z = 0, facing +z |
-    | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the previous one; shortest arcs, not SMPL's |
+    | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the previous one: shortest arcs, not SMPL's |
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
     | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves until the next frame |
 

@@ -103,7 +103,7 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 
 
 def is_degenerate(rot6d: Tensor) -> Tensor:
-    """Returns (...,) bool: whether a pair of vectors (..., 6) defines no rotation.
+    """Returns a bool tensor (...,) that is True where two vectors (..., 6) define no rotation.
 
     This is the case if one vector is 0, or if the vectors are parallel. `rot6d_to_matrix` completes
     such pairs.
@@ -122,7 +122,7 @@ def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
-    """Returns (..., 1) bool: whether two vectors (..., 6) define no rotation.
+    """Returns a bool tensor (..., 1) that is True where two vectors (..., 6) define no rotation.
 
     `first` and `across` are the results of `_orthogonal`. If the vectors are parallel, `across`
     consists of rounding errors. NaN is not degenerate, so it stays NaN.
@@ -136,7 +136,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 
 
 def _shorter(normalized: Tensor) -> Tensor:
-    """Returns (..., 1) bool: whether a normalized vector (..., 3) is shorter than 1.
+    """Returns a bool tensor (..., 1) that is True where a normalized vector is shorter than 1.
 
     In this case, the original vector was about 0.
     """

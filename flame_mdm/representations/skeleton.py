@@ -73,7 +73,7 @@ class Skeleton:
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def bones(self, joints: Tensor) -> Tensor:
-        """Returns the vectors (..., J, 3) from the parents to the joints, with 0 for the root."""
+        """Returns the vectors (..., J, 3) from parents to joints. The vector of the root is 0."""
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:

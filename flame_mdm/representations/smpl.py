@@ -27,7 +27,7 @@ rounded and made symmetric.
 
 
 AXIS_ANGLES = {66: 22, 72: 24, 156: 52, 165: 55}
-"""Number of joints, by the number of axis-angle values per frame.
+"""Number of joints for each possible number of axis-angle values per frame.
 
 The entries are for the body alone, SMPL, SMPL+H and SMPL-X.
 """

@@ -37,7 +37,7 @@ def stance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def dodge(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Steps aside, or back, in a fraction of a second and returns to an upright stance."""
+    """Steps aside or back within a fraction of a second, then returns to an upright stance."""
     start = rng.uniform(0.3, 0.7)
     quick = pulse(t, start, start + 0.28, start + 0.5, start + 1.1)
     guard(body, pulse(t, 0.05, 0.35, start + 0.7, t[-1]))

@@ -100,7 +100,7 @@ def pray(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def cry(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Hides the face in the hands, bent over, with shaking shoulders."""
+    """Bends over and hides the face in the hands while the shoulders shake."""
     down = ease(t, rng.uniform(0.05, 0.2), rng.uniform(0.7, 0.9))
     sob = down * beat(t, rng.uniform(2.2, 2.8))
     for side, sign in enumerate(SIGN):

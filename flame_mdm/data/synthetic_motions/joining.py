@@ -104,7 +104,7 @@ def frames_of(body: Body, frames: np.ndarray) -> Body:
 
 
 def _padded(values: np.ndarray, axis: int, start: int, frames: int) -> np.ndarray:
-    """Returns values with `frames` frames along `axis`; the given values begin at frame `start`.
+    """Pads values to `frames` frames along `axis`, so that the given values begin at frame `start`.
 
     The first given value is repeated before `start`, and the last given value is repeated at the
     end.

@@ -48,7 +48,7 @@ class Gait:
 def walk_along(
     body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int
 ) -> np.ndarray:
-    """Moves the pelvis at `speed`, in m/s, along a path, with footprints on both sides of it.
+    """Moves the pelvis along a path at `speed` m/s, with footprints on both sides of the path.
 
     The foot `first` takes the first step. Returns how far the right foot is in front of the left
     foot (F,), in meters, relative to the heading of the pelvis.

@@ -208,7 +208,7 @@ def pull(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 def climb_ladder(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
-    """Climbs a ladder: each hand moves with the opposite foot, by two rungs."""
+    """Climbs a ladder. Each hand moves up two rungs together with the opposite foot."""
     seconds, start = rng.uniform(0.5, 0.6), rng.uniform(0.05, 0.15)
     steps = int((t[-1] - 0.1 - start) / seconds)
     seconds = (t[-1] - 0.1 - start) / steps

@@ -105,7 +105,7 @@ class MotionSource(ABC):
 
     @cached_property
     def excluded(self) -> Counter[str]:
-        """Number of clips or labels left out for each reason, which is saved in the store.
+        """Number of clips or labels left out for each reason, as saved in the store.
 
         It is complete once `clips` is exhausted.
         """
@@ -215,7 +215,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice for a split without clips, which begins with a space.
+    """Returns advice, with a leading space, for a split without clips.
 
     The advice is "" for a published data set, because its splits are fixed.
     """

@@ -20,7 +20,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-# Index of a clip, and the number of the batch for which it is drawn, which is -1 in evaluation
+# Index of a clip, and number of the batch for which it is drawn (-1 in evaluation)
 Draw = tuple[int, int]
 # Id, features x (F, D), caption and action of a clip, which `collate` takes as input
 Sample = tuple[str, Tensor, str | None, int | None]

@@ -330,7 +330,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
     Args:
         prefixes: the word to insert, by action.
         notes: captions and labels of all motions.
-        table: the file with the actions, which the error message names.
+        table: the file that lists the actions, named in the error message.
 
     Raises:
         UserError: If no motion has one of the actions.

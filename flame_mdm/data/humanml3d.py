@@ -270,7 +270,7 @@ def _read_joints(path: Path) -> np.ndarray:
         or joints.shape[2] != 3
     ):
         raise UserError(
-            f"{path}: has shape {joints.shape} and type {joints.dtype}. Expected numbers of "
+            f"{path}: it has shape {joints.shape} and type {joints.dtype}. Expected numbers of "
             "shape (frames, 22 or more joints, 3)"
         )
     return joints[:, :22]

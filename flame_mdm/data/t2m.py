@@ -251,7 +251,7 @@ class T2MFolder(MotionSource):
         array = read_npy(required(path, self.get_it), mmap=mmap)
         if array.ndim != dimensions or array.dtype.kind not in "fiu":
             raise UserError(
-                f"{path}: has shape {array.shape} and type {array.dtype}. Expected an array of "
+                f"{path}: it has shape {array.shape} and type {array.dtype}. Expected an array of "
                 f"numbers with {dimensions} dimensions"
             )
         return array

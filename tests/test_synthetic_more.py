@@ -63,7 +63,7 @@ def test_a_share_of_the_clips_shows_actions_of_the_core():
     assert few.options["core_share"] == 0.5
     assert "core_share" not in without.options
     with pytest.raises(
-        UserError, match=r"core_share=0.5: expected a number from 0 to 1, with actions"
+        UserError, match=r"core_share=0.5: expected a number from 0 to 1. Values above 0"
     ):
         Synthetic(1, core_share=0.5)
 

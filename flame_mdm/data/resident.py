@@ -54,8 +54,8 @@ def free_memory(device: torch.device) -> int:
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
     """Returns features (N + 1, D) on a device: the frames of a store, then a row of zeros.
 
-    The zeros are used as padding. The frames are normalized unless the representation adapts clips that were cut. In this case,
-    they are normalized later.
+    The zeros are used as padding. The frames are normalized unless the representation adapts clips
+    that were cut. In this case, they are normalized later.
     """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)

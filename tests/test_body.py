@@ -259,7 +259,7 @@ def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch, subtest
             "age=old is invalid. Use NAME=NUMBER, with a name from gender, age, height, weight and a number",
         ),
         ("anny age=1.1", r"age=1\.1 is invalid"),
-        ("anny", r'body=anny needs the package anny\. Run pip install "flame-mdm\[body\]"'),
+        ("anny", r'body=anny requires the anny package\. Run pip install "flame-mdm\[body\]"'),
     ):
         with subtests.test(name=name, message=message), pytest.raises(UserError, match=message):
             load_body(name)

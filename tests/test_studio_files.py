@@ -550,7 +550,7 @@ def test_without_usd_core_the_error_says_how_to_install_it(
 ):
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(
-        UserError, match=r"need the package usd-core\. Run pip install .flame-mdm\[usd\]"
+        UserError, match=r"require the usd-core package\. Run pip install .flame-mdm\[usd\]"
     ):
         synthetic("kick").save(tmp_path / "kick.usdz")
     assert list(tmp_path.iterdir()) == []

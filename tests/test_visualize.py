@@ -267,7 +267,7 @@ def test_mp4_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(
         UserError,
-        match=r'm\.mp4: MP4 needs the package av\. Run pip install "flame-mdm\[video\]", or',
+        match=r'm\.mp4: MP4 requires the av package\. Run pip install "flame-mdm\[video\]", or',
     ):
         write_mp4(tmp_path / "m.mp4", [sway(2)])
     assert list(tmp_path.iterdir()) == []

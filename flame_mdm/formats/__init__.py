@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flame_mdm.errors import UserError
 
-# Files with a scene of nodes and its animations
+# Extensions of files that contain a scene of nodes and its animations
 SCENES = (".fbx", ".glb", ".vrm", ".vrma")
 # Extensions of motion files that can be read
 ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
@@ -50,7 +50,8 @@ def unread(path: Path) -> UserError:
     """Returns the error for a file that has an unsupported extension."""
     advice = ADVICE.get(path.suffix.lower(), f"Use one of {', '.join(ENDINGS)}")
     return UserError(
-        f"{path}: {path.suffix or 'a file without extension'} cannot be read as a motion. {advice}"
+        f"{path}: {path.suffix or 'a file without an extension'} cannot be read as a motion. "
+        f"{advice}"
     )
 
 

@@ -43,10 +43,10 @@ class AnimatedNodes:
 
 
 def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) -> tuple[str, Item]:
-    """Returns the name and the content of an animation.
+    """Returns the name and content of the requested animation.
 
     Args:
-        animations: names and contents.
+        animations: name and content of each animation.
         requested: the name of an animation, or its number, counted from 1. None = the first one.
 
     Raises:
@@ -95,7 +95,7 @@ def parents_first(parents: Sequence[int]) -> list[int]:
 
 
 def world_matrices(parents: Sequence[int], local: np.ndarray) -> np.ndarray:
-    """Converts matrices relative to the parents to world matrices, (F, N, 4, 4) each.
+    """Converts matrices (F, N, 4, 4) relative to the parents to world matrices.
 
     Parents must precede their children.
     """

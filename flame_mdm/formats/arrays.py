@@ -1,4 +1,4 @@
-"""Motion files that contain arrays (`.npz`, `.npy`, `.json`), with joints or SMPL's rotations."""
+"""Motion files with arrays of joint positions or SMPL rotations: `.npz`, `.npy`, `.json`."""
 
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,8 @@
 """ASF/AMC motion capture files, as used by Acclaim and the CMU database: one file per skeleton, one per motion.
 
-An ASF file lists the bones of a subject. Each bone has a direction and length in the world in the
-rest pose (standing), the axes C in which it turns, and its degrees of freedom. An AMC file contains
-the angles of these degrees of freedom for each frame. If M is the rotation given by these
+An ASF file lists the bones of a subject. Each bone has a direction and length in world coordinates
+in the standing rest pose, the axes C in which it turns, and its degrees of freedom. An AMC file
+contains the angles of these degrees of freedom for each frame. If M is the rotation given by these
 angles, the bone turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied
 first: C = Rz Ry Rx.
 """
@@ -43,8 +43,8 @@ class Bone(NamedTuple):
 def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints.
 
-    Each bone becomes a joint with the same name at its start. AMC files do not contain `fps`, which
-    is 120 for most of CMU's recordings.
+    Each bone becomes a joint with the same name at its start. AMC files do not contain the frame
+    rate `fps`, which is 120 for most of CMU's recordings.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
@@ -176,7 +176,7 @@ def _order(lines: Lines, words: list[str]) -> str:
 
 
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
-    """Returns, for each bone, the values (F, N) of its N degrees of freedom; angles in degrees.
+    """Returns, for each bone, the values (F, N) of its N degrees of freedom. Angles are in degrees.
 
     Raises:
         UserError: If there are too many frames for this number of `joints`.

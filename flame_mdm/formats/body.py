@@ -15,7 +15,10 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh, mannequin
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
-"""How much the width of the trunk at a joint follows the shoulders, from 0 to 1; the rest follows the hips."""
+"""How much the width of the trunk at a joint follows the shoulders, from 0 to 1.
+
+The rest follows the hips.
+"""
 # Limits on the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
 # positions must not make the trunk too thin or too wide.
 WIDER = (0.8, 1.25)

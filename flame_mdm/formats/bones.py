@@ -49,7 +49,7 @@ def bone_poses(
     Args:
         tree: the file.
         layout: the skeleton of the file.
-        joints: (F, 22, 3), SMPL's joints in meters, y up.
+        joints: (F, 22, 3), positions of SMPL's joints in meters, y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
         in_front: (J, 3, 3), rotations relative to the parents in a rest pose that precedes
             the motion; None if there is no such pose.
@@ -156,7 +156,7 @@ def _unit(vector: ArrayLike) -> np.ndarray:
 def _assembled(turned: np.ndarray, root: np.ndarray, steps: np.ndarray) -> Poses:
     """Returns the poses of joints with world rotations (F, 22, 3, 3).
 
-    The body has the bones of the file.
+    The body has the bone lengths of the file.
     """
     offsets = np.zeros((len(SMPL22), 3))
     local = turned.copy()

@@ -140,7 +140,7 @@ def read_lines(path: str | Path) -> Lines:
 def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
-    Raises `UserError`, with file and line, if the file is incomplete or invalid.
+    Raises `UserError`, which names the file and the line, if the file is incomplete or invalid.
     """
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
@@ -183,7 +183,7 @@ def read(path: str | Path) -> Bvh:
             )
             source.word("{")
     if blocks or not nodes or source.row[-1].upper() != "MOTION":
-        source.fail("expected MOTION after the end of the hierarchy, at the end of a line")
+        source.fail("expected MOTION after the hierarchy, as the last word on its line")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
     # The number of digits is limited, because Python needs quadratic time to parse long numbers.
@@ -280,7 +280,7 @@ class Lines:
         return " ".join(words)
 
     def numbers(self, words: Sequence[str], count: int) -> list[float]:
-        """Returns the words as `count` finite numbers."""
+        """Converts the words to `count` finite numbers."""
         try:
             values = [float(word) for word in words]
         except ValueError:
@@ -298,7 +298,7 @@ class Lines:
 
 
 def write(bvh: Bvh, path: str | Path) -> None:
-    """Writes a BVH file. `read` converts it back to the same numbers.
+    """Writes a BVH file. Reading the file with `read` returns the same numbers.
 
     Joints are written in depth-first order.
     """

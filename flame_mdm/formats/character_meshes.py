@@ -13,7 +13,7 @@ from flame_mdm.formats.body import PosedFigure
 from flame_mdm.formats.characters import Character, moved
 from flame_mdm.formats.rigged import Material, RiggedClip, Skin
 
-# Mode of a primitive with triangles
+# Mode of a primitive that consists of triangles
 TRIANGLES = 4
 # Maximum number of vertices in a character
 MAX_VERTICES = 2_000_000
@@ -54,7 +54,7 @@ def character_clip(character: Character, motion: PosedFigure, name: str) -> Rigg
 
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the names. A number is appended to each duplicate."""
+    """Returns the names, with a number appended to each duplicate."""
     counts: dict[str, int] = {}
     distinct = []
     for name in names:

@@ -1,12 +1,12 @@
 """Motions for a user's character, which is a skinned .glb file or the skeleton of a .bvh file.
 
-The proportions, units, axes, names and rest pose of a character may differ from SMPL's body. The
-rest pose must be upright with flat feet.
+A character may differ from SMPL's body in proportions, units, axes, names and rest pose. The rest
+pose must be upright with flat feet.
 
 Arms and legs take the directions of the motion's bones. Trunk, head, hands and feet are turned as
 in the motion, relative to the rest pose. The path of the hips is scaled by the leg length. Then the
 legs are bent so that the toes reach the motion's toe positions, which are scaled in the same way.
-The height of the toes is the character's own toe height.
+Their heights are adjusted to the character's own toe height.
 """
 
 import copy
@@ -48,8 +48,8 @@ class BvhCharacter(RestPose):
 def read(path: str | Path) -> Character | BvhCharacter:
     """Reads a character.
 
-    The names of its joints must be the names of a known skeleton, or the names in a `.yaml` file
-    with the same name as the character's file.
+    Its joint names must match a known skeleton, or be listed in a `.yaml` file with the same name
+    as the character's file.
 
     Raises:
         UserError: If the file is damaged, if a .glb file contains no skin, or if there is no usable
@@ -201,7 +201,7 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 class UnknownJoints(UserError):
     """Error for joints that cannot be identified.
 
-    `template` contains the lines of a file with names, which the user can complete.
+    `template` contains the lines of a file of joint names that the user can complete.
     """
 
     def __init__(self, message: str, template: list[str]):

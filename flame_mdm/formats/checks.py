@@ -81,7 +81,7 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
 
 
 def jump(joints: np.ndarray, fps: float) -> str:
-    """Returns a message if the pelvis or a leg moves faster than people do; otherwise "".
+    """Returns a message if the pelvis or a leg moves faster than people do, or "" otherwise.
 
     `joints` are (F, 22, 3).
     """
@@ -104,7 +104,7 @@ def jump(joints: np.ndarray, fps: float) -> str:
 
 
 def below_floor(joints: np.ndarray) -> str:
-    """Returns a message if a body with adult bones sinks below the floor; otherwise "".
+    """Returns a message if a body with adult bones sinks below the floor, or "" otherwise.
 
     This happens if the body in the file is smaller than an adult.
     """

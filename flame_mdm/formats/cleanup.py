@@ -1,7 +1,7 @@
 """Cleanup of generated motion.
 
-Cleanup smooths the joints, makes bone lengths constant, keeps feet in place, and moves hands out of
-the body.
+Cleanup smooths the paths of joints, makes bone lengths constant, keeps feet in place, and moves
+hands out of the body.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,9 @@ LOW = 0.07
 # still
 SLOW = 0.5
 SHARE, SHARE_PINNED = 0.5, 0.4
-"""Fraction of the body's speed added to `SLOW`, before and after the body follows its feet.
+"""Fractions of the body's speed that are added to `SLOW`.
+
+The first applies before the body is moved to follow its feet, the second after it.
 
 In generated motion, a foot on the floor may slide along with the body. A swinging foot is faster
 than the body.
@@ -46,7 +48,7 @@ REACH = 0.999
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
-    """Returns a motion with smooth joints, constant bone lengths and feet that do not slide.
+    """Returns a motion with smooth joint paths, constant bone lengths and feet that do not slide.
 
     `cleanup` describes the changes to the joints. The result has no features, rotations or
     contacts, because they would no longer match the joints.
@@ -175,9 +177,9 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
     """Bends limbs whose foot or hand has moved down because bone lengths have changed.
 
-    Between two very different poses in a sequence, for example from a crawl to a walk, the poses
-    are averages of both and have short bones. With full lengths, they would reach through the
-    floor.
+    Between two very different poses in a sequence, for example when a crawl changes to a walk, the
+    poses are averages of the two and have short bones. With full lengths, they would reach through
+    the floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):

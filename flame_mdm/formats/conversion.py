@@ -1,4 +1,4 @@
-"""Conversion of motions to joints or SMPL rotations, the input of representations."""
+"""Conversion of motions to the joint positions or SMPL rotations that representations encode."""
 
 from dataclasses import dataclass
 
@@ -36,9 +36,9 @@ class RawMotion:
     """A motion in the form that `Representation.encode` accepts.
 
     Attributes:
-        values: joints (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
+        values: joint positions (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
-        note: a line for the user if a body with different proportions was used; otherwise "".
+        note: a line for the user if a body with different proportions was used, or "" otherwise.
             The line states the error, and whether the rotations come from the file or were fitted
             to the joints.
         error: mean distance in meters between the joints of this body and the joints of the motion.
@@ -129,7 +129,7 @@ def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
 
     Args:
         body: the motion with the bones of its own body.
-        joints: (F, 22, 3), joints of the motion in meters.
+        joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:
         The poses, and the distances (F, 22) in meters of their joints from the scaled `joints`.

@@ -19,7 +19,7 @@ LIMITS = {
     "skating": (
         0.5,
         "m/s",
-        "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more, longer than a step takes",
+        "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more (longer than a step takes)",
     ),
     "pop": (
         200.0,
@@ -40,7 +40,7 @@ LIMITS = {
     "floating": (
         LOW,
         "m",
-        "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or 0.3 s at rest",
+        "no joint is within 5 cm of the floor for 0.8 s (longer than a jump), or for 0.3 s at rest",
     ),
     "limit": (
         15.0,
@@ -209,9 +209,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand; negative outside
-        the body. Also unit vectors (F, 3, 3) to these points, from the axis of the part in which
-        each point is deepest.
+        Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand. It is negative
+        outside the body. The second result is the unit vectors (F, 3, 3) to these points, from the
+        axis of the part in which each point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

@@ -87,7 +87,7 @@ class Curve:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F,) at times (F,) in seconds.
 
-        Before the first key and after the last key, the value of this key is held.
+        The value of the first key is held before it, and the value of the last key after it.
         """
         if len(self.times) == 1:
             return np.full(len(times), self.values[0])

@@ -1,9 +1,9 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files of Autodesk's FBX SDK. Programs require different details.
-If a reader fails without a detail, a comment names this reader. The bones are at the top level,
-because Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in
-`PreRotation`, so that rotations of 0 are the rest pose in every program.
+The structure of the scene follows files of Autodesk's FBX SDK. Different programs require different
+details. Comments name the program that requires a detail. The bones are at the top level, because
+Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in `PreRotation`,
+so that rotations of 0 are the rest pose in every program.
 """
 
 from collections import Counter

@@ -60,7 +60,7 @@ class Clip:
     """A motion for a game engine.
 
     Attributes:
-        name: name, without the name of the set.
+        name: name of the clip, without the name of the set.
         kind: loop (the last pose equals the first pose), start, stop or turn.
         motion: the joints and the root trajectory.
         text: the text from which the motion was generated.
@@ -108,7 +108,7 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 
 
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
-    """Returns the cycle of a gait in a direction with the smallest difference between its ends.
+    """Returns, of all gait cycles in a direction, the one whose ends differ least.
 
     Returns None if there is no cycle. Cycles that begin with a landing of the left foot are
     preferred, so that the loops of a set begin with the same foot.
@@ -156,7 +156,7 @@ def gait(
     """Returns the start, the loop and the stop of a gait on a straight path.
 
     Args:
-        motion: a person who is standing, moves in a direction, and stands again.
+        motion: a motion in which a person stands, moves in a direction, and stands again.
         cycle: the cycle that becomes the loop.
         degrees: the direction, relative to the heading of the person.
         stand: (22, 3), the first pose of the start and the last pose of the stop.
@@ -207,7 +207,7 @@ def closed(motion: GroundedMotion) -> GroundedMotion:
 
 
 def moving(motion: GroundedMotion) -> tuple[int, int]:
-    """Returns the frames between which the body moves, with `MARGIN` around them."""
+    """Returns the first and last frame in which the body moves, extended by `MARGIN`."""
     speed = np.linalg.norm(np.gradient(motion.world(), axis=0), axis=-1).max(1) * motion.fps
     speed = gaussian_filter1d(speed, 0.05 * motion.fps, mode="nearest")
     fast = np.flatnonzero(speed > SETTLED)
@@ -220,7 +220,7 @@ def moving(motion: GroundedMotion) -> tuple[int, int]:
 def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedMotion | None:
     """Returns a turn in place by an angle. `stand` (22, 3) is the first and the last pose.
 
-    Returns None if the motion turns by a very different angle or to the other side.
+    Returns None if the motion turns by a very different angle or in the other direction.
     """
     # The model turns by about the requested angle. The root is turned by exactly this angle, and
     # the pose turns with it.

@@ -151,7 +151,7 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
     """Returns an order of nodes in which parents precede their children, and the parents.
 
     Raises:
-        ValueError: If the nodes are not trees.
+        ValueError: If the nodes do not form trees.
     """
     above = {child: number for number, node in enumerate(nodes) for child in node.children}
     if len(above) != sum(len(node.children) for node in nodes):

@@ -104,7 +104,7 @@ class Track:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F, C) at times (F,). Rotations are not normalized.
 
-        Before the first key and after the last key, the value of this key is held.
+        The value of the first key is held before it, and the value of the last key after it.
         """
         # Each time lies in a segment between two keys. CUBICSPLINE stores slopes per second, which
         # are converted to slopes per segment.

@@ -5,8 +5,8 @@ this root. Motions are cut in this representation, so that the last pose of one 
 first pose of the next. Then the path of the root is added again, and inverse kinematics keeps each
 foot in place during its contacts.
 
-Arrays have F frames and the 22 SMPL joints, in meters, y up. Angles are in radians. Positive angles
-turn to the left.
+Arrays contain the positions of the 22 SMPL joints in F frames, in meters, y up. Angles are in
+radians. Positive angles turn to the left.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ SMOOTHNESS = 0.15
 LOW = 0.05
 # Maximum horizontal speed of a planted toe in m/s
 SLOW = 0.25
-# Contacts, and gaps between contacts, that are shorter than this are ignored; in seconds
+# Contacts and gaps between contacts are ignored if they are shorter than this many seconds
 SHORT = 0.1
 # Seconds over which the body is lowered for a leg that is too short
 LOWERING = 0.2
@@ -39,10 +39,10 @@ FEET = tuple(
 
 @dataclass(frozen=True, eq=False)
 class GroundedMotion:
-    """A motion as a path of a root on the floor, and joints relative to this root.
+    """A motion, stored as the path of a root on the floor and joints relative to this root.
 
     Attributes:
-        local: (F, 22, 3), joints relative to the root, which faces +z.
+        local: (F, 22, 3), joint positions relative to the root, which faces +z.
         path: (F, 2), x and z of the root.
         heading: (F,), direction of the root; 0 = it faces +z.
         contacts: (F, 2), whether the left and the right toes are planted.
@@ -118,7 +118,7 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns whether the left and right toes are planted, (F, 2), by height and speed."""
+    """Returns whether the left and right toes are planted (F, 2), given their height and speed."""
     # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
     # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]

@@ -32,7 +32,7 @@ LEG, USUAL_LEG = (
     (0.6, 1.2),
     0.83,
 )
-# Minimum length of a child's leg in meters, at about one year
+# Minimum leg length of a child in meters, at the age of about one year
 CHILD = 0.25
 # Minimum length of a foot in meters, ankle to toes
 FOOT = 0.02
@@ -57,7 +57,7 @@ Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """Map from the joints in files to SMPL's 22 joints, in meters, y up.
+    """Map from the joints in files to SMPL's 22 joints, whose positions are in meters, y up.
 
     The fields are the keys of `skeleton.yaml`.
     """
@@ -101,7 +101,7 @@ class Layout(BaseModel):
 
     @property
     def rig(self) -> str:
-        """The name of the skeleton of `rigs.yaml` with the same joints; "" if there is none."""
+        """The name of the skeleton of `rigs.yaml` with the same joints, or "" if there is none."""
         return self._rig
 
     def bone(self, joint: str) -> str:
@@ -131,7 +131,7 @@ class Layout(BaseModel):
         }
 
     def pairs(self) -> dict[str, str]:
-        """Returns the counterpart on the other side of each joint in the files that the map uses.
+        """For each joint in the files that the map uses, returns its counterpart on the other side.
 
         A joint without a counterpart is its own counterpart.
         """
@@ -145,7 +145,10 @@ class Layout(BaseModel):
         return pairs
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Maps joints (F, J, 3) with these names to (F, 22, 3) float32, meters, y up."""
+        """Maps joints (F, J, 3) with these names to SMPL's joints (F, 22, 3).
+
+        The result is float32, in meters, y up.
+        """
         weights = np.zeros((len(SMPL22), len(names)))
         for row, joint in zip(weights, SMPL22.joints, strict=True):
             for name, share in _shares(self.map[joint]).items():
@@ -177,7 +180,7 @@ def _shares(source: Source) -> Mapping[str, float]:
 def _layout(
     joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, **fields: Any
 ) -> Layout:
-    """Returns a layout in `layouts.yaml`, which describes the arguments."""
+    """Returns a layout from `layouts.yaml`. The comments in this file describe the arguments."""
     parts = {key: fields.pop(key) for key in ("sides", "trunk", "arm", "leg") if key in fields}
     skeleton = presets()[rig] if rig else parts
     bones = joint_names(skeleton) if skeleton else {joint: joint for joint in SMPL22.joints}
@@ -245,8 +248,8 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns the layout of a file from `read_tree`, and the names of its joints in this layout.
 
-    `fields` of `Layout` override the known fields. Known skeletons whose arrays are in meters are
-    in centimeters in BVH files, as written by `flame_mdm.formats`.
+    `fields` of `Layout` override the known fields. Known skeletons whose arrays are in meters use
+    centimeters in BVH files, as written by `flame_mdm.formats`.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
@@ -276,7 +279,8 @@ def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout,
             else "but SMPL has 22, 24 or 52, and SOMA has 30 or 77"
         )
         raise UserError(
-            f"{count} joints, {rest}. Add the names of all joints and a map to skeleton.yaml"
+            f"the array has {count} joints, {rest}. Add the names of all joints and a map to "
+            "skeleton.yaml"
         )
     return find_layout(names, fields), names
 
@@ -341,7 +345,10 @@ def _renamed(source: Source, names: Mapping[str, str]) -> Source:
 
 
 def skeleton_file(path: Path) -> Path | None:
-    """Returns the nearest `skeleton.yaml`, a regular file, in a file's folder or above it."""
+    """Returns the nearest `skeleton.yaml` in a file's folder or above it.
+
+    Raises `UserError` if it is not a regular file.
+    """
     for folder in path.absolute().parents:
         if os.path.lexists(folder / "skeleton.yaml"):
             regular_file(folder / "skeleton.yaml")
@@ -398,10 +405,10 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
     """Checks the length of the legs.
 
     Args:
-        joints: (F, 22, 3), SMPL's joints in meters.
+        joints: (F, 22, 3), positions of SMPL's joints in meters.
         unit: unit of the file, in meters.
         children: whether bodies may be children.
-        doubt: a line about another problem with the motion, for the message.
+        doubt: a line about another problem with the motion, which is added to the message.
 
     Raises:
         UserError: If the leg length is not a person's. The message suggests a unit.
@@ -436,8 +443,8 @@ def _usual_unit(leg: float, unit: float) -> str:
     return f"No common unit fits the file; with {usual:.3g}, the legs have the usual length of {USUAL_LEG:g} m"
 
 
-# Fraction of the frames in which the toes of both feet point backwards. Above this fraction, left
-# and right are swapped.
+# Left and right count as swapped if the toes of both feet point backwards in more than this
+# fraction of the frames
 BACKWARDS = 0.25
 
 
@@ -495,8 +502,8 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     if unequal or changing:
         fault = "left and right limbs differ in length" if unequal else "the limbs change in length"
         raise UserError(
-            f"{count} joints, but not the joints of {skeleton} in order: {fault}. Add the names of all "
-            "joints and a map to skeleton.yaml"
+            f"the array has {count} joints like {skeleton}, but not in the same order: {fault}. "
+            "Add the names of all joints and a map to skeleton.yaml"
         )
 
 

@@ -140,8 +140,8 @@ class Motion(PosedFigure):
 
         Args:
             path: the file. Its extension selects the format (docs/formats.md).
-            rest_pose: begin a `.bvh` file with a frame in the rest pose, with the arms to the
-                sides. Some programs expect it.
+            rest_pose: begin a `.bvh` file with a frame in the rest pose, in which the arms point to
+                the sides. Some programs expect this frame.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's skeleton.
             character: your own character, as a file or as the result of `characters.read`. The
@@ -149,8 +149,8 @@ class Motion(PosedFigure):
                 file, the motion of a `.bvh` character as a `.bvh` file.
             body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from
                 `formats.people.load_body`. Default: the mannequin.
-            root_motion: the joint on the floor of `rig` follows the hips in a `.glb`, `.fbx` or USD
-                file. Otherwise, it stays in place. Only for `rig="unreal"` and `rig="soma"`.
+            root_motion: whether the root of `rig` on the floor follows the hips in a `.glb`, `.fbx`
+                or USD file. Otherwise, it stays in place. Only for `rig="unreal"` and `rig="soma"`.
             facts: additional entries for an `.npz` file, such as the seed.
 
         Raises:
@@ -199,7 +199,7 @@ class Motion(PosedFigure):
 
         Known rotations are interpolated on the sphere, so that bones keep their length. Without
         rotations, joints are interpolated by cubic splines. Features are left out, because they are
-        valid for one frame rate only.
+        valid at only one frame rate.
         """
         if math.isclose(self.fps, fps):
             return self

@@ -1,10 +1,10 @@
 """Matching of joint names.
 
-Blender's extension contains this file, so it needs only the standard library.
+Blender's extension contains this file, so it uses only the standard library.
 
 Programs spell the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
 left up leg`, `L_UpLeg`. Differences in case, separators, and a prefix that many joints share are
-ignored. The mark of the side may be short or long (L, left), and at the beginning or the end.
+ignored. The side may be marked at the beginning or the end of a name, by a letter or a word.
 """
 
 import re

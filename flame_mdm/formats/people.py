@@ -124,7 +124,7 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
         package = import_module("anny")
     except ImportError:
         raise UserError(
-            'body=anny needs the package anny. Run pip install "flame-mdm[body]"'
+            'body=anny requires the anny package. Run pip install "flame-mdm[body]"'
         ) from None
     model = package.Anny(rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
     output = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
@@ -214,7 +214,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 
 
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows.
+    """Returns a color (V, 3), from 0 to 255, for each vertex, given the joint that it follows.
 
     The hair has the shape of the mannequin's hair.
     """

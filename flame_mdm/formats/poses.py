@@ -29,7 +29,7 @@ SPINE = {
 BENDS = {1: -1.0, 2: -1.0, 16: 1.0, 17: 1.0}
 """For hips and shoulders, the z component of the direction in which the knee or elbow bends at rest."""
 STRAIGHT = 0.15
-"""Sine of the bend angle of a knee or elbow at which two cues of the limb's twist have equal weight.
+"""Sine of a knee's or elbow's bend angle at which two cues for a limb's twist have equal weight.
 
 The cues are the bend and the rotation of the parent. Weights are squared, so that a clear bend
 dominates.
@@ -117,8 +117,8 @@ def solve(joints: Tensor, fps: float) -> Poses:
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(
-            "joint rotations are computed only for SMPL's 22 joints, (frames, 22, 3), but these have shape "
-            f"{tuple(joints.shape)}. Save them as .json or .npy"
+            "joint rotations can be computed only for SMPL's 22 joints (frames, 22, 3), but these "
+            f"joints have shape {tuple(joints.shape)}. Save them as .json or .npy"
         )
     joints = joints.double()
     lengths = torch.linalg.vector_norm(SMPL22.bones(joints), dim=-1).mean(0)

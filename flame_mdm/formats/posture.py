@@ -1,6 +1,6 @@
 """World rotations of a body.
 
-Blender's extension contains this file, so the file needs only numpy.
+Blender's extension contains this file, so the file requires only numpy.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def complete(
 
     Args:
         joints: (F, 22, 3) in meters.
-        offsets: (22, 3), joints relative to their parents in the rest pose.
+        offsets: (22, 3), positions of the joints relative to their parents in the rest pose.
         world: (F, 22, 3, 3), world rotations.
 
     Returns:
@@ -67,7 +67,7 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Returns orthonormal axes as rows (3, 3).
 
-    The rows are the normalized direction, the part of `u` that is orthogonal to it, normalized, and
+    The rows are the normalized direction, the normalized part of `u` that is orthogonal to it, and
     the cross product of the two.
     """
     along = direction / np.linalg.norm(direction)

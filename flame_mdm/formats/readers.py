@@ -99,10 +99,10 @@ class Recording:
         motion: the motion. Its notes are lines for the user.
         layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
         doubts: findings that look wrong. Their lines are among the notes of the motion.
-        smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes; None
-            if the file contains no such rotations.
-        tree: the tree of joints without rest-pose frames, at the frame rate of the file; None
-            if the file contains no tree.
+        smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, or
+            None if the file contains no such rotations.
+        tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
+            the file contains no tree.
     """
 
     motion: Motion
@@ -364,7 +364,7 @@ def _of_smpl(
     fields: Mapping[str, Any],
 ) -> Recording:
     others = [key for key in Layout.model_fields if key not in ("up", "fps")]
-    _refuse(fields, others, "the joints and lengths of SMPL's rotations are known")
+    _refuse(fields, others, "the joints and bone lengths of SMPL's body are known")
     data["fps"] = rate = _rate(data, rate, fields)
     up = fields.get("up", "z")
     axes = BODY_AXES[up]

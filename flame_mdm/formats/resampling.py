@@ -16,7 +16,7 @@ RATES = (0.1, 1000.0)
 MAX_FRAMES = 500_000
 # Maximum number of frames times joints of a tree: one hour with 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000
-# Number of frames times joints that are accepted for any file size; reading them takes 300 MB
+# Number of frames times joints that is accepted in files of any size; reading it takes 300 MB
 FEW_POSITIONS = 1_000_000
 BYTES_PER_POSITION = 4
 """Minimum number of bytes per frame and joint, for files with more positions.
@@ -31,7 +31,7 @@ def frame_rate(value: Any, name: str = "fps") -> float:
     """Returns a frame rate as a float; `name` is its name in the file.
 
     Raises:
-        UserError: If the value is not a number in `RATES`.
+        UserError: If the value is not a number in the range `RATES`.
     """
     number = np.asarray(value)
     # Some programs write an array that contains one number

@@ -1,6 +1,6 @@
 """Skeletons of other programs, and moving characters.
 
-Blender's extension contains this file, so the file needs only numpy.
+Blender's extension contains this file, so the file requires only numpy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +56,7 @@ class Rig:
     orders: tuple[str, ...]
     # Meters per unit of length in BVH files
     unit: float = CENTIMETER
-    # (3, 3), rotation from the world of the file
+    # (3, 3), rotation from the world coordinates of the file
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))
     # (J,), scale of each joint: world units per unit of the joint. Empty = all scales are 1.
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))
@@ -199,7 +199,7 @@ def rest_pose(
     """Returns a rest pose, turned so that y is up and +z is ahead.
 
     Args:
-        source: name of the character in messages.
+        source: name of the character for error messages.
         names: names of the J joints.
         parents: index of each joint's parent.
         positions: (J, 3), in world coordinates with any unit and direction.
@@ -315,7 +315,7 @@ def follow(
 
     Args:
         character: the character.
-        joints: (F, 22, 3), joints of the body in meters.
+        joints: (F, 22, 3), joint positions of the body in meters.
         offsets: (22, 3), offsets of the joints from their parents in the rest pose.
         neutral: (22, 3, 3), rotations of the body parts in the rest pose.
         world: (F, 22, 3, 3), world rotations of the body parts.

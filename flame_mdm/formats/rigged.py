@@ -131,7 +131,7 @@ class RiggedClip:
         return positions, turns
 
     def part(self, frames: slice, name: str, contacts: np.ndarray) -> "RiggedClip":
-        """Returns some frames as a clip with a name and the contacts (F, 2) of these frames."""
+        """Returns part of the clip under a new name, with the contacts (F, 2) of its frames."""
         moves = {joint: moved[frames] for joint, moved in self.moves.items()}
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
@@ -149,7 +149,7 @@ class RiggedClip:
         return changes
 
     def on_path(self, path: np.ndarray, heading: np.ndarray) -> "RiggedClip":
-        """Moves a clip whose body stays in place along a path.
+        """Moves an in-place clip along a path.
 
         The root moves. If there is no root on the floor, the hips move.
 
@@ -225,7 +225,7 @@ def rigged(
     """Converts a moving body to a clip on a skeleton.
 
     Args:
-        poses: the body.
+        poses: the moving body.
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
@@ -297,7 +297,7 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     """Returns the mesh of a body in its stored pose, with the hips at the rig's rest position."""
     mesh = body.mesh
     moved = rig.positions[rig.hips] + [0, body.lift, 0] - body.joints[0]
-    weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones join their joints
+    weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones are merged into their joints
     np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), mesh.weights[:, len(SMPL22) :].T)
     bones, shares = largest_weights(weights)
 

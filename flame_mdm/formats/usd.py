@@ -3,7 +3,7 @@
 """Writes a motion with its skeleton and skin as a Universal Scene Description (UsdSkel) file.
 
 Files are .usda, .usdc or .usdz. Source: Pixar, "UsdSkel",
-https://openusd.org/release/api/usd_skel_page_front.html. Writing needs the package usd-core
+https://openusd.org/release/api/usd_skel_page_front.html. Writing requires the usd-core package
 (extra `usd`).
 """
 
@@ -27,7 +27,7 @@ def write(path: Path, clip: RiggedClip) -> None:
     except ImportError as error:
         advice = 'Run pip install "flame-mdm[usd]"'
         raise UserError(
-            f"{path}: {path.suffix} files need the package usd-core. {advice}"
+            f"{path}: {path.suffix} files require the usd-core package. {advice}"
         ) from error
 
     with atomic_write(path) as temporary, tempfile.TemporaryDirectory() as folder:

@@ -65,7 +65,7 @@ def rest_rig(poses: Poses) -> Rig:
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a clip of the skeleton of `rest_rig`."""
+    """Writes a clip whose skeleton comes from `rest_rig`."""
     binary = Binary()
     turns = quaternions(np.concatenate([clip.rest[None], clip.turns]))[1:]
     curves = [("rotation", node, turns[:, node]) for node in range(len(clip.joints))]

@@ -1,4 +1,4 @@
-"""Figures and bodies for players and pictures. The mesh of a body is skinned to a motion."""
+"""Figures and bodies for players and pictures. A body is a mesh that is skinned to a motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22, Skeleton
 from flame_mdm.safe_io import naming, read_npz
 
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
-"""Limbs with a helper bone, by their first joint, and the share of a twist that the helper bone takes.
+"""Share of a limb's twist that its helper bone takes, by the first joint of the limb.
 
 The twist is measured at the hip or shoulder or, for the forearm, at the wrist.
 """
@@ -48,9 +48,9 @@ class Figure:
         fps: frames per second.
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
-        text: the caption or the name of the action; "" if there is neither.
-        id: name of the motion. It is the name of a clip or file, or the text and the sample number,
-            which determine the noise.
+        text: the caption or the name of the action, or "" if there is neither.
+        id: name of the motion: the name of a clip or file, or the text and the sample number, which
+            together determine the noise.
         contacts: (F, N) bool, True = this joint of `skeleton.feet` is on the floor; None = unknown.
     """
 
@@ -64,15 +64,15 @@ class Figure:
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
         """Returns the fitted body and "", or None and the reason why no body fits.
 
-        Without a body, a skeleton is drawn instead.
+        If no body fits, a skeleton is drawn instead.
 
-        `body` is the mesh; None = the mannequin. Fitting a body requires the joint rotations.
+        `body` is the mesh to fit; None = the mannequin. Fitting requires the joint rotations.
         """
         return None, "its joint rotations are unknown"
 
 
 def target(path: str | Path, motions: Sequence[Figure]) -> Path:
-    """Returns the path of a file. Raises `UserError` if there are no motions to write to it."""
+    """Returns the path as a `Path`. Raises `UserError` if there are no motions to write to it."""
     if not motions:
         raise UserError(f"{path}: no motions to show")
     return Path(path)
@@ -84,12 +84,12 @@ def sides(skeleton: Skeleton) -> list[int]:
 
 
 def head(skeleton: Skeleton) -> int | None:
-    """Returns the index of the head joint; None if the skeleton has no head."""
+    """Returns the index of the head joint, or None if the skeleton has no head."""
     return skeleton.joints.index("head") if "head" in skeleton.joints else None
 
 
 def radii(skeleton: Skeleton) -> list[float]:
-    """Returns the radius of the body around each joint in meters.
+    """Returns the radius of the body, in meters, around each joint.
 
     The radius increases with the number of the joint's descendants.
     """
@@ -100,12 +100,14 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose, an A-pose with the pelvis at 0. `tools/mannequin.py` writes it.
+    """A closed mesh in its stored pose, an A-pose with the pelvis at the origin.
+
+    `tools/mannequin.py` writes it.
 
     Attributes:
         points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
         weights: (V, 28) weights for SMPL's 22 joints and for `HELPERS`. At most four weights per
-            point are not 0.
+            point are nonzero.
         triangles: (T, 3), counterclockwise as seen from outside.
         turns: (28, 3, 3), world rotation of each bone from SMPL's rest pose to the stored pose.
         rest: (22, 3), position of each joint relative to its parent in SMPL's rest pose.
@@ -132,9 +134,9 @@ class Mesh:
 
 
 def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the four bones (V, 4) with the largest weights, and integer weights (V, 4) with a sum of 255.
+    """Returns the four bones (V, 4) with the largest weights, and their integer weights (V, 4).
 
-    The input is (V, B).
+    `weights` are (V, B). The integer weights of a vertex sum to 255.
     """
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     most = np.take_along_axis(weights, bones, 1)
@@ -163,7 +165,8 @@ class FittedBody:
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the
     # clip
     fit: np.ndarray
-    # (22, 3), joints of the stored pose with the bone lengths of the clip, pelvis at 0
+    # (22, 3), joints of the stored pose with the bone lengths of the clip and the pelvis at the
+    # origin
     joints: np.ndarray
     # (V, 3), points of the mesh in this pose
     points: np.ndarray
@@ -171,7 +174,7 @@ class FittedBody:
     neutral: np.ndarray
     # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
     turns: np.ndarray
-    # (F, B, 3), starting point of each bone: the joints of the motion, raised by `lift`
+    # (F, B, 3), starting point of each bone: the joint positions of the motion, raised by `lift`
     starts: np.ndarray
     # Height in meters of the body's joints above the motion's joints: the thickness of the sole
     lift: float

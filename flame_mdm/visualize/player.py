@@ -59,9 +59,9 @@ def player_page(
     rounded to millimeters, or to 1/65534 of the span of a motion.
 
     Args:
-        motions: the motions, with any skeletons, lengths and frame rates. `title` is the heading of
-            the page.
-        about: HTML of a collapsible section below the heading of the page. Texts in it must
+        motions: the motions. Their skeletons, lengths and frame rates may differ.
+        title: heading of the page.
+        about: HTML of a collapsible section below the heading of the page. Any text in it must
             already be escaped.
         columns: motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
@@ -139,7 +139,7 @@ def _packed(
 
 
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
-    """Returns proportions, and a 32-bit quaternion for each frame and bone.
+    """Returns the proportions of a body, and a 32-bit quaternion for each frame and bone.
 
     The quaternions are exact to about 0.1 degrees. The two highest bits state which of x, y, z and
     w is largest. The three other components, from -0.71 to 0.71, follow with 10 bits each.

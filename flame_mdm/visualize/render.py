@@ -45,8 +45,8 @@ def write_gif(
 
     Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second. Therefore,
     the frame rate is the highest frame rate of the motions, divided by the smallest integer that
-    results in 50 or less. For example, 60 fps become 30, and 120 fps become 40. A motion that ends
-    earlier stays at its last frame. `body` is the body to draw; None = the mannequin.
+    results in 50 or less. For example, 60 fps becomes 30, and 120 fps becomes 40. A motion that
+    ends earlier stays at its last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -73,7 +73,7 @@ def write_mp4(
         av = import_module("av")
     except ImportError:
         raise UserError(
-            f'{path}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write GIF'
+            f'{path}: MP4 requires the av package. Run pip install "flame-mdm[video]", or write GIF'
         ) from None
     fps = max(motion.fps for motion in motions)
     with (
@@ -167,7 +167,7 @@ def _palette() -> Image.Image:
 def _video(
     motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
 ) -> Iterator[Image.Image]:
-    """Yields images of the panels side by side, one per 1 / fps seconds, with a progress bar."""
+    """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]
@@ -278,7 +278,7 @@ def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]
 
 
 def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Returns colors (V, 3) with light from the upper left of the camera."""
+    """Returns the colors (V, 3) of a surface that is lit from the upper left of the camera."""
     light = TOWARD - 0.7 * RIGHT + [0, 1.2, 0]
     lit = np.maximum(normals @ (light / np.linalg.norm(light)), 0)
     return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
@@ -287,7 +287,7 @@ def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
 def _rasterize(
     image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray
 ) -> None:
-    """Draws triangles into an image, the nearest triangle at each pixel.
+    """Draws triangles into an image. Each pixel shows the nearest triangle.
 
     Colors are interpolated between the corners. The image is (height, width, 3) uint8. `at` (V, 2)
     are pixel coordinates, y down; `depth` (V,) are distances from the camera; `colors` (V, 3) are
@@ -345,7 +345,7 @@ def _draw_skeleton(
     project: Callable[[np.ndarray], np.ndarray],
     rim: float,
 ) -> None:
-    """Draws joints (J, 3) and the head, the farthest limb first, with dark rims of `rim` pixels."""
+    """Draws limbs between joints (J, 3) and the head, from far to near. Dark rims are `rim` pixels wide."""
     at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []
@@ -383,7 +383,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns at most three lines of a motion's caption, and a fourth line if it is drawn as a skeleton."""
+    """Returns at most three lines of a caption, and a fourth line if a skeleton is drawn."""
     lines, font = [""], _font(size)
     # The caption has room for three lines
     for word in shortened(motion.text or motion.id, width).split():
@@ -398,7 +398,7 @@ def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> li
 
 
 def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:
-    """Draws lines of text with room for `lines` lines, once for all frames."""
+    """Draws lines of text on an image that has room for `lines` lines."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)

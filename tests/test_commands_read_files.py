@@ -54,7 +54,7 @@ ROWS = {
     "f12_thirty_joints.npz": [
         Row(
             "",
-            "30 joints like SOMA 30, but not in the same order.*Add the names of all joints.*skeleton.yaml",
+            "30 joints like SOMA, but not in the same order.*Add the names of all joints.*skeleton.yaml",
         )
     ],
     "f12_body_only_66.npz": [Row(STANDS)],

@@ -345,7 +345,7 @@ def _draw_skeleton(
     project: Callable[[np.ndarray], np.ndarray],
     rim: float,
 ) -> None:
-    """Draws limbs between joints (J, 3) and the head, from far to near. Dark rims are `rim` pixels wide."""
+    """Draws limbs and a head at joints (J, 3), from far to near, with dark rims of `rim` pixels."""
     at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []

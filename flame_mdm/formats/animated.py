@@ -23,13 +23,12 @@ class AnimatedNodes:
 
     Attributes:
         names: names of the N nodes.
-        parents: index of the parent of each node, smaller than the index of the node; -1 for a
-            root.
+        parents: index of each node's parent, smaller than the node's own index, or -1 for a root.
         positions: (F, N, 3) in the world, in meters, y up.
         fps: frames per second.
         animation: the name of the animation.
-        humanoid: index of the node for each SMPL joint if the file declares which nodes form a human
-            body; otherwise empty.
+        humanoid: index of the node for each SMPL joint if the file declares which nodes form a
+            human body, otherwise empty.
         unit: meters per unit of length, as declared in the file.
     """
 
@@ -47,7 +46,7 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 
     Args:
         animations: name and content of each animation.
-        requested: the name of an animation, or its number, counted from 1. None = the first one.
+        requested: the name or 1-based number of an animation. None = the first one.
 
     Raises:
         UserError: If there is no such animation.
@@ -75,7 +74,7 @@ def parents_first(parents: Sequence[int]) -> list[int]:
     """Returns an order of nodes in which parents precede their children.
 
     Args:
-        parents: index of each node's parent; -1 for a root.
+        parents: index of each node's parent, or -1 for a root.
 
     Raises:
         ValueError: If a node is its own ancestor.

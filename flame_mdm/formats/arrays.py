@@ -13,7 +13,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.smpl import AXIS_ANGLES, read_pose
 from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
 
-# Maximum size of a `.json` motion in bytes. Parsed, it takes several times as much memory.
+# Maximum size of a `.json` motion in bytes. Once parsed, it takes several times as much memory.
 JSON_LIMIT = 128 * MEBIBYTE
 RATES = (
     "fps",

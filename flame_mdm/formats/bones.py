@@ -52,7 +52,7 @@ def bone_poses(
         joints: (F, 22, 3), positions of SMPL's joints in meters, y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
         in_front: (J, 3, 3), rotations relative to the parents in a rest pose that precedes
-            the motion; None if there is no such pose.
+            the motion, or None if there is no such pose.
     """
     if layout.mirrored:
         return BoneRotations(reason="the motion in the file is mirrored")

@@ -40,7 +40,7 @@ class Bvh:
 
     # J names. The end site of a joint is a joint without channels, called `NAME.end`.
     joints: tuple[str, ...]
-    # Index of each joint's parent, smaller than the joint's own index; -1 for a root
+    # Index of each joint's parent, smaller than the joint's own index, or -1 for a root
     parents: tuple[int, ...]
     # (J, 3) float64, rest position of each joint in its parent's frame
     offsets: np.ndarray
@@ -118,7 +118,7 @@ def forward_kinematics(
     G_j = G_p R_j and p_j = p_p + G_p t_j, where p is the parent of j.
 
     Args:
-        parents: index of each joint's parent; -1 for a root. Parents precede their children.
+        parents: index of each joint's parent, or -1 for a root. Parents precede their children.
         rotations: (F, J, 3, 3), relative to the parents.
         translations: (F, J, 3), in the parents' frames.
     """

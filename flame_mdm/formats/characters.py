@@ -5,8 +5,8 @@ pose must be upright with flat feet.
 
 Arms and legs take the directions of the motion's bones. Trunk, head, hands and feet are turned as
 in the motion, relative to the rest pose. The path of the hips is scaled by the leg length. Then the
-legs are bent so that the toes reach the motion's toe positions, which are scaled in the same way.
-Their heights are adjusted to the character's own toe height.
+legs are bent so that the toes reach the motion's toe positions, which are scaled in the same way
+and adjusted to the character's own toe height.
 """
 
 import copy

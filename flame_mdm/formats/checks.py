@@ -18,8 +18,8 @@ AVERAGED = 0.05
 KICK = 30.0
 UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is reported as too small
 
-# Maximum number of seconds between a rest pose that precedes a motion and the motion. Some
-# conversions blend these frames.
+# Maximum time in seconds between a motion and the rest pose that precedes it. Some conversions
+# blend these frames.
 BLEND = 0.04
 # Number of subsequent frames with which the first steps are compared
 CALM = 8

@@ -182,7 +182,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name of the take, or its number, counted from 1. None = the first take with keys.
+        animation: name or 1-based number of the take. None = the first take with keys.
 
     Raises:
         UserError: If the file is damaged, contains no animation, or contains several animation

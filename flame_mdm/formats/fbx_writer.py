@@ -22,7 +22,7 @@ from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 
 # The files are in centimeters
 PER_METER = 100
-# `TimeMode` of a rate in `CustomFrameRate`
+# `TimeMode` for a rate that is given in `CustomFrameRate`
 CUSTOM_RATE = 14
 # A fixed time, so that identical motions result in identical files. Readers compare it with `FileId`.
 CREATED = "1970-01-01 10:00:00:000"

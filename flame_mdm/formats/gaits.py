@@ -82,7 +82,7 @@ class Cycle:
 
     first: int
     last: int
-    difference: float  # mean distance of the joints in meters
+    difference: float  # mean distance between the joints in meters
 
 
 def direction(degrees: float) -> np.ndarray:

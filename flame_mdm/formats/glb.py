@@ -41,7 +41,7 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 # Maximum size of a file that is read
 LIMIT = 512 * MEBIBYTE
-# Maximum size of the JSON part in bytes. Parsed, it takes several times as much memory.
+# Maximum size of the JSON part in bytes. Once parsed, it takes several times as much memory.
 DOCUMENT_LIMIT = 16 * MEBIBYTE
 # Maximum number of nodes, and of items in any other list
 MAX_NODES, MAX_ITEMS = 4096, 65_536
@@ -188,7 +188,7 @@ class Glb:
     nodes: tuple[int, ...]
     # Name of each node
     names: tuple[str, ...]
-    # Index of each node's parent, -1 for a root
+    # Index of each node's parent, or -1 for a root
     parents: tuple[int, ...]
     # (N, 4, 4), from each node's coordinates to its parent's coordinates
     locals: np.ndarray

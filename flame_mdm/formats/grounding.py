@@ -137,7 +137,7 @@ def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
 def anchored(
     motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool
 ) -> GroundedMotion:
-    """Replaces the first or last pose of a motion. The change fades out over some seconds.
+    """Replaces the first or last pose of a motion. The change fades out over `seconds`.
 
     `pose` (22, 3) is relative to the root. Bones keep their lengths.
     """

@@ -156,7 +156,7 @@ class Layout(BaseModel):
         return self.turn(weights @ positions).astype(np.float32)
 
     def turn(self, positions: np.ndarray) -> np.ndarray:
-        """Returns positions (F, J, 3) of the same joints in meters, y up."""
+        """Converts positions (F, J, 3) to meters, y up."""
         return (
             self.unit
             * positions

@@ -71,7 +71,7 @@ class Motion(PosedFigure):
         joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`. Joints
             are float32.
         poses: rotations of SMPL's joints, if known.
-        features: (F, D) float32 features in the units of the data; empty if unknown.
+        features: (F, D) float32 features in the units of the data, or empty if unknown.
         representation: name of the representation of the features.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
         degenerate: number of frames in which the features determine no rotation for at least one

@@ -135,8 +135,8 @@ def read(
         up: the up axis of the file: y, z or -y.
         resample_to: target frame rate; None = the frame rate of the file. Rotations are
             interpolated on the sphere, joints and translations with cubic splines.
-        animation: name or number, counted from 1, of an animation in an FBX or GLB file; None = the
-            first animation.
+        animation: name or 1-based number of an animation in an FBX or GLB file; None = the first
+            animation.
 
     Returns:
         The motion. Its `notes` state what was left out or looks wrong.

@@ -28,7 +28,7 @@ MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
-    """Returns a frame rate as a float; `name` is its name in the file.
+    """Returns a frame rate as a float. `name` is its name in error messages.
 
     Raises:
         UserError: If the value is not a number in the range `RATES`.

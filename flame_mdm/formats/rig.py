@@ -42,7 +42,7 @@ class Rig:
 
     # Names; parents precede their children
     joints: tuple[str, ...]
-    # Index of each joint's parent, -1 for a root
+    # Index of each joint's parent, or -1 for a root
     parents: tuple[int, ...]
     # (J, 3), positions of the joints
     positions: np.ndarray

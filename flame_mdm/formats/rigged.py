@@ -28,7 +28,7 @@ class Material:
     Attributes:
         name: its name.
         color: red, green and blue from 0 to 1, as on screens.
-        image: content of a PNG or JPEG file that is multiplied with the color; empty = no image.
+        image: content of a PNG or JPEG file that is multiplied by the color; empty = no image.
     """
 
     name: str
@@ -87,8 +87,8 @@ class RiggedClip:
         name: the name of the animation.
         fps: frames per second.
         joints: names of the J joints.
-        parents: index of the parent of each joint, smaller than the index of the joint; -1 for
-            the root.
+        parents: index of each joint's parent, smaller than the joint's own index, or -1 for the
+            root.
         offsets: (J, 3), position of each joint relative to its parent in the rest pose.
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to the parents.
@@ -229,7 +229,7 @@ def rigged(
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
-        fitted: the body of the person. Its toes bend as in pictures. None = no skin.
+        fitted: the body of the person, whose toes bend as in pictures. None = no skin.
         root_motion: whether the root on the floor follows the hips and their direction. Otherwise,
             it stays in place.
 

@@ -11,7 +11,7 @@ TIP = re.compile(r"[_. ]?(end|nub|tip)(site)?$", re.IGNORECASE)
 
 
 def read(path: Path, animation: str | None = None) -> AnimatedNodes:
-    """Reads an animation by its name or number, counted from 1; None = the first animation.
+    """Reads an animation, given by its name or 1-based number; None = the first animation.
 
     Raises:
         UserError: As in the readers for both formats.

@@ -41,7 +41,7 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
 
 @dataclass(eq=False, repr=False)
 class Figure:
-    """Moving joints that players and pictures draw, such as a `flame_mdm.formats.motion.Motion`.
+    """Moving joints to draw in players and pictures, such as a `flame_mdm.formats.motion.Motion`.
 
     Attributes:
         joints: (F, J, 3) joint positions in meters, y up, floor at y = 0.

@@ -1,4 +1,4 @@
-"""HTML player for motions, a single file that needs no network and opens from disk."""
+"""HTML player for motions: a single file that opens from disk and needs no network."""
 
 import base64
 import html

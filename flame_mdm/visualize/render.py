@@ -46,7 +46,7 @@ def write_gif(
     Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second. Therefore,
     the frame rate is the highest frame rate of the motions, divided by the smallest integer that
     results in 50 or less. For example, 60 fps becomes 30, and 120 fps becomes 40. A motion that
-    ends earlier stays at its last frame. `body` is the body to draw; None = the mannequin.
+    ends earlier holds its last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -180,7 +180,7 @@ def _video(
 
     with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
         for tick in range(count):
-            # After its end, a motion stays at its last frame
+            # After its end, a motion holds its last frame
             now = [
                 min(int(tick / fps * motion.fps + 1e-6), len(motion.joints) - 1)
                 for motion in motions

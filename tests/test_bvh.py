@@ -178,7 +178,7 @@ def test_damaged_files_are_named_with_the_line(parse, subtests):
         (ARM.replace("  JOINT Arm\n  {", "  JOINT Arm\n"), 8, "expected {"),
         (ARM.replace("ROOT", "LIMB"), 2, "unexpected LIMB"),
         (ARM.replace("9.5\n", "9.5\n1 2\n"), 20, r"expected 10 finite number\(s\), found 1 2"),
-        (ARM.replace("\n}\nMOTION", "\nMOTION"), 13, "after the end of the hierarchy"),
+        (ARM.replace("\n}\nMOTION", "\nMOTION"), 13, "after the hierarchy"),
         (ARM.replace("MOTION", "MOTION 3"), 14, "as the last word on its line"),
         (ARM.replace("Frames:\t3", "Frames: many"), 15, "expected Frames:"),
         (ARM.replace("0.0333333", "0"), 16, "frame time"),

@@ -259,7 +259,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that reads every requested attribute exactly; None if there is no such value."""
+        """Name of the value that reads every requested attribute exactly, or None if there is no such value."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -278,7 +278,7 @@ class _Measure:
     def _rows(
         self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]
     ) -> dict[str, Any] | None:
-        """Returns the inputs and readings of a metric in float64; None if an input is missing."""
+        """Returns the inputs and readings of a metric in float64, or None if an input is missing."""
         required = set(required_inputs(metric)) | (
             {"generated"} if "generated" in metric.states else set()
         )
@@ -326,7 +326,7 @@ def _is_audited(metric: SampleMetric, part: str) -> bool:
 
 
 def _interval(values: np.ndarray) -> list[float | None]:
-    """Returns a value and the half width of its 95 % interval; None if it cannot be computed."""
+    """Returns a value and the half width of its 95 % interval. Both are None if they cannot be computed."""
     pair = [float(values[0]), float(1.96 * values[1:].std())]
     return [float(f"{x:.6g}") for x in pair] if np.isfinite(pair).all() else [None, None]
 

@@ -20,7 +20,7 @@ Item = TypeVar("Item")
 
 
 def world_size() -> int:
-    """Returns the number of ranks; 1 without a process group."""
+    """Returns the number of ranks, or 1 if there is no process group."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 

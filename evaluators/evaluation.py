@@ -161,7 +161,7 @@ class Evaluation:
 
     @cached_property
     def several(self) -> Evaluator | None:
-        """The evaluator for several motions per prompt; None if the protocol has no multimodality."""
+        """The evaluator for several motions per prompt, or None if the protocol has no multimodality."""
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
@@ -254,10 +254,7 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns notes that limit how the values can be interpreted.
-
-        The notes are about repeated clips and unchecked values of real motions.
-        """
+        """Returns notes on the limitations of the values: repeated clips, and unchecked values of real motions."""
         lines = []
         clips = len(self.protocol.selected(self.clips))
         drawn = {
@@ -363,7 +360,7 @@ class Evaluation:
                 if count != others:
                     numbers = f"{count} generated and {others} real motions"
                     lines.append(
-                        f"{name}: {numbers}. Compare it only with values for the same two numbers"
+                        f"{name}: {numbers}. Compare it only with values for the same numbers of motions"
                     )
         return lines
 

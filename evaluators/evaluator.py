@@ -99,7 +99,7 @@ class Evaluator:
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Rows:
-        """Computes the metric inputs for motions. All processes pass the same motions.
+        """Computes the metric inputs for motions. All processes must pass the same motions.
 
         Raises `UserError` if a motion is not finite.
         """
@@ -248,7 +248,7 @@ class Evaluator:
     def _updated(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
-        """Returns all metrics after their update with the motions, and the names of computable metrics."""
+        """Updates all metrics with the motions. Returns all of them, and those that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
             # Returns False: metrics are not synchronized, because this process has all motions
@@ -270,7 +270,7 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name; their declared properties can be read."""
+        """The metrics by name, from which declared properties can be read."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:
@@ -283,7 +283,7 @@ class Evaluator:
         return isinstance(self.declared[name.partition("/")[0]], TwoSets)
 
     def reads(self, name: str) -> bool:
-        """Returns whether a metric requires an input."""
+        """Returns whether any metric requires an input."""
         return any(name in required_inputs(metric) for metric in self.declared.values())
 
     def check(

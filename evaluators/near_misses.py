@@ -32,7 +32,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip, with slots in the action: "wave-left-hand" is "wave-{side}-hand"."""
+    """Returns the attributes of a clip, with slots in the action: "wave-left-hand" becomes "wave-{side}-hand"."""
     stated = {
         name: value
         for name, value in clip.attributes.items()

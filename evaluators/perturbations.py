@@ -94,7 +94,7 @@ def draw_in(joints: Joints, centimeters: float) -> Joints:
 
 
 def freeze(joints: Joints, percent: float) -> Joints:
-    """Holds one frame until the end of the motion, for a given share of the duration."""
+    """Holds one frame over a given share of the duration, until the end of the motion."""
     moving = max(1, round(len(joints) * (1 - percent / 100)))
     return joints[np.minimum(np.arange(len(joints)), moving - 1)]
 
@@ -176,11 +176,11 @@ class Perturbation:
     grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation with the grades that the motions allow, or one per kind; [] if none is possible."""
+        """Returns the perturbation (or one per kind) with the grades that the motions allow, or [] if there are none."""
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns by name the sets of motions from which `apply` selects."""
+        """Returns, by name, the sets of motions from which `apply` selects."""
         return {}
 
     def apply(
@@ -308,7 +308,7 @@ class ReplacedCaptions(Perturbation):
 class DroppedActions(Perturbation):
     """Drops a share of the actions, in percent.
 
-    The remaining motions are repeated in their place, with their texts.
+    The remaining motions are repeated, with their texts, to replace them.
     """
 
     unit: str = "% of actions"
@@ -368,7 +368,7 @@ def _reversed(scene: Scene) -> list[np.ndarray]:
 
 
 def repetitions(row: DrawnClip) -> int:
-    """Returns the number of repetitions that the data set states for a clip; 1 if it states none."""
+    """Returns the number of repetitions that the data set states for a clip, or 1 if it states none."""
     count = row.clip.attributes.get("count", 1)
     return count if isinstance(count, int) else 1
 
@@ -391,7 +391,7 @@ def _other_half(scene: Scene) -> list[np.ndarray]:
 
 
 def _memorized(scene: Scene) -> list[np.ndarray]:
-    """Returns for each motion a training motion with the same captions or action; otherwise the motion itself."""
+    """Returns, for each motion, a training motion with the same captions or action, or the motion itself."""
     training, copies = scene.data.clips("train"), []
     for row in scene.rows:
         same = [clip for clip in training.clips if clip.captions == row.clip.captions]

@@ -36,9 +36,9 @@ class Plan:
             model, they are None, None and {}.
         clips, representation: the evaluated split of `data`, and the representation on its
             device.
-        skeleton: the source of bone lengths for joints that are computed from SMPL's rotations;
+        skeleton: the source of bone lengths for joints that are computed from SMPL's rotations, or
             None if the data has joint positions.
-        protocol, changed: the protocol in the requested size, and the options that differ.
+        protocol, changed: the protocol in the requested size, and the options that changed.
         path: path of the result file.
     """
 
@@ -151,7 +151,7 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
 def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton | None:
     """Sets the bones of a representation of SMPL's rotations from SMPL's model file.
 
-    Without this file, the stand-in bones remain.
+    Without this file, the stand-in bones are kept.
     """
     if not isinstance(representation, SMPL | Rot6D):
         return None
@@ -167,7 +167,7 @@ def sampling_options(
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:
-    """Returns the options of the sampler and of `Edit`: the requested values, by default the recipe's values."""
+    """Returns the options of the sampler and of `Edit`: the requested values or, by default, the recipe's values."""
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
     if protocol.edit is not None:

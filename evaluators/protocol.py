@@ -29,7 +29,7 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
-CONTEXT_STARTS = 5  # In DiP's code, the context begins at one of this many first frames of a clip
+CONTEXT_STARTS = 5  # In DiP's code, the context begins at one of the first five frames of a clip
 Count = Annotated[Int, Field(ge=1)]
 
 
@@ -43,11 +43,11 @@ class DrawnClip:
     clip: Entry
     #: Indices of the frames drawn from the clip.
     frames: np.ndarray
-    #: Index of the caption drawn from the clip; None = the clip has no captions.
+    #: Index of the caption drawn from the clip, or None if the clip has no captions.
     caption: int | None
     #: Name shared by all motions with the same caption and length.
     prompt: str
-    #: Indices of the frames that the model receives as context and continues; not measured.
+    #: Indices of the frames that the model receives as context and continues. They are not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
@@ -58,7 +58,7 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """The attributes of the clip that rules can read; {} for clips with an attribute of `UNREAD`."""
+        """The attributes of the clip that rules can read, or {} for clips with an attribute of `UNREAD`."""
         return {
             name: value
             for name, value in self.clip.attributes.items()
@@ -100,7 +100,7 @@ class Protocol(ClosedSchema):
 
     #: Name of the file and, for variants, the name of the variant.
     name: str
-    #: Number that increases with each change of the protocol. Values of different versions are
+    #: Number that increases with each change to the protocol. Values of different versions are
     #: not comparable.
     version: Int
     #: Condition of the generated motions.
@@ -126,11 +126,11 @@ class Protocol(ClosedSchema):
     smoothing: Number | None = None
     #: Motions per batch, if the protocol measures time. The first batch is not timed.
     batch_size: Count | None = None
-    #: Frames that a model that continues frames receives as context. "drawn": the first of the
-    #: drawn frames, which are not measured. "start": as in DiP's code, frames of the clip that
-    #: begin at one of its first five frames; the motion that follows is as long as the drawn frames.
+    #: Context frames for models that continue motions. "drawn": the first drawn frames, which are
+    #: then not measured. "start", as in DiP's code: frames that begin at one of the first five
+    #: frames of the clip. The motion that follows the context is as long as the drawn frames.
     context: Literal["drawn", "start"] = "drawn"
-    #: Number of context frames that the model receives; `open_protocol` sets it.
+    #: Number of context frames that the model receives. Set by `open_protocol`.
     context_frames: Int = 0
     #: Attributes that evaluated clips must have. {} = all clips of the split.
     only: dict[str, Any] = Field({})
@@ -140,11 +140,11 @@ class Protocol(ClosedSchema):
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = (
         Field({})
     )
-    #: Whether this is a quick evaluation; `resized` sets it.
+    #: Whether this is a quick evaluation. Set by `resized`.
     quick: bool = False
-    #: Whether the number of motions differs from the number in the file; `resized` sets it.
+    #: Whether the number of motions differs from the number in the file. Set by `resized`.
     resized_samples: bool = False
-    #: Hash of the content of the file; `load_protocol` sets it.
+    #: Hash of the content of the file. Set by `load_protocol`.
     sha256: str = ""
 
     def resized(
@@ -160,7 +160,7 @@ class Protocol(ClosedSchema):
         """Returns the protocol in a different size, and the options that changed.
 
         `clips` is the number of clips in the split. A quick evaluation has few motions and
-        replications. `batch_size` only changes protocols that measure time.
+        replications. `batch_size` only affects protocols that measure time.
         """
         defaults = (
             {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)}
@@ -319,7 +319,7 @@ class Protocol(ClosedSchema):
 
 
 def protocol_names(folder: Path = FOLDER) -> list[str]:
-    """Returns the names of the protocols in a folder, with their variants, sorted."""
+    """Returns the sorted names of the protocols in a folder, including variants."""
     return sorted(name for path in folder.glob("*.yaml") for name in _protocols(path))
 
 

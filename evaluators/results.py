@@ -45,7 +45,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Scores of one part of an evaluation: real motions, generated motions, or several per prompt."""
+    """Scores of one part of an evaluation: real motions, generated motions, or several motions per prompt."""
 
     # Scores by replication
     scores: Sequence[Scores] = ()
@@ -57,7 +57,7 @@ class Outcome:
 
     @property
     def values(self) -> dict[str, Value | None]:
-        """Means over replications; None if a replication has no value."""
+        """Means over replications. A value that is missing in a replication is None."""
         table: dict[str, Value | None] = {}
         counts = [scores.count for scores in self.scores]
         for name in self.scores[0].values if self.scores else ():
@@ -98,7 +98,7 @@ def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
 
 
 def mean_cost(costs: Sequence[Cost]) -> Cost:
-    """Returns the mean cost over replications; None if a replication used no model."""
+    """Returns the mean cost over replications. Numbers are None if a replication used no model."""
     values = {name: [getattr(cost, name) for cost in costs] for name in Cost.model_fields}
     return Cost(
         **{
@@ -187,7 +187,8 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
     """Returns the reasons why values are not valid.
 
-    Evaluated clips may be in the training data of the model or the extractor.
+    Values are not valid if evaluated clips may be in the training data of the model or the
+    extractor.
     """
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
     trained = {"training data": plan.model.facts.get("fingerprint") if plan.model else None}
@@ -248,7 +249,7 @@ def show(result: Result, path: Path) -> None:
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns the explanation of the intervals at the end of a line; "" without intervals."""
+    """Returns the explanation of the intervals at the end of a line, or "" if there are no intervals."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""

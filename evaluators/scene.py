@@ -59,7 +59,7 @@ class Scene:
 
     @property
     def actions(self) -> list[int]:
-        """Action label of each motion; 0 if the data has none."""
+        """Action label of each motion, or 0 if the data has no labels."""
         return [row.clip.action or 0 for row in self.rows]
 
     def draws(self, *parts: str | int) -> np.random.Generator:
@@ -68,7 +68,7 @@ class Scene:
 
     @cached_property
     def wrong(self) -> dict[str, list[Text | None]]:
-        """A wrong text for each motion, by the kind of error; None for motions without such a text.
+        """A wrong text for each motion, or None for motions without such a text, by kind of error.
 
         The kinds are `RANDOM` and `NEAR`. If near misses differ in several attributes, there is
         also a kind "near misses: ATTRIBUTE" for each attribute.

@@ -297,7 +297,7 @@ class Baseline:
         return Samples(rows, self.make(rows, replication))
 
     def _real(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
-        """Returns random windows of the rows' clips, with the rows' lengths."""
+        """Returns random windows of the rows' clips. The windows are as long as the rows' motions."""
         moved = []
         for row in rows:
             generator = np.random.default_rng(key("baseline", self.seed, replication, row.id))

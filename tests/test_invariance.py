@@ -192,38 +192,42 @@ def test_too_few_samples_and_wrong_inputs_are_errors(subtests):
     kept = values | {"kept": values["kept"] | True}
     short = values | {"mask": values["mask"] & (torch.arange(34) < 1)}
     for metric, inputs, message in (
-        (distribution.FrechetMotionDistance(), 1, "got 1 generated motions, needs at least 2"),
+        (distribution.FrechetMotionDistance(), 1, "got 1 generated motions, but needs at least 2"),
         (
             distribution.KernelMotionDistance(),
             45,
-            "got 45 generated motions for subsets of 1000, needs at least 1000",
+            "got 45 generated motions for subsets of 1000, but needs at least 1000",
         ),
-        (distribution.PrecisionRecall(), 3, "got 3 motions in the smaller set, needs at least 4"),
-        (alignment.TextsForMotion(), 31, "got 31 different captions, needs at least 32"),
-        (alignment.MotionsForText(), 31, "got 31 motions, needs at least 32"),
-        (retrieval.MultiPositiveRPrecision(), 31, "got 31 motions, needs at least 32"),
+        (
+            distribution.PrecisionRecall(),
+            3,
+            "got 3 motions in the smaller set, but needs at least 4",
+        ),
+        (alignment.TextsForMotion(), 31, "got 31 different captions, but needs at least 32"),
+        (alignment.MotionsForText(), 31, "got 31 motions, but needs at least 32"),
+        (retrieval.MultiPositiveRPrecision(), 31, "got 31 motions, but needs at least 32"),
         (
             published_physics.MBenchQuality(30.0),
             45,
-            "defined at 20 frames per second, but the motions have 30",
+            "only defined at 20 frames per second, but the motions have 30",
         ),
         (
             published_physics.PhysicalFootContact(20.0),
             45,
-            "defined at 30 frames per second, but the motions have 20",
+            "only defined at 30 frames per second, but the motions have 20",
         ),
-        (alignment.MutualInformationDivergence(), 12, "got 12 samples, one more than features"),
+        (alignment.MutualInformationDivergence(), 12, "got 12 samples for the features of motion"),
         (
             diversity.Diversity(pairs=300, replace=False),
             45,
-            "got 45 motions for 300 pairs, needs at least 300",
+            "got 45 motions for 300 pairs, but needs at least 300",
         ),
         (
             diversity.TextMultimodality(),
             45,
-            "9 of 9 prompts do not have 30 motions, but 5 to 5. Generate 30 motions per prompt",
+            "9 of 9 prompts do not have 30 motions: found 5 to 5. Generate 30 motions per prompt",
         ),
-        (diversity.ActionMultimodality(), 5, "got 1 motions of class 1, needs at least 2"),
+        (diversity.ActionMultimodality(), 5, "got 1 motions of class 1, but needs at least 2"),
         (reconstruction.DisplacementErrors(), kept, "a motion has no generated frame"),
         (
             reconstruction.TemosPositionErrors(),

@@ -47,8 +47,8 @@ class MotionCLIP(nn.Module):
         blind_features: number of features at the beginning of each frame that are set to 0.
             FLAME's code sets 3: each frame begins with the root's translation, so scores do not
             depend on position and height.
-        roughness: whether absolute second differences over time, which show noise, are additional
-            inputs.
+        roughness: whether absolute second differences over time, which show noise, are used as
+            additional inputs.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class MotionCLIP(nn.Module):
         self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F), of at most `max_frames`."""
+        """Returns features (B, E) of normalized motions (B, F, D), F <= `max_frames`, with mask (B, F)."""
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
             longest = int(lengths.max())

@@ -21,7 +21,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-# Near-miss captions per motion and step. Each differs in another attribute if possible.
+# Near-miss captions per motion and step. If possible, each differs in a different attribute.
 NEAR_MISSES = 2
 # Standard deviation, in meters, of noise on the joints at strength 1
 JITTER = 0.02
@@ -128,7 +128,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:
-        """Returns a near miss for a clip, as a function of (seed, step, clip, number); "" if the clip has none."""
+        """Returns a near miss for a clip, or "" if it has none, as a function of (seed, step, clip, number)."""
         attributes = self.near_misses[name] or [[""]]
         draw = key("near miss", self.seed, step, name)
         texts = attributes[(draw + number) % len(attributes)]
@@ -149,8 +149,8 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
     """Returns noisy copies (B, F, D) of normalized motions.
 
-    In the first half of the motions, noise is added to the joints; in the second half, to the
-    features. Its strength is `strength` (B,). The noise is drawn from torch's CPU generator.
+    Noise is added to the joints in the first half of the motions, and to the features in the second
+    half. `strength` (B,) is the strength of the noise. The noise is drawn from torch's CPU generator.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

@@ -137,7 +137,7 @@ class T2MEvaluator(nn.Module):
     are normalized with the `mean` and `std` (D,) of the released weights. After normalization,
     motions are padded with zeros to `max_frames`, as in the authors' code for real motions. The
     convolutions therefore read 3 frames past the end. The network reads the first `used_features`
-    features (MARDM: 67; KIT: 64); None = all features except the contacts.
+    features (67 for MARDM, 64 for KIT); None = all features except the contacts.
     """
 
     mean: Tensor
@@ -259,7 +259,7 @@ def read_statistics(folder: Path) -> list[Tensor]:
 
 
 def load_t2m(folder: Path) -> T2MEvaluator:
-    """Loads the evaluator, or MARDM's evaluator of 67 or 64 features, from the folder of a `T2MExtractor`."""
+    """Loads the evaluator, or MARDM's evaluator for 67 or 64 features, from the folder of a `T2MExtractor`."""
     mean, std = read_statistics(folder)
     network = T2MEvaluator(mean, std, used_features=len(mean) if len(mean) in (67, 64) else None)
     path = folder / "finest.tar"

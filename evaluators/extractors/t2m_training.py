@@ -23,7 +23,7 @@ from flame_mdm.representations import Representation
 
 
 class _MovementDecoder(nn.Module):
-    """The decoder for the movement encoder: two transposed convolutions decode one vector to 4 frames."""
+    """The decoder for the movement encoder: two transposed convolutions decode one vector into 4 frames."""
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -97,7 +97,7 @@ class MatchingLoss(SampleMetric):
         self.margin = margin
 
     def value(self, motion: Tensor, text: Tensor) -> float | None:
-        """Returns the loss of features (N, E) of motions and texts; None for a single pair."""
+        """Returns the loss of features (N, E) of motions and texts, or None for a single pair."""
         return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 

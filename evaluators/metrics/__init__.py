@@ -13,17 +13,17 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | labels | (B,) int64 | requested classes |
 | groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
 | requested | B mappings | requested attributes, see `attributes` |
-| sides | B pairs of strings | requested content and side, in the Bandai set, see `attributes` |
-| joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
+| sides | B pairs of strings | requested content and side (Bandai set only), see `attributes` |
+| joints | (B, F, J, 3) | joint positions of generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
-| contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
-| kept | (B, F, J) bool | True = the edit must keep this joint in this frame, if motions are edits |
+| contacts | (B, F, 4) bool | generated contacts of `skeleton.feet`, if the features contain them |
+| kept | (B, F, J) bool | for edits: True = the edit must keep this joint in this frame |
 | keys | (B,) int64 | unique keys of generated motions |
 | real | (R, E) | features of real motions |
-| real_joints | (B, F, J, 3) | real motions in meters, y up, floor at y = 0 |
+| real_joints | (B, F, J, 3) | joint positions of real motions in meters, y up, floor at y = 0 |
 | real_mask | (B, F) bool | True = real frame of a real motion |
 | real_keys | (R,) int64 | unique keys of real motions |
-| nearest, real_nearest | (B, 1 or 2) | distances from the nearest training motion, see `memorization` |
+| nearest, real_nearest | (B, 1 or 2) | distances to the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
 A key is the `flame_mdm.seeds.key` of an id. With several samples per id, the sample index is

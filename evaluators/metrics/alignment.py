@@ -11,12 +11,12 @@ from evaluators.metrics.diversity import distances
 from evaluators.metrics.samples import Rows, SampleMetric
 from flame_mdm.errors import UserError
 
-# The k of R-precision
+# Values of k for R-precision
 TOP = (1, 2, 3)
 
 
 def equally_weighted(values: Tensor) -> Tensor:
-    """Returns values (N,) with a column of weights of 1, (N, 2)."""
+    """Returns (N, 2): the values (N,) in one column, and weights of 1 in the other."""
     return torch.stack([values, torch.ones(len(values), dtype=values.dtype)], 1)
 
 
@@ -62,7 +62,7 @@ class RPrecision(SampleMetric):
         self.pool, self.seed = pool, seed
 
     def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
-        """Returns `top1`, `top2` and `top3` of features (N, E) and the keys (N,) of the captions."""
+        """Returns `top1`, `top2` and `top3` for features (N, E) and caption keys (N,)."""
         ranks = self.ranks(generated, text, text_keys)
         return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in TOP}
 
@@ -71,9 +71,7 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns the probability, for each query, that its correct candidate is among the k nearest.
-
-        The probability is over random pools.
+        """Returns, for each query, the probability that its correct candidate is among the k nearest in a random pool.
 
         Args:
             distance: (N, M) distances from queries to candidates.
@@ -98,7 +96,7 @@ class RPrecision(SampleMetric):
 class TextsForMotion(RPrecision):
     """R-precision, texts for a motion: is the motion's text among the k nearest of 32 texts?
 
-    This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of
+    This is the definition in the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and in
     FLAME's code. A motion ranks 32 texts by Euclidean distance: its own text, and 31 texts drawn
     without replacement from other captions. In FLAME's code, a pool is a batch, so the last pool
     may be smaller. The motion's own text is at a random position, so that an extractor that cannot
@@ -136,7 +134,7 @@ class TextsForMotion(RPrecision):
         )
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the probability that each motion's text is among the k nearest of a random pool, by k."""
+        """Returns, by k, the probability that each motion's text is among the k nearest in a random pool."""
         keys = rows["text_keys"].numpy()
         _, first, correct = np.unique(keys, return_index=True, return_inverse=True)
         return self.in_random_pools(
@@ -151,17 +149,18 @@ class MotionsForText(RPrecision):
     Test pairs in random order are split into pools of 32. In a pool, each text ranks the motions
     by Euclidean distance; equal captions may be in the same pool.
 
-    The authors' code differs in two ways. It drops an incomplete last pool. In this implementation,
-    the texts of an incomplete last pool rank the last 32 motions, so that every text counts once.
-    Its distances are float32: if a motion and its text have the same features, the motion may rank
-    last (square root of a negative number).
+    The authors' code drops an incomplete last pool. In this implementation, the texts of an
+    incomplete last pool rank the last 32 motions, so that every text counts once. The authors' code
+    also computes distances in float32. If a motion and its text have the same features, this motion
+    may therefore rank last (square root of a negative number).
 
     Args:
         pool: number of motions in a pool, including the text's own motion.
         seed: seed of the pools.
-        normalize: whether to scale features to norm 1 first, which ranks by cosine. An extractor
-            trained with cosines, such as motion-CLIP, does not constrain lengths. Without
-            normalization, the motions with the shortest features would be nearest to every text.
+        normalize: whether to first scale features to norm 1, so that motions are ranked by cosine.
+            An extractor trained with cosines, such as motion-CLIP, does not constrain the lengths
+            of features. Without normalization, the motions with the shortest features would be
+            nearest to every text.
 
     Example:
         >>> metric, features, keys = MotionsForText(pool=3), torch.eye(3), torch.arange(3)
@@ -186,7 +185,7 @@ class MotionsForText(RPrecision):
         return retrieval_ranks(text[order], generated, pools, position)
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the probability that each text's motion is among the k nearest of a random pool, by k."""
+        """Returns, by k, the probability that each text's motion is among the k nearest in a random pool."""
         generated, text = rows["generated"], rows["text"]
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -212,7 +211,7 @@ class MultimodalDistance(SampleMetric):
     `generated` (B, E), `text` (B, E) and `keys` (B,).
 
     Args:
-        normalize: whether to scale features to norm 1 first, for extractors trained with
+        normalize: whether to first scale features to norm 1, for extractors trained with
             cosines. The value is then in [0, 2].
 
     Example:
@@ -244,7 +243,7 @@ class MultimodalDistance(SampleMetric):
 
 
 class MotionCLIPScore(SampleMetric):
-    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine between features of motions and texts.
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine between motion features and text features.
 
     The value is in [-1, 1]; higher is better. `update` takes `generated` (B, E), `text` (B, E)
     and `keys` (B,).
@@ -300,20 +299,20 @@ def pointwise_mutual_information(
 class MutualInformationDivergence(SampleMetric):
     """MID in nats: the mean of `pointwise_mutual_information` over generated motions.
 
-    Kim et al. 2022. Higher is better. MID needs more samples than motion and text have features
-    together, because otherwise the joint covariance is singular. The authors' code requires only
-    half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and `keys`
+    Kim et al. 2022. Higher is better. The number of samples must exceed the total number of motion
+    and text features, because otherwise the joint covariance is singular. The authors' code
+    requires only half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and `keys`
     (B,); row i of `real` is the real motion of text i.
 
     Args:
-        eps: added to the diagonals of covariances before they are inverted; 5e-4 in FLAME, 0 in
-            the authors' release.
+        eps: value added to the diagonals of covariances before they are inverted: 5e-4 in FLAME,
+            0 in the authors' release.
 
     Example:
         >>> metric, text = MutualInformationDivergence(), torch.randn(64, 2)
         >>> generated, real = text + 0.1 * torch.randn(64, 2), text + 0.1 * torch.randn(64, 2)
         >>> metric.update(generated=generated, text=text, real=real, keys=torch.arange(64))
-        >>> metric.compute() > 2  # a motion says much about its text
+        >>> metric.compute() > 2  # a motion says a lot about its text
         True
     """
 
@@ -330,7 +329,7 @@ class MutualInformationDivergence(SampleMetric):
         self.need(
             len(text),
             real.shape[1] + text.shape[1] + 1,
-            "samples, one more than features of motion and text",
+            "samples for the features of motion and text",
         )
         return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()
 

@@ -64,13 +64,13 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     actions, then gestures of the arms and the head.
 
     Args:
-        joints: (F, 22, 3) positions of SMPL's joints in meters, y up, with any position and
-            heading.
+        joints: (F, 22, 3) positions of SMPL's joints in meters, y up. The body may have any
+            position and heading.
         fps: frames per second.
 
     Returns:
-        "action", and the other `ATTRIBUTES` of the motion. {} if no action of the set is
-        recognized, for example in noise, or if the joints do not form a body.
+        "action" and the other `ATTRIBUTES` of the motion, or {} if no action of the set is
+        recognized (for example, in noise) or the joints do not form a body.
 
     Example:
         >>> read_attributes(np.random.default_rng(0).normal(size=(40, 22, 3)), fps=20)  # noise
@@ -146,9 +146,9 @@ def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Whether the joints form a body: limbs of 15 to 60 cm that vary by less than 25 %, and smooth joints.
+    """Whether the joints form a body: limbs are 15 to 60 cm long and vary by less than 25 %, and joints move smoothly.
 
-    A joint is smooth if it stays within 2 cm of a curve.
+    A joint moves smoothly if it stays within 2 cm of a curve.
     """
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
@@ -224,7 +224,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads throws, salutes, raised arms, waves, claps and punches; if none is found, standing."""
+    """Reads throws, salutes, raised arms, waves, claps and punches, or standing if none of them is found."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -272,7 +272,7 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
 
 def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
-    """Counts how often the head pitches forward by more than 32 degrees and back, relative to the shoulders."""
+    """Counts how often the head pitches forward by more than 32 degrees relative to the shoulders, and back."""
     base = smooth[:, [NECK, *COLLARS, *SHOULDERS]].mean(1)
     head = smooth[:, HEAD] - base - (smooth[:, NECK] - base).mean(0)
     nod = np.degrees(np.arctan2((head[:, [0, 2]] * forward).sum(-1), head[:, 1]))
@@ -280,7 +280,7 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns whether each requested attribute, and combinations of attributes, were read from a motion.
+    """Returns whether each requested attribute, and each combination of attributes, was read from a motion.
 
     Each action in `CHECKED` is read by its own check. Returns {} for actions without a rule.
 
@@ -289,8 +289,9 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
         requested: the attributes of the request.
 
     Returns:
-        Whether each attribute is right, by name. `action_and_side`: whether both are right, or
-        the action if no side was requested. `all`: whether every requested attribute is right.
+        Whether each attribute is right, by name. `action_and_side`: whether both are right or, if
+        no side was requested, whether the action is right. `all`: whether every requested
+        attribute is right.
     """
     if requested["action"] in UNDECIDED or requested.keys() & set(UNREAD):
         return {}
@@ -304,11 +305,11 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 
 
 class AttributeAccuracy(Timed, MotionMean):
-    """Fraction of motions that show the requested value, by attribute. A metric of this project.
+    """Fraction of motions that show the requested value, by attribute.
 
-    There is one value in [0, 1] for each of `ATTRIBUTES`, for `action_and_side` and for `all`.
-    Higher is better. Rules read the attributes from the joints, without a network; see
-    `right_attributes`.
+    This metric was introduced in this project. There is one value in [0, 1] for each of
+    `ATTRIBUTES`, for `action_and_side` and for `all`. Higher is better. Rules read the attributes
+    from the joints, without a network; see `right_attributes`.
 
     Args:
         fps: frames per second of the motions.
@@ -317,7 +318,7 @@ class AttributeAccuracy(Timed, MotionMean):
         >>> metric, joints = AttributeAccuracy(fps=20), torch.zeros(1, 40, 22, 3)
         >>> mask, requested = torch.ones(1, 40, dtype=torch.bool), [{"action": "walk"}]
         >>> metric.update(joints, mask, requested, keys=torch.tensor([0]))
-        >>> metric.compute()["action"]  # 22 joints in one point are not a walk
+        >>> metric.compute()["action"]  # 22 joints at one point are not a walk
         0.0
     """
 
@@ -326,12 +327,12 @@ class AttributeAccuracy(Timed, MotionMean):
     names = (*ATTRIBUTES, "action_and_side", "all")
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the attributes that `read_all` finds in each motion as JSON: `seen` (N,)."""
+        """Returns, as JSON in `seen` (N,), the attributes that `read_all` finds in each motion."""
         seen = [json.dumps(read_all(joints.numpy(), self.fps)) for joints in motions["joints"]]
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns by attribute whether each motion shows the requested value, and whether one was requested."""
+        """Returns, by attribute, whether each motion shows the requested value, and whether one was requested."""
         pairs = zip(rows["seen"], rows["requested"], strict=True)
         shown = [right_attributes(json.loads(str(seen)), requested) for seen, requested in pairs]
         weighted: dict[str, Tensor] = {}
@@ -350,7 +351,7 @@ class AttributeAccuracy(Timed, MotionMean):
             joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
             mask: (B, F) bool, True = real frame.
             requested: B mappings from names of `ATTRIBUTES` to values, such as {"action": "walk",
-                "speed": "slow"}. Requests that no rule reads do not count.
+                "speed": "slow"}. Requests that no rule can read are not counted.
             keys: (B,) int64, unique keys of the motions.
         """
         rows = []
@@ -388,9 +389,9 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
 class SideAccuracy(Timed, MotionMean):
     """Fraction of motions from the Bandai set that show the requested side, left or right.
 
-    A metric of this project. `hand` covers gestures, `path` covers turns and sideways walks, and
-    `hand_or_path` covers both. Chance level is 0.5; higher is better. Rules read the sides
-    from the joints, without a network; see `read_side`.
+    This metric was introduced in this project. `hand` covers gestures, `path` covers turns and
+    sideways walks, and `hand_or_path` covers both. Chance level is 0.5; higher is better. Rules
+    read the sides from the joints, without a network; see `read_side`.
 
     Args:
         fps: frames per second of the motions.
@@ -417,7 +418,7 @@ class SideAccuracy(Timed, MotionMean):
             joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
             mask: (B, F) bool, True = real frame.
             sides: B pairs of requested content and side. Only requests for the left or right side
-                count.
+                are counted.
             keys: (B,) int64, unique keys of the motions.
         """
         rows = []

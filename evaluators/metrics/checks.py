@@ -17,7 +17,7 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the directions (F, 2) to the front and to the left on the ground, and the turn to the left in degrees."""
+    """Returns the forward and left directions (F, 2) on the ground, and the turn to the left in degrees."""
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]
@@ -49,7 +49,7 @@ class View:
     """A smoothed motion, and quantities that several checks need.
 
     Attributes:
-        smooth: joints (F, 22, 3) in meters.
+        smooth: smoothed joint positions (F, 22, 3) in meters.
         fps: frames per second.
         forward: direction (F, 2) that the body faces, on the ground.
         left: direction (F, 2) to the left of the body, on the ground.
@@ -66,7 +66,7 @@ class View:
 
     @classmethod
     def of(cls, smooth: np.ndarray, fps: float) -> "View":
-        """Returns the view of smoothed joints (F, 22, 3) in meters, y up."""
+        """Creates the view from smoothed joint positions (F, 22, 3) in meters, y up."""
         forward, left, turned = heading_of(smooth)
         return cls(smooth, fps, forward, left, turned, float(np.percentile(smooth[:, TOES, 1], 10)))
 
@@ -253,6 +253,6 @@ CHECKED: dict[str, Callable[[View], Shown]] = {
 
 
 def check(action: str, view: View) -> Shown:
-    """Returns the attributes of a motion if it shows an action of `CHECKED`, otherwise {}."""
+    """Returns the attributes of a motion if it shows the action (one of `CHECKED`), or {} if it does not."""
     shown = CHECKED[action](view)
     return {"action": action, **shown} if shown else {}

@@ -15,7 +15,7 @@ from flame_mdm.sampling.referee.judging import SHORTEST, Verdict, verdicts
 from flame_mdm.sampling.referee.kinds import GROUPS
 from flame_mdm.sampling.referee.sentences import read_claims
 
-# An audit keeps this many seconds of each motion, so that all sets of motions have equal size
+# An audit keeps this many seconds of each motion, so that all sets of motions have the same size
 KEPT_SECONDS = 10.0
 STEP = 0.0005  # meters per unit of the kept positions
 
@@ -29,10 +29,10 @@ def claims_of(caption: str) -> tuple[Claim, ...]:
 class ClaimAccuracy(Timed, MotionMean):
     """Fraction of decided claims that are true.
 
-    A metric of this project. The referee (`flame_mdm.sampling.referee`) reads the claims in the
-    caption of each motion, and measures each claim on the joints of the motion. The values are
-    fractions in [0, 1] for each group of claims, such as "side" and "count", and for "all" claims;
-    higher is better. "decided" is the fraction of all claims that are decided. "captions" is the
+    This metric was introduced in this project. The referee (`flame_mdm.sampling.referee`) reads the
+    claims in the caption of each motion, and measures each claim on the joints of the motion. The
+    values are fractions in [0, 1] for each group of claims, such as "side" and "count", and for
+    "all" claims; higher is better. "decided" is the fraction of all claims that are decided. "captions" is the
     fraction of captions with at least one decided claim.
     Motions that are shorter than 0.5 seconds, or have a skeleton other than SMPL's 22 joints, are
     not judged.
@@ -74,7 +74,7 @@ class ClaimAccuracy(Timed, MotionMean):
         self.add(keys, rows)
 
     def judged(self, joints: np.ndarray, caption: str) -> list[Verdict]:
-        """Returns the verdicts on the claims in a caption about joints (F, J, 3)."""
+        """Returns the verdicts on the claims that a caption makes about a motion (F, J, 3)."""
         if joints.shape[1] != len(SMPL22) or len(joints) < (SHORTEST + 0.1) * self.fps:
             return []
         return verdicts(joints, self.fps, claims_of(caption))

@@ -37,8 +37,7 @@ class FrechetMotionDistance(TwoSets):
 
     Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
     means in float32, and uses scipy's `sqrtm` for the product. If `sqrtm` fails, it adds 1e-6 to
-    the diagonals. The relative difference between the values of this class and of the authors' code
-    is 1e-8.
+    the diagonals. The relative difference from the values of the authors' code is 1e-8.
 
     Lower is better. The value is biased upward, especially with few samples, so compare only values
     with equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
@@ -97,8 +96,8 @@ class KernelMotionDistance(TwoSets):
         subsets: number of random subsets.
         subset_size: number of samples that a subset takes from each set. Neither set may be
             smaller.
-        replace: whether to draw with replacement, as in the code of MoDi and MDM if there are more
-            real motions than `subset_size`. Samples that are drawn twice increase the value.
+        replace: whether to draw with replacement. The code of MoDi and MDM does so if there are
+            more real motions than `subset_size`. Samples that are drawn twice increase the value.
         seed: seed of the draws.
 
     Example:
@@ -125,7 +124,7 @@ class KernelMotionDistance(TwoSets):
         )
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `std` for features (N, E), (M, E).
+        """Returns `mean` and `std` for features (N, E) and (M, E).
 
         Raises `UserError` if a set has fewer than `subset_size` samples.
         """
@@ -168,9 +167,9 @@ class PrecisionRecall(TwoSets):
 
     `precision` is the fraction of generated motions in the manifold of the real motions. `recall`
     is the fraction of real motions in the manifold of the generated motions. Higher is better; see
-    `manifold_coverage`. Neighbor distances shrink with the number of samples, so both sets are cut
-    to the size of the smaller set, in the order of the keys. The authors' code cuts them in the
-    order of the files.
+    `manifold_coverage`. Neighbor distances shrink with the number of samples, so both sets are
+    truncated to the size of the smaller set, in the order of the keys. The authors' code truncates
+    them in the order of the files.
 
     `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
 
@@ -186,7 +185,7 @@ class PrecisionRecall(TwoSets):
     names = ("precision", "recall")
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `precision` and `recall` of features (N, E), (M, E).
+        """Returns `precision` and `recall` for features (N, E) and (M, E).
 
         Raises `UserError` if a set has fewer than four motions.
         """

@@ -139,7 +139,7 @@ class PairedMultimodality(SampleMetric):
         self.samples = samples
 
     def value(self, features: Tensor, groups: Tensor) -> float:
-        """Returns the value of features (N, E).
+        """Returns the multimodality of features (N, E).
 
         Raises `UserError` if a text of `groups` (N,) does not have 2 `samples` motions.
         """
@@ -174,7 +174,7 @@ class ActionMultimodality(SampleMetric):
         self.pairs, self.seed = pairs, seed
 
     def value(self, features: Tensor, labels: Tensor) -> float:
-        """Returns the value of features (N, E) with labels (N,).
+        """Returns the multimodality of features (N, E) with labels (N,).
 
         Raises `UserError` if a class has only one motion.
         """
@@ -192,8 +192,8 @@ class ActionMultimodality(SampleMetric):
 class JointVariance(SampleMetric):
     """Variance of joint positions across the motions for a text, in square meters.
 
-    The variance over the `samples` motions for a text, which have equal length, is summed over x, y
-    and z, and averaged over joints, frames and texts. The denominator of the variance is n - 1. The
+    For each text, the variance is computed over `samples` motions of equal length, with n - 1 in
+    the denominator. It is summed over x, y and z, and averaged over joints, frames and texts. The
     value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of joints
     for the 10 generated motions", but eq. 18 defines a variance over the frames of one motion. No
     code was published.

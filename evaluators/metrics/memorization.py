@@ -45,23 +45,23 @@ class TrainingMotions:
     poses: Tensor
     #: (M,) int64, number of frames of each motion.
     lengths: Tensor
-    #: (M, E) features of the extractor; None without an extractor.
+    #: (M, E) features from the extractor, or None if there is no extractor.
     features: Tensor | None
     #: Right hip, left hip, right shoulder and left shoulder; see `Skeleton.facing`.
     facing: Sequence[int]
 
     def nearest(self, joints: Sequence[Tensor], features: Tensor | None) -> Tensor:
-        """Returns the distances of motions from the nearest training motion.
+        """Returns the distances between motions and their nearest training motions.
 
         Args:
-            joints: B motions (F, J, 3) in meters.
+            joints: joint positions (F, J, 3) of B motions in meters.
             features: (B, E) features of the motions, or None.
 
         Returns:
             (B, 2), or (B, 1) without features. The first column is the root mean square distance
-            of the joints in every fourth frame, in meters, from the best window of the same
-            length; it is infinite if no training motion is long enough. The second column is the
-            distance between the features.
+            (in meters) between the joints of the motion and of the best window of the same length,
+            in every fourth frame. It is infinite if no training motion is long enough. The second
+            column is the distance between the features.
         """
         squares = self.poses.square().sum(-1)
         # Number of frames from each frame to the end of its motion
@@ -99,12 +99,12 @@ class TrainingMotions:
 
 
 class NearestTraining(SampleMetric):
-    """Distance from the nearest training motion, and the share of copies.
+    """Distance to the nearest training motion, and the share of copies.
 
-    A metric of this project. A motion counts as a copy if its joints are closer to a training
-    motion than the joints of 99 % of the held-out real motions (all but `CLOSE`). By this
-    definition, about 1 % of real motions are copies, and all motions of a model that repeats the
-    training set are copies.
+    This metric was introduced in this project. A motion counts as a copy if its joints are closer
+    to a training motion than the joints of 99 % of the held-out real motions (all but `CLOSE`). By
+    this definition, about 1 % of real motions are copies, and all motions of a model that repeats
+    the training set are copies.
 
     The values `joints`, in meters, and `features` are the medians of the distances. `copies` is
     the share of copies, in [0, 1]. `update` takes `nearest` (B, 1 or 2), `real_nearest` (B, 1 or

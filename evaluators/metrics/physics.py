@@ -21,7 +21,7 @@ class FootSkating(Timed, JointMean):
     A toe joint touches the floor if it is below 5 cm in two adjacent frames. It slides if it moves
     more than 2.5 cm over the ground between these frames (Karunratanakul et al. 2023, "Guided
     Motion Diffusion"). The limit of 2.5 cm applies to 20 frames per second. At other frame rates,
-    the limit is the same speed of 0.5 m/s. The code released with the paper also requires this
+    the limit corresponds to the same speed, 0.5 m/s. The code released with the paper also requires this
     speed in the mean of five frames, and averages the ratios of the motions. This metric follows
     the paper: two frames decide, and every frame transition has the same weight. Lower is better.
 
@@ -44,7 +44,7 @@ class FootSkating(Timed, JointMean):
         self.toes = list(toes)
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns whether a foot skates in each frame transition of a motion (F, J, 3), (F - 1,) bool."""
+        """Returns (F - 1,) bool: whether a foot skates in each frame transition of a motion (F, J, 3)."""
         toes = motion[:, self.toes].double()
         fast = toes[..., [0, 2]].diff(dim=0).norm(dim=-1) * self.fps > LIMITS["skating"][0]
         low = toes[..., 1] < LOW
@@ -134,7 +134,7 @@ class StaticShare(Timed, JointMean):
     higher_is_better = False
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns whether a motion (F, J, 3) is static, (1,) bool; (0,) for a single frame."""
+        """Returns whether a motion (F, J, 3) is static, as (1,) bool, or an empty tensor for a single frame."""
         moved = motion.double().diff(dim=0).norm(dim=-1)
         # The speed is undefined for a single frame
         return (moved.mean() * self.fps < STANDING)[None][: len(moved)]

@@ -50,7 +50,7 @@ class PublishedPhysics(Timed, JointMean):
         """Returns the means by name. Raises `UserError` if they are undefined at the frame rate."""
         if not self.defined:
             raise self.error(
-                f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
+                f"only defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
             )
         return self.means(sums, counts) | {"measured": (counts > 0).all(1).double().mean().item()}
 
@@ -60,24 +60,25 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns, by name, the sum and number (N, 2) of each motion's values; {} if undefined."""
+        """Returns, by name, the sum and number (N, 2) of each motion's values, or {} if they are undefined."""
         return super().readings(motions) if self.defined else {}
 
 
 class MBenchQuality(PublishedPhysics):
-    """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, only at 20 frames per second.
+    """Motion quality of MBench (ViMoGen, bf891de), in meters per frame. Only defined at 20 frames per second.
 
     - `jitter_degree`: mean norm of the second difference of the joint positions, plus the same
       mean for positions relative to the root.
     - `dynamic_degree`: mean norm of the first difference of the joint positions, plus the same mean
       for relative positions; higher = more motion.
-    - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, otherwise 0.
+    - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, or 0 if there are
+      none.
     - `foot_sliding`: mean horizontal step of toes in contact.
-    - `foot_floating`: number of frames in which the body moves without the support of a foot, per
-      frame. The value can exceed 1.
+    - `foot_floating`: number of frames in which the body moves without the support of a foot,
+      divided by the number of all frames. The value can exceed 1.
 
     A toe is in contact if it moves less than 1 cm per frame, even in the air, or if it is lower
-    than 2 cm. The published code uses z as the height, although in its pipeline, y is the height.
+    than 2 cm. The published code uses z as the height, although y is the height in its pipeline.
     In this implementation, the height is y.
 
     Args:
@@ -148,7 +149,7 @@ def _speed(points: Tensor) -> Tensor:
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
     """Counts the frames of `foot_floating` in a motion (F, J, 3).
 
-    The positions of the two feet are (F, 2, 3), their contacts (F, 2) bool.
+    The positions of the two feet are (F, 2, 3), and their contacts are (F, 2) bool.
 
     Returns three numbers of frames, one per kind. In frames of the first kind, the feet on the
     ground do not move like the body. In the second kind, a foot in the air moves much less than the
@@ -231,7 +232,7 @@ class KimodoQuality(PublishedPhysics):
             joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
             mask: (B, F) bool, True = real frame.
             keys: (B,) int64, unique keys of the motions.
-            contacts: (B, F, 4) bool, predicted contacts of the feet. None = values that need
+            contacts: (B, F, 4) bool, predicted contacts of the feet. If None, values that need
                 contacts are not computed.
 
         Raises:
@@ -250,7 +251,7 @@ class KimodoQuality(PublishedPhysics):
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values of a motion (F, J, 3), and of the contacts (F, 4) bool of its feet if given."""
+        """Computes the values of a motion (F, J, 3) and, if given, of the contacts (F, 4) bool of its feet."""
         if len(motion) < 2:
             return {}
         feet = motion[:, self.feet]
@@ -272,13 +273,14 @@ class KimodoQuality(PublishedPhysics):
 
 
 class KimodoConstraints(MotionMean):
-    """Constraint errors of Kimodo (7330e7e) for edits: distances of kept parts from the real motion.
+    """Constraint errors of Kimodo (7330e7e) for edits: distances between kept parts and the real motion.
 
     Distances are in meters.
 
     - `root2d_err`: horizontal distance of the root, in frames that keep the root.
     - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
-    - `root2d_acc`: fraction of these frames with a distance of at most 10 cm.
+    - `root2d_acc`: fraction of the frames that keep the root in which this distance is at most
+      10 cm.
     - `fullbody_keyframe`: distance of all joints, in frames that keep all joints.
     - `end_effector`: distance of the kept joints in the other frames.
 
@@ -401,8 +403,8 @@ class TransitionJerk(SampleMetric):
     centered at the first frame after each change between kept and generated frames, if the motion
     contains the whole window. The jerk is averaged over windows, frame by frame. `peak` is the
     maximum of this mean curve. `area` is the sum of its absolute differences from
-    `JERK_OF_REAL_MOTIONS`, and grows with the window. `windows` is the number of windows. At frame
-    rates without an entry in `JERK_OF_REAL_MOTIONS`, there is no area.
+    `JERK_OF_REAL_MOTIONS`, and grows with the size of the window. `windows` is the number of
+    windows. At frame rates without an entry in `JERK_OF_REAL_MOTIONS`, there is no area.
 
     Args:
         fps: frames per second of the motions.
@@ -457,7 +459,7 @@ class TransitionJerk(SampleMetric):
         super().update(keys=keys, total=total, windows=count)
 
     def value(self, total: Tensor, windows: Tensor) -> dict[str, float | None]:
-        """Returns `peak`, `area` and `windows`; without windows, peak and area are None."""
+        """Returns `peak`, `area` and `windows`. Without windows, `peak` and `area` are None."""
         count = int(windows.sum())
         peak, area = peak_and_area(total.sum(0) / count, self.real) if count else (None, None)
         return {"peak": peak, "area": area, "windows": count}

@@ -41,8 +41,8 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
     The positions are root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3).
 
     Args:
-        joints: (F, J, 3) in meters.
-        root: (F, 3) in meters.
+        joints: (F, J, 3) joint positions in meters.
+        root: (F, 3) root positions in meters.
         parents: parent of each joint, -1 for the root.
     """
     bones = joints[:, 1:] - joints[:, list(parents[1:])]
@@ -89,7 +89,7 @@ class PositionErrors(MotionMean):
             real_joints: (B, F', J, 3) real motions for the same texts, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the generated motions.
-            groups: (B,) int64, keys of the texts; only needed for several `samples`.
+            groups: (B,) int64, keys of the texts; only needed if `samples` is greater than 1.
             references: B real motions (F'', J, 3) at the frame rate of their recording; only
                 needed for `upsampling`.
 
@@ -152,8 +152,8 @@ class TemosPositionErrors(PositionErrors):
     APE is the distance between `temos_parts`, averaged over joints and over all frames of all
     clips. AVE is the distance between the variances of each coordinate over time (n - 1 in the
     denominator), averaged over joints, then over clips. The unit of both is 1000 KIT units, which
-    are 1.56 m; the tables call this unit meters. TEMOS compares at 100 frames per second:
-    `upsampling=8`.
+    are 1.56 m; the tables call this unit meters. TEMOS compares motions at 100 frames per second,
+    which corresponds to `upsampling=8`.
 
     Args:
         samples: number of motions per text; see `PositionErrors`.
@@ -193,7 +193,7 @@ class TemosPositionErrors(PositionErrors):
 
 
 class FlamePositionErrors(PositionErrors):
-    """APE (in meters) and AVE (in square meters) of FLAME's code, which FLAME's tables do not use.
+    """APE (in meters) and AVE (in square meters) as in FLAME's code. FLAME's tables do not use them.
 
     The compared positions are `flame_parts`. The error of the trajectory is the sum of the
     distances along its two axes. The local error is the error of the bones. Variances of global
@@ -224,7 +224,7 @@ class FlamePositionErrors(PositionErrors):
         return flame_parts(joints, joints[:, 0], self.parents)
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns APE, in meters, and AVE, in square meters, of a clip, by name."""
+        """Returns the APE (in meters) and AVE (in square meters) of a clip, by name."""
         root, path, local, joints = (a[part] - b[part] for part in PARTS)
         distances = [
             root.norm(dim=-1),
@@ -276,17 +276,17 @@ class EditErrors(MotionMean):
         self.add(keys, errors)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool; {} if none exist."""
+        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool, or {} if there are none."""
         raise NotImplementedError
 
 
 class DisplacementErrors(EditErrors):
-    """ADE and FDE: mean distance of the joints in all predicted frames, and in the last one, in meters.
+    """ADE and FDE: mean joint distance in all predicted frames, and in the last one, in meters.
 
-    As usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints and
-    frames of a clip, then over clips. The part that an edit kept is ignored. MFM (Table 3) gives no
-    formula, code or unit for its numbers. The numbers are too large for meters, so they are not
-    comparable.
+    As is usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints
+    and frames of a clip, then over clips. The part that an edit kept is ignored. MFM (Table 3)
+    gives no formula, code or unit for its numbers, which are too large to be in meters. They are
+    therefore not comparable.
 
     Example:
         >>> metric, real = DisplacementErrors(), torch.zeros(1, 5, 22, 3)
@@ -334,11 +334,12 @@ class DisplacementErrors(EditErrors):
 
 
 class KeptDrift(EditErrors):
-    """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
+    """Distance in world coordinates, in meters, by which the kept part of an edit has moved.
 
-    `mean` is averaged over the kept joints and frames of a motion, then over motions. `largest` is
-    the maximum over all of them. If features are relative to the root, an edit can keep steps and
-    poses exactly and still move a kept ending, because the ending begins where the new part ends.
+    This metric was introduced in this project. `mean` is averaged over the kept joints and frames
+    of a motion, then over motions. `largest` is the maximum over all of them. If features are
+    relative to the root, an edit can keep steps and poses exactly and still move a kept ending,
+    because the ending begins where the new part ends.
 
     Example:
         >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)
@@ -376,13 +377,13 @@ class KeptDrift(EditErrors):
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the mean and the largest distance of the kept joints of a motion; {} without kept joints."""
+        """Returns the mean and the largest distance of the kept joints of a motion, or {} if no joints were kept."""
         return (
             {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
         )
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `largest` over the motions with kept joints; None without such motions."""
+        """Returns `mean` and `largest` over the motions with kept joints. They are None without such motions."""
         drift = sums[counts[:, 0] > 0]
         values = (
             (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)

@@ -23,7 +23,7 @@ from flame_mdm.seeds import key
 # Captions with a larger cosine count as the same. TMR's threshold of 0.95 applies to (cosine + 1) /
 # 2.
 SAME = 0.9
-# The k of recall
+# Values of k for recall
 TMR_TOP = (1, 2, 3, 5, 10)
 # TMR's number of motions in a batch, and maximum number of dissimilar motions
 BATCH, DISSIMILAR = 32, 100
@@ -36,7 +36,7 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of a caption, scaled to norm 1. `config` is the JSON of an encoder's mapping.
+    """Returns the vector (C,) of a caption, scaled to norm 1. `config` is an encoder's mapping as JSON.
 
     The caption is encoded alone, not in a batch.
     """
@@ -49,7 +49,7 @@ def embedding(config: str, caption: str) -> Tensor:
 
 
 def plain_caption(caption: str) -> str:
-    """Returns a caption in lower case, without punctuation and extra spaces."""
+    """Returns a caption in lower case, without punctuation or extra spaces."""
     return " ".join(re.sub(r"[^\w\s]", "", caption.lower()).split())
 
 
@@ -61,8 +61,8 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
         correct: (N, N) bool, symmetric, True = correct pair. The best correct candidate counts.
             None = only the diagonal is correct.
 
-    Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for texts.
-    The values for the reverse direction, texts for motions, have names that begin with `m2t_`.
+    Returns recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for
+    texts. The names of the values for the reverse direction, texts for motions, begin with `m2t_`.
 
     Example:
         >>> values = whole_set_retrieval(torch.eye(4))
@@ -136,17 +136,17 @@ class CaptionMetric(SampleMetric):
 
 
 class MultiPositiveRPrecision(CaptionMetric):
-    """R-precision, motions for a text, in which all motions with the text's caption are correct.
+    """R-precision, motions for a text, in which all motions with the text's caption count as correct.
 
-    A metric of this project.
+    This metric was introduced in this project.
 
     - `topK`: the fraction of texts with a correct motion among the K nearest motions. Ties share
       their mean rank.
-    - `proper`: R-precision as in information retrieval. A text with R correct motions adds the
-      fraction of them among its R nearest motions.
-    - `single_topK`: only the text's own motion is correct. Except for ties, the values equal the
-      values of `MotionsForText`.
-    - `chance_topK`: the expected values of a random order. They show how much similar captions
+    - `proper`: R-precision as in information retrieval. A text with R correct motions contributes
+      the fraction of them that are among its R nearest motions.
+    - `single_topK`: like `topK`, but only the text's own motion counts as correct. Except for ties,
+      the values equal those of `MotionsForText`.
+    - `chance_topK`: the expected values for a random order. They show how much similar captions
       raise all values.
     - `positives`: the mean number R of correct motions.
 
@@ -155,7 +155,7 @@ class MultiPositiveRPrecision(CaptionMetric):
             text.
         pool: number of motions in a pool, as in `MotionsForText`.
         seed: seed of the pools.
-        normalize: whether to scale features to norm 1 first, which ranks by cosine.
+        normalize: whether to first scale features to norm 1, so that motions are ranked by cosine.
 
     Example:
         >>> metric, features = MultiPositiveRPrecision(pool=3), torch.eye(3)
@@ -205,7 +205,7 @@ class MultiPositiveRPrecision(CaptionMetric):
 
 
 def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | None]:
-    """Computes hit rates, R-precision and chance from the similarity (N, M) and correctness (N, M) of candidates."""
+    """Computes hit rates, R-precision and chance levels from similarities (N, M) and correctness (N, M)."""
     rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
     values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in TOP}
     # In a random order, the first k candidates are k draws without replacement. The probability
@@ -227,18 +227,18 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
 class TMRRetrieval(CaptionMetric):
     """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), in both directions.
 
-    - `all`: among all motions. Only the text's own motion is correct.
-    - `threshold`: among all motions. Motions with the same caption are also correct.
-    - `dissimilar`: among 100 motions with different captions, or half of all motions if this is
-      less. Without an encoder, there is no value.
-    - `batches`: in batches of 32. An incomplete last batch is left out. The medians of the batches
-      are averaged.
+    - `all`: retrieval among all motions. Only the text's own motion counts as correct.
+    - `threshold`: retrieval among all motions. Motions with the same caption also count as correct.
+    - `dissimilar`: retrieval among 100 motions with different captions, or half of all motions if
+      this is less. Without an encoder, there is no value.
+    - `batches`: retrieval in batches of 32. An incomplete last batch is left out. The medians of
+      the batches are averaged.
 
     Each protocol has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of
-    motions for texts. The values for the reverse direction have names that begin with `m2t_`.
+    motions for texts. The names of the values for the reverse direction begin with `m2t_`.
 
-    TMR's caption encoder is all-mpnet-base-v2. TMR's dissimilar motions and batches are lists
-    for HumanML3D and KIT. In this implementation, batches are drawn. Without `ids`, the dissimilar
+    TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
+    HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the dissimilar
     subset starts with the first motion by key. The motion whose caption is least similar to the
     captions already chosen is added next, until the subset is complete.
 

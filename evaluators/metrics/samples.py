@@ -15,7 +15,7 @@ from torchmetrics.utilities import dim_zero_cat
 from flame_mdm.errors import UserError
 
 Value = float | dict[str, float | None] | None
-"""Result of `compute`: a number, or numbers by name; None without samples."""
+"""Result of `compute`: a number or numbers by name, or None if there are no samples."""
 
 Rows = Mapping[str, Any]
 """Inputs for N motions by their names in `evaluators.metrics`, such as tensors with N rows."""
@@ -26,14 +26,15 @@ class Declared:
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
-        units: units of individual values by name, if they differ from `unit`.
-        directions: whether higher is better, by name, for the values that differ from
-            `higher_is_better`; None = neither direction is better.
-        summary: name of the value that summarizes the other values; None = there is no such value.
+        units: by name, the units of the values whose unit differs from `unit`.
+        directions: by name, whether higher is better for the values to which `higher_is_better`
+            does not apply; None = neither direction is better.
+        summary: name of the value that summarizes the other values, or None if there is no such
+            value.
         audited: names of the values that audits show; None = all values.
         sees_meaning: whether the metric may detect that a motion does not show what was requested.
-        exact: name of the value that reads the requested attributes without a network; None = there
-            is no such value.
+        exact: name of the value that reads the requested attributes without a network, or None if
+            there is no such value.
         depends_on_count: whether the bias of the value depends on the number of motions.
     """
 
@@ -59,7 +60,7 @@ class Declared:
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the metric's readings of motions, without the conditions, by name.
+        """Returns, by name, the metric's readings of motions, which do not depend on the conditions.
 
         Each reading is an array with N rows. Metrics of features need no readings.
         """
@@ -104,7 +105,7 @@ class SampleMetric(Declared, Metric):
         names: names of the values; empty if there is only one value.
 
     Example:
-        >>> class MeanFeature(SampleMetric):  # a metric is its inputs and a formula
+        >>> class MeanFeature(SampleMetric):  # a metric consists of its inputs and a formula
         ...     states = ("generated",)
         ...     def value(self, generated):
         ...         return generated.mean().item()
@@ -145,7 +146,7 @@ class SampleMetric(Declared, Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
-        """Returns the value of all samples. Without samples, the value or each value is None."""
+        """Returns the metric computed over all samples. Without samples, it (or each of its values) is None."""
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 
@@ -155,7 +156,7 @@ class SampleMetric(Declared, Metric):
         return dict.fromkeys(self.names) if self.names else None
 
     def value(self, *rows: Any, **_: Any) -> Value:
-        """Computes the value from all rows, in the order of their keys."""
+        """Computes the value from all rows, which are sorted by key."""
         raise NotImplementedError
 
     def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
@@ -172,7 +173,7 @@ class SampleMetric(Declared, Metric):
         return [values.double() if values.is_floating_point() else values for values in rows]
 
     def rows(self, keys: str, *names: str) -> list[Tensor]:
-        """Returns the rows, which must be finite, in the order of their keys; [] without rows.
+        """Returns the rows, which must be finite, sorted by key, or [] if there are no rows.
 
         Floats are returned as float64.
         """
@@ -210,7 +211,7 @@ class SampleMetric(Declared, Metric):
         if wrong := int((sizes != samples).sum()):
             have = f"{wrong} of {len(names)} prompts do not have {samples} motions"
             raise self.error(
-                f"{have}, but {int(sizes.min())} to {int(sizes.max())}. Generate {samples} motions per prompt"
+                f"{have} : found {int(sizes.min())} to {int(sizes.max())}. Generate {samples} motions per prompt"
             )
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
@@ -221,7 +222,7 @@ class SampleMetric(Declared, Metric):
     def need(self, count: int, least: int, noun: str) -> None:
         """Raises `UserError` if `count` is less than `least`."""
         if count < least:
-            raise self.error(f"got {count} {noun}, needs at least {least}")
+            raise self.error(f"got {count} {noun}, but needs at least {least}")
 
     def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
         """Splits padded joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3).
@@ -263,7 +264,7 @@ class Timed(SampleMetric):
 class MotionMean(SampleMetric):
     """Base class for means over the values of motions.
 
-    A motion adds one value, one value per frame, or any other number of values.
+    A motion contributes one value, one value per frame, or any other number of values.
     """
 
     states = ("sums", "counts")
@@ -277,7 +278,7 @@ class MotionMean(SampleMetric):
             keys: (B,) int64, unique keys of the motions.
             motions: B numbers or tensors, such as one number per frame. If the metric has
                 `names`, B mappings from names to numbers or tensors. NaN or missing values are
-                undefined and do not count.
+                undefined and are not counted.
             more: additional states with B rows each.
         """
         names, rows = self.parts or self.names, []
@@ -295,7 +296,7 @@ class MotionMean(SampleMetric):
         return self.means(*rows)
 
     def means(self, sums: Tensor, counts: Tensor) -> Any:
-        """Returns the mean of all values, by name if the metric has `names`; None without values."""
+        """Returns the mean of all values, by name if the metric has `names`, or None if there are no values."""
         totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in totals]
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
@@ -383,9 +384,9 @@ class TwoSets(SampleMetric):
             super().update(real_keys=real_keys, real=real)
 
     def compute(self) -> Any:
-        """Returns the value of both sets.
+        """Returns the metric computed from both sets.
 
-        If a set is empty, the value or each value is None.
+        If a set is empty, the metric (or each of its values) is None.
         """
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         return self.value(*generated, *real) if generated and real else self.nothing

@@ -176,7 +176,7 @@ class Perturbation:
     grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation (or one per kind) with the grades that the motions allow, or [] if there are none."""
+        """Returns the perturbation (or one per kind) with all possible grades, or [] if none is possible."""
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:

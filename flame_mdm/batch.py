@@ -126,7 +126,7 @@ class Condition:
         return replace(self, pooled=pooled, tokens=tokens, token_mask=token_mask)
 
     def with_null(self) -> Condition:
-        """Returns the conditions followed by the null condition of each sample, (2B).
+        """Returns a batch of size 2B: the conditions, followed by the null condition of each sample.
 
         With this batch, classifier-free guidance needs only one forward pass.
         """
@@ -153,7 +153,7 @@ class Condition:
 
 
 class Guide(Protocol):
-    """Guides motions (B, F, D) to a goal, such as world positions."""
+    """Guides motions (B, F, D) toward a goal, such as world positions."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         """Returns `x_t`, changed so that its clean estimate is closer to the goal.
@@ -183,16 +183,16 @@ class Edit:
             noise (FLAME, RePaint). "trajectory" overwrites the early part of the flow's path
             (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
-        blend: for "x_t", when the kept part is replaced. "after" each step (FLAME, eq. 6): the
-            result contains the known motion itself. "before" each call of the denoiser (FLAME's
-            code): the result contains the model's version of the known motion.
+        blend: for "x_t", when the kept part is replaced: "after" each step (FLAME, eq. 6), so that
+            the result contains the known motion itself, or "before" each call of the denoiser
+            (FLAME's code), so that the result contains the model's version of the known motion.
         resample: for "x_t", how many times each step is repeated, after noise is added again
             (RePaint, algorithm 1).
         guide: for "x0", a goal that is imposed on the clean estimate at each step, before the kept
             part overwrites it. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
             with the noise of the first of these steps (SDEdit). MDM's code sets the number of
-            skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. None: sampling
+            skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. None = sampling
             starts from pure noise.
 
     Example:
@@ -238,7 +238,7 @@ Sampling starts from draw 0.
 
 
 def pad_to(x: Tensor, size: int) -> Tensor:
-    """Pads dimension 1 of x (B, N, ...) with zeros (False) up to `size` entries."""
+    """Pads dimension 1 of x (B, N, ...) with zeros (False in masks) up to `size` entries."""
     missing = size - x.shape[1]
     return x if missing == 0 else torch.cat([x, x.new_zeros(x.shape[0], missing, *x.shape[2:])], 1)
 

@@ -19,7 +19,7 @@ DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 class UserError(ValueError):
     """An error that the user can fix.
 
-    Commands print its message in one line and exit with code 1.
+    Commands print its message on one line and exit with code 1.
     """
 
 
@@ -44,9 +44,9 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(text: str, most: int = MAX_LINE) -> str:
-    """Shortens a text to at most `most` characters, and escapes direction characters.
+    """Shortens text to at most `most` characters, and escapes direction characters.
 
-    A shortened text ends with an ellipsis.
+    Shortened text ends with an ellipsis.
     """
     text = DIRECTIONS.sub(lambda match: _escaped(match[0]), text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
@@ -66,12 +66,12 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns a text as one `printable` line. The text may come from an untrusted file."""
+    """Returns text, which may come from an untrusted file, as one `printable` line."""
     return printable(re.sub(r"[\t\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+", " ", text))
 
 
 def markdown_text(text: str) -> str:
-    """Returns a text as one line of Markdown without markup."""
+    """Returns text as one line of Markdown without markup."""
     return html.escape(re.sub(r"([|*_`~#\[\]\\])", r"\\\1", one_line(text)), quote=False)
 
 
@@ -88,7 +88,7 @@ def show_as(path: str, name: str) -> None:
 
 
 def say(*lines: object, error: bool = False) -> None:
-    """Prints each argument as one `printable` line; texts may come from untrusted files.
+    """Prints each argument as one `printable` line, because text may come from untrusted files.
 
     If the output is piped to a program that has ended, such as `head`, all later lines are dropped.
     The command still finishes its work.

@@ -103,9 +103,9 @@ class Model:
     config: Config
     # Facts about the training data: actions, maximum length, fingerprint
     facts: dict[str, Any]
-    # Number of training steps of the loaded checkpoint; None if unknown
+    # Number of training steps of the loaded checkpoint, or None if it is unknown
     steps: int | None = None
-    # SHA-256 of the file that the model was loaded from; "" if it was not loaded
+    # SHA-256 of the file that the model was loaded from, or "" if it was not loaded
     sha256: str = ""
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
@@ -132,7 +132,7 @@ class MotionGenerator(Model, nn.Module):
     """
 
     noun = "a motion generator"
-    #: The condition that the model was trained with.
+    #: The condition with which the model was trained.
     conditioned_on: Literal["none", "text", "action"]
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
@@ -219,16 +219,16 @@ class MotionGenerator(Model, nn.Module):
             batch: conditions, `mask` and `ids` of B motions; its `x` is ignored.
             options: sampler options. For an option that is None, the recipe's value is used.
             seed: seed of the noise.
-            replication: index of the replication, to sample several motions per id.
+            replication: index of the replication, used to sample several motions per id.
             edit: part of a motion to keep.
             windows: windows that cover motions longer than the training motions. The conditions of
                 the windows replace the conditions of the batch.
             prefix: (B, C, D) normalized features of the frames before the motions. Required by a
                 model with `context_frames` C. Such a model continues the prefix block by block and
                 accepts no edit, windows or trajectory.
-            unconditioned: sample a conditional model with its null condition.
-            shared_noise: the noise is a function of (seed, replication) and does not depend on
-                the id.
+            unconditioned: whether to sample a conditional model with its null condition.
+            shared_noise: whether the noise is a function of only (seed, replication), so that it
+                does not depend on the id.
             trajectory: list that receives the normalized clean estimate (B, F, D) of each call of
                 the denoiser.
 
@@ -241,7 +241,7 @@ class MotionGenerator(Model, nn.Module):
         self.check_request(options, unconditioned)
         options = self.sampler_options if options is None else options.over(self.sampler_options)
         was_training = self.training
-        if was_training:  # setting the mode of all modules takes as long as a small network
+        if was_training:  # setting the mode of all modules takes as long as running a small network
             self.eval()
 
         cond = self.encode(batch if windows is None else windows.batch, unconditioned)
@@ -330,18 +330,18 @@ FADE = 0.5
 
 
 class Blocks:
-    """Motions that are generated in blocks; each block continues the last frames of the previous one.
+    """Motions generated in blocks, each of which continues the last frames of the previous block.
 
     Source: Tevet et al. 2025, "CLoSD". The noise of a block is a function of (seed, replication,
     id, block index). Changing a condition therefore changes only the later blocks.
 
     Args:
         model: a model whose denoiser has `context_frames` C.
-        ids: B names of the motions; they seed the noise.
+        ids: B names of the motions, which seed the noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
-        options: sampler options; none of them is None.
+        options: sampler options, none of which is None.
         seed: seed of the noise.
-        replication: index of the replication, to sample several motions per id.
+        replication: index of the replication, used to sample several motions per id.
         unconditioned: whether the conditions are null conditions, so that no guidance is needed.
         fade: number of frames after a seam over which a jump between two blocks is faded out; see
             `joined`. 0 = no fading, as in DiP's code.
@@ -461,5 +461,6 @@ class DistilledGenerator(MotionGenerator):
             )
         if unconditioned and self.condition.features:
             raise UserError(
-                f"this distilled model was trained with a condition only. Pass a {self.condition.reads}"
+                "this distilled model was trained only with a condition, so it cannot sample without one. "
+                f"Pass a {self.condition.reads}"
             )

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from flame_mdm.batch import Constant
 
 CONTACT_SPEED = 0.01
-"""Maximum displacement per frame, in meters, of a foot in contact in the data."""
+"""Maximum displacement per frame, in meters, of a foot that counts as in contact in the data."""
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
@@ -86,12 +86,12 @@ class MotionLosses(nn.Module):
         joints: weight of the squared error of the joint positions (eq. 3).
         velocity: weight of the squared error of the features' velocity (eq. 5).
         foot_contact: weight of the squared velocity of the feet that are in contact in the data
-            (eq. 4). Feet that are not in contact count in the mean with 0, as in the sum over all
-            frames in the paper.
+            (eq. 4). Feet that are not in contact count as 0 in the mean, as in the paper's sum over
+            all frames.
         bone_length: weight of the squared error of the bone lengths, in square meters. This is
-            InterGen's bone length loss (arXiv:2304.05684). InterGen applies it only up to a noise
-            level; here, it applies at all levels.
-        root_relative: subtract the first joint from all joints, as in MDM's code.
+            InterGen's bone length loss (arXiv:2304.05684). InterGen applies it only up to a certain
+            noise level. In this implementation, it is applied at all levels.
+        root_relative: whether to subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of features that `velocity` uses, counted from the first. MDM's
             code uses 144 of 25 x 6 and 262 of 263: it leaves out the last row of the feature
             matrix. None = all features.

@@ -30,7 +30,7 @@ class ProgressBar(tqdm):
             yield item
 
     def update(self, n: float | None = 1) -> bool | None:
-        """Advances the bar by `n`, unless a signal was received: then raises its exception."""
+        """Advances the bar by `n`. If a signal was received, raises its exception instead."""
         raise_received()
         return super().update(n)
 

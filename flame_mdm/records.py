@@ -17,13 +17,13 @@ class Value(Schema):
 
     # None if the value cannot be computed
     mean: Number | None
-    # Half width of the 95 % interval over replications; None for a single replication
+    # Half width of the 95 % interval over replications, or None for a single replication
     ci: Number | None
     replications: Int | None
     n: Int | None  # motions per replication; None if replications have different numbers
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
-    # Number of real motions if the metric compares two sets; otherwise None
+    # Number of real motions if the metric compares two sets, or None otherwise
     n_real: Int | None = None
     unit: str = ""
     # Bootstrap values: the metric of motions drawn with replacement from the first replication
@@ -31,7 +31,7 @@ class Value(Schema):
 
     @property
     def half(self) -> float | None:
-        """Half width of the 95 % interval over replications; None if unknown.
+        """Half width of the 95 % interval over replications, or None if it is unknown.
 
         For a single replication, the interval is over the motions.
         """
@@ -189,7 +189,7 @@ class Result(Measured):
 
     @property
     def counts(self) -> str:
-        """Numbers of replications and motions of most values, as text; "" without values."""
+        """Numbers of replications and motions of most values, as text, or "" if there are no values."""
         values = [value for value in (self.values or {}).values() if value and value.replications]
         counts = Counter(value.counts for value in values if value.n != 0)
         return counts.most_common(1)[0][0] if counts else ""

@@ -73,9 +73,9 @@ class Fault(Schema):
 
 
 def made_by(path: str | Path) -> str:
-    """Returns a text that explains how to obtain a missing checkpoint or extractor.
+    """Explains how to obtain a missing checkpoint or extractor.
 
-    The text is the command that creates the file or, if no command creates it, the page that states
+    Returns the command that creates the file or, if no command creates it, the page that states
     where to find it.
     """
     name = Path(path).as_posix()
@@ -90,7 +90,7 @@ def made_by(path: str | Path) -> str:
 class Run:
     """Content of a run directory.
 
-    Curves are a mapping from name to step to value. Results are stored by their path in the
+    Curves map each name to a mapping from steps to values. Results are stored by their path in the
     directory.
     """
 
@@ -102,13 +102,13 @@ class Run:
 
     @property
     def label(self) -> str:
-        """Recipe and name of the run; only the recipe if the run has the default name."""
+        """Recipe and name of the run, or only the recipe if the run has the default name."""
         name = self.config["run"].get("name", "default")
         return str(self.config["experiment"]) + (f"/{name}" if name != "default" else "")
 
     @property
     def samples(self) -> Path | None:
-        """Folder of the samples of the last step; None if there are no samples."""
+        """Folder of the samples of the last step, or None if there are no samples."""
         folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
         return max(
             (path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None
@@ -168,7 +168,7 @@ def read_history(folder: Path) -> dict[str, dict[int, float]]:
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a history. Ignores an incomplete last line of a killed process."""
+    """Returns the lines of a history. Ignores an incomplete last line that a killed process left behind."""
     if not path.exists():
         return []
     *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")

@@ -104,7 +104,7 @@ def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> 
 
 
 def _too_large(content: Any) -> str:
-    """Returns the first integer above `MAX_INTEGER` in the content, as text; "" if none is."""
+    """Returns the first integer above `MAX_INTEGER` in the content as text, or "" if there is none."""
     if isinstance(content, dict | list):
         values = content.values() if isinstance(content, dict) else content
         return next(filter(None, map(_too_large, values)), "")

@@ -23,7 +23,7 @@ Counters = TypeVar("Counters", Tensor, np.ndarray)
 
 
 def key(*parts: str | int) -> int:
-    """Hashes parts to a 63-bit number, the same on every machine.
+    """Hashes parts to a 63-bit number that is the same on every machine.
 
     Example:
         >>> key("noise", 0, "clip_1") == key("noise", 0, "clip_1"), key("noise", 0, "clip_2") < 2**63
@@ -114,7 +114,7 @@ def seeded_noise(
         features: D.
         seed: seed of the run.
         replication: index of the replication.
-        like: a tensor; the noise has its device and precision.
+        like: a tensor whose device and precision are used for the noise.
 
     Returns:
         A function that maps the draw index (0, 1, 2, ...) to noise (B, F, D).

@@ -98,7 +98,7 @@ class StopRequest:
 
 
 def kill_children() -> None:
-    """Kills all child processes. Python would wait forever for suspended workers."""
+    """Kills all child processes, because Python would wait forever for suspended workers."""
     # torch's handler would raise an error for each worker that ends.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     for process in active_children():
@@ -106,5 +106,5 @@ def kill_children() -> None:
 
 
 def ignore_interrupts() -> None:
-    """Ignores Ctrl-C in a worker process; the parent process handles it."""
+    """Ignores Ctrl-C in a worker process, because the parent process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

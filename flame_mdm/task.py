@@ -116,7 +116,7 @@ class Task(Model, LightningModule):
         """Keeps values of the current training step by name, if they are logged.
 
         `Measurements` writes them to the loggers after the step. Lightning's `log` takes as long
-        per value as a small network, and keeps the host busy in all later steps.
+        per value as running a small network, and keeps the host busy in all later steps.
         """
         if self.is_reported:
             for name, value in values.items():
@@ -156,7 +156,7 @@ class Task(Model, LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_start(self) -> None:
-        """Allows clipping with fused optimizers in bfloat16.
+        """Allows gradient clipping with fused optimizers in bfloat16.
 
         Lightning refuses it because such an optimizer could scale gradients itself. In bfloat16,
         gradients are not scaled.
@@ -184,14 +184,15 @@ class GeneratorTask(Task):
             `SamplerOptions`.
         seed: seed of all random draws during training. Draws are functions of (seed, batch number,
             rank).
-        compile: compile the denoiser with torch.compile when training begins.
-        checkpoint_activations: store fewer activations for the backward pass and recompute them;
-            see `flame_mdm.denoisers.recomputation`. The weights are the same, but steps are slower.
+        compile: whether to compile the denoiser with torch.compile when training begins.
+        checkpoint_activations: whether to store fewer activations for the backward pass and
+            recompute the others; see `flame_mdm.denoisers.recomputation`. The weights are the same,
+            but steps are slower.
         targets: options of `TargetConditions`, for a denoiser with a target encoder. None = no
             targets.
 
     If the denoiser reads `context_frames`, the first frames of a training sample are its clean
-    prefix. Only the frames after the prefix count in the losses.
+    prefix. Only the frames after the prefix contribute to the losses.
     """
 
     noun = MotionGenerator.noun
@@ -415,7 +416,7 @@ def _conditioned(
 ) -> tuple[MotionBatch, Condition]:
     """Returns the motions to predict, without the frames of the prefix, and their conditions.
 
-    `u` (B,) are uniform numbers in (0, 1). These numbers determine which targets are requested.
+    `u` (B,) are uniform numbers in (0, 1) that determine which targets are requested.
     """
     prefix, batch = generator.split_prefix(batch)
     cond = generator.condition(batch)
@@ -434,7 +435,7 @@ def _name_as_generator(task: GeneratorTask, state: dict[str, Any], prefix: str, 
 
 
 def _name_as_task(task: GeneratorTask, state: dict[str, Any], prefix: str, *_: object) -> None:
-    """Adds "generator." to the names of the weights in a state to load."""
+    """Adds "generator." to the names of the weights in a state that is being loaded."""
     for name in [name for name in state if name.startswith(prefix)]:
         state[f"{prefix}generator.{name.removeprefix(prefix)}"] = state.pop(name)
 

@@ -140,7 +140,7 @@ def test_what_lightning_checks_late_is_checked_before_the_data(
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     for word, reason in (
-        *((f"trainer.{key}=0", "must be above 0") for key in sweeps.LATE),
+        *((f"trainer.{key}=0", "must be greater than 0") for key in sweeps.LATE),
         (
             "trainer.devices=99",
             f"this machine has 3 CPU cores, and {NO_GPU}. Use at most trainer.devices=3",
@@ -194,7 +194,7 @@ def test_recipes_outside_the_repository(tmp_path, subtests):
         ("ema: {decay: x}", "ema.decay=x: must be a finite number"),
         ("ema: {decays: 0.9}", "unknown config key 'ema.decays'"),
         ("seed: abc", "seed=abc: must be a whole number"),
-        ("seed: -1", "seed=-1: must be from 0 to"),
+        ("seed: -1", "seed=-1: must be between 0 and"),
         ("initial_weights: 3", "initial_weights=3: must be a string or null"),
         ("lr_decay: x", "lr_decay=x: must be a finite number or null"),
         ("lr_warmup: 1.5", "lr_warmup=1.5: must be a whole number or null"),

@@ -1,14 +1,14 @@
 """Adapters: small changes to a model's weights, learned from a few clips.
 
 A weight W (out, in) of attention or feed-forward layers becomes W + strength * up down, with `up`
-(out, rank) and `down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, the
-row of each new word has an additional vector. During training, `torch.nn.utils.parametrize`
+(out, rank) and `down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, a
+vector is added to the row of each new word. During training, `torch.nn.utils.parametrize`
 computes the weights. This also works for code that reads a weight without calling its layer, such
 as cross-attention.
 
-All layers are trained, but a style keeps only the changes in the second half of them. The first
-half would learn that the clips show few actions, and the model would no longer follow the requested
-action.
+All layers are trained, but a style keeps only the changes in the second half of the layers. The
+first half would learn that the clips show few actions, and the model would no longer follow the
+requested action.
 
 An adapter file (.safetensors) contains the parts of the change to a weight NAME as NAME.up,
 NAME.down and NAME.vectors. Its metadata contains `About` as JSON.
@@ -87,7 +87,7 @@ class Change(nn.Module):
 def changed(
     weight: Tensor, parts: Mapping[str, Tensor], rows: Sequence[int], strength: float = 1.0
 ) -> Tensor:
-    """Returns a weight with a low-rank change, or with vectors added to some of its rows."""
+    """Returns the weight after applying a low-rank update or adding vectors to some of its rows."""
     if "vectors" in parts:
         return weight.index_add(
             0, torch.tensor(rows, device=weight.device), strength * FARTHER * parts["vectors"]
@@ -96,7 +96,7 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns one of each word's two table rows, if possible a row that no vocabulary word uses."""
+    """Returns, for each word, one of its two table rows, preferably one that no vocabulary word uses."""
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]

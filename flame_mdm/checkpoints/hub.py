@@ -1,4 +1,4 @@
-"""Sharing of models: export from a checkpoint, model card, and upload to the Hugging Face hub."""
+"""Model sharing: export from a checkpoint, model card, and upload to the Hugging Face hub."""
 
 import re
 from collections.abc import Mapping

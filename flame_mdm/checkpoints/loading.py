@@ -43,7 +43,7 @@ NO_GPU = (
     if torch.version.cuda or torch.version.hip
     else "this PyTorch was built without CUDA"
 )
-"""The reason why PyTorch can use no GPU, on machines where this is the case."""
+"""The reason why PyTorch cannot use a GPU, on machines where it cannot."""
 
 
 def load(

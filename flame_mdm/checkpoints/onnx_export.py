@@ -68,7 +68,7 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise UserError(
-            f'format=onnx needs the package {error.name}. Run pip install "flame-mdm[onnx]"'
+            f'format=onnx requires the {error.name} package. Run pip install "flame-mdm[onnx]"'
         ) from error
     write_folder(load(source, **adapted), out, half=half)
     return Path(out)
@@ -213,7 +213,7 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
 
     The denoiser is called at time t and returns y. The clean estimate is x0 = p x + q y. The next
     noisy motion is a x + b x0 + c x0' + d noise, where x0' is the clean estimate of the previous
-    call. Raises `UserError` for samplers without this form.
+    call. Raises `UserError` for samplers that do not have this form.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
@@ -274,7 +274,7 @@ class Graph(NamedTuple):
 
 
 class Call(nn.Module):
-    """One call of a model's denoiser with condition encoder and guidance, without a learned variance.
+    """One call of a model's denoiser, including condition encoder and guidance, but without a learned variance.
 
     Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
     condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)
@@ -307,7 +307,7 @@ class Call(nn.Module):
             x_t: (B, F, D), noisy motion.
             t: (B,), times in units of the denoiser's table.
             lengths: (B,), number of frames of each motion.
-            condition: (B, S) tokens of texts, or (B,) action indices; None for an unconditional
+            condition: (B, S) tokens of texts, (B,) action indices, or None for an unconditional
                 model.
             counts: (B,), number of tokens of each text.
         """
@@ -482,7 +482,7 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
 
 
 def _shrink(path: Path, half: bool) -> None:
-    """Removes the descriptions of the nodes. With `half`, also stores matrices in half precision, with a cast."""
+    """Removes the descriptions of the nodes. With `half`, also stores matrices in half precision and adds casts."""
     import onnx
     from onnx import numpy_helper
 

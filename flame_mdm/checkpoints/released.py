@@ -65,7 +65,7 @@ class Released(NamedTuple):
 def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
     """Converts a model of MDM or MFM.
 
-    The network of the model is an encoder, a decoder, a decoder with token, or a GRU; the
+    The network of the model is an encoder, a decoder, a decoder with an input token, or a GRU. The
     condition is text, actions or nothing.
 
     Args:

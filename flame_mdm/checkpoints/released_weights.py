@@ -98,7 +98,7 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def layer_names(
     state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
 ) -> tuple[dict[str, str], int]:
-    """Returns the number of layers, and a mapping from prefixes of torch's layers to the project's prefixes."""
+    """Returns a mapping from prefixes of torch's layers to the project's prefixes, and the number of layers."""
     count = sum(
         key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
     )

@@ -45,7 +45,7 @@ NUMBERS = frozenset(
     ]
 )
 MASK = (1 << 64) - 1
-# Default duration in seconds for a model that continues frames
+# Maximum duration in seconds for a model that continues frames
 LONGEST = 600
 # the last graph exists only for SMPL's joints
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
@@ -135,7 +135,7 @@ def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
     An item of a list is reported by the name of the list.
 
     The schema contains types, bounds for numbers and for the number of items, patterns for entire
-    texts, and required keys. Objects may contain keys that are not in the schema.
+    strings, and required keys. Objects may contain keys that are not in the schema.
     """
     kind = schema["type"]
     if not _has_type(value, kind):
@@ -194,7 +194,7 @@ def check(content: Any) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Returns the content of a regular file with at most `most` bytes; otherwise raises `ValueError` or `OSError`."""
+    """Returns the content of a regular file with at most `most` bytes. Otherwise raises `ValueError` or `OSError`."""
     if path.exists() and not path.is_file():
         raise ValueError(f"{path.name} is a folder, a pipe or a device")
     with path.open("rb") as file:
@@ -213,7 +213,7 @@ def first_line(error: Exception) -> str:
 class Sampler:
     """A model in a folder: `content` of `model.json`, and sessions of onnxruntime.
 
-    `poses` is None except for SMPL.
+    `poses` is None unless the model generates SMPL's joints.
     """
 
     def __init__(self, folder: str | Path, threads: int = 1):
@@ -322,7 +322,7 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Returns normalized features (F, D) of frames that are sampled together; `number` seeds the noise."""
+        """Returns normalized features (F, D) of frames that are sampled together. `number` seeds the noise."""
         content = self.content
         x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
@@ -342,16 +342,16 @@ class Sampler:
         return x
 
     def decode(self, x: np.ndarray) -> np.ndarray:
-        """Converts normalized features (F, D) to joints (F, J, 3) in meters, y up."""
+        """Converts normalized features (F, D) to joint positions (F, J, 3) in meters, y up."""
         shape = (1, len(x), len(self.content["skeleton"]["joints"]), 3)
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the offsets in the rest pose and the local rotations. Only for SMPL's 22 joints.
+        """Returns the rest-pose offsets and the local rotations. Only defined for SMPL's 22 joints.
 
         The offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
         are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y, z); the quaternion of
-        the root is in the world.
+        the root is in world coordinates.
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")
@@ -513,7 +513,7 @@ def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Writes one motion as .npz with `joints` (F, J, 3) in meters and `fps`."""
+    """Writes one motion as .npz with joint positions `joints` (F, J, 3) in meters, and `fps`."""
     positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
     options = dict(word.split("=", 1) for word in arguments if word not in positional)
     if len(positional) != 3:

@@ -1,4 +1,4 @@
-"""Reads files from `torch.save` after checking their sizes, checksums and keys."""
+"""Reads files written by `torch.save` after checking their sizes, checksums and keys."""
 
 import io
 import pickle
@@ -19,7 +19,7 @@ CODECS = ("latin1", "latin-1")
 
 
 def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file from `torch.save`, without executing code in the file."""
+    """Returns the plain values and tensors in a file written by `torch.save`, without executing code in the file."""
     import torch
 
     check_torch(path)
@@ -29,7 +29,7 @@ def read_torch(path: Path) -> Any:
 
 
 def check_torch(path: Path) -> None:
-    """Checks the sizes and checksums in an archive from `torch.save`, which `torch.load` does not do."""
+    """Checks the sizes and checksums in an archive written by `torch.save`. `torch.load` does not check them."""
     size = regular_file(path)
     if not _is_archive(path):
         return

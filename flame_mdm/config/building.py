@@ -134,7 +134,7 @@ def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **der
 
     Args:
         node: the mapping.
-        offered: additional arguments. Those that the class or function accepts are passed.
+        offered: additional arguments. Only those that the class or function accepts are passed.
         derived: additional arguments, all of which are passed.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
@@ -176,7 +176,7 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def save(config: Config, path: Path, head: str = "") -> None:
-    """Writes the configuration as YAML, atomically, after the comment line `head`."""
+    """Writes the configuration atomically as YAML. If `head` is given, it becomes a comment on the first line."""
     content = OmegaConf.to_yaml(OmegaConf.create(config))
     write_text(path, f"# {head}\n{content}" if head else content)
 

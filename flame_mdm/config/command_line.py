@@ -1,4 +1,4 @@
-"""Command lines, with one dataclass per command that declares its keys, and signals, errors and exit codes."""
+"""Command lines, whose keys are declared by one dataclass per command, and their signals, errors and exit codes."""
 
 import os
 import re
@@ -29,7 +29,7 @@ it takes all remaining words. `SWEEPS` is True if the command accepts --multirun
 as `data.source.path`, and the keys and options in `COMPOSED`.
 """
 
-STOP = (signal.SIGINT, signal.SIGTERM)  # signals after which a command cleans up and ends
+STOP = (signal.SIGINT, signal.SIGTERM)  # signals after which a command cleans up and exits
 
 TEXT = ("str", "str | None")  # annotations of keys that take any text
 
@@ -52,7 +52,7 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns settings as `read_settings` does, after the checks that their fields declare."""
+    """Returns the settings from `read_settings` after running the checks that their fields declare."""
     settings = read_settings(kind, words)
     for entry in fields(kind):  # type: ignore[arg-type]
         value, check = getattr(settings, entry.name), entry.metadata.get("check")
@@ -64,8 +64,8 @@ def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     """Reads the settings of a command from its words.
 
-    Text is taken literally, lists of texts are split as in a shell, and other values follow Hydra's
-    grammar.
+    Text is taken literally, lists of strings are split as in a shell, and other values follow
+    Hydra's grammar.
     """
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
@@ -222,7 +222,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code.
 
     A signal in `signums` ends the action after it has cleaned up. An error that the user can fix is
-    printed as one line, and 1 is returned. FLAME_MDM_TRACEBACK=1 prints the traceback first. Any
+    printed on one line, and 1 is returned. FLAME_MDM_TRACEBACK=1 prints the traceback first. Any
     other exception is a bug: the traceback is printed with a request to report it, and `BUG` is
     returned.
     """
@@ -254,7 +254,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 
 
 def explanation(error: Exception) -> str | None:
-    """Returns the line for an error that the user can fix; None for a bug.
+    """Returns the line for an error that the user can fix, or None for a bug.
 
     The user can fix a `UserError`, a file error, and a lack of memory.
     """

@@ -85,10 +85,10 @@ class ConfigSource(NamedTuple):
 def prepare_overrides(
     recipe: ConfigSource, overrides: Sequence[str], first: Sequence[str] = ()
 ) -> tuple[list[str], Config]:
-    """Checks the overrides (not those in `first`) and prepares them for Hydra.
+    """Checks the overrides (except those in `first`) and prepares them for Hydra.
 
     Keys that the recipe lacks but a `_target_` accepts get the prefix `++`. Also returns the recipe
-    with its groups chosen, before individual keys are overridden; {} without overrides.
+    with its groups chosen, before individual keys are overridden, or {} if there are no overrides.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -202,14 +202,14 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
                 )
         if group == LAUNCH and source_file("submitit") is None:
             raise UserError(
-                f'{override.input_line} needs hydra-submitit-launcher. Run pip install "flame-mdm[slurm]"'
+                f'{override.input_line} requires hydra-submitit-launcher. Run pip install "flame-mdm[slurm]"'
             )
 
 
 def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
     """Composes a configuration with prepared overrides.
 
-    If `base` is given, the values must have the types of the values in `base`.
+    If `base` is given, the values must have the same types as the values in `base`.
     """
     config = compose_unchecked(source, overrides)
     if base is not None:

@@ -32,8 +32,8 @@ The results of each job are written to the same place as without a launcher.
 def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
     """Runs a command line `[OBJECT [OUT]] key=value ... [--multirun]` and returns the exit code.
 
-    With `--multirun`, values separated by commas are a sweep: one job per combination, one after
-    the other. `launch=...` passes the jobs of a sweep, or a single job, to a launcher, and waits
+    With `--multirun`, values separated by commas define a sweep with one job per combination. The
+    jobs run one after the other. `launch=...` passes the jobs of a sweep, or a single job, to a launcher, and waits
     for them. Values of keys that accept any text, such as paths, are never split.
     """
     words = make_variables() if "--from-make" in argv else list(argv)

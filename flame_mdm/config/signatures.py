@@ -131,7 +131,7 @@ def _alternatives(annotation: ast.expr) -> list[ast.expr]:
 
 
 def _mismatch(value: Any, kind: ast.expr) -> str:
-    """Returns the requirement of an annotation without unions; "" if the value meets the requirement."""
+    """Returns the requirement of an annotation without unions, or "" if the value meets the requirement."""
     name = _name(kind)
     if name in KINDS:
         types, description = KINDS[name]
@@ -174,7 +174,7 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
 def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
     """Returns the requirement of a tuple's annotation, such as `tuple[float, float]`.
 
-    "" = the items meet the requirement.
+    Returns "" if the items meet the requirement.
     """
     if isinstance(kinds[-1], ast.Constant) and kinds[-1].value is ...:
         kinds = [kinds[0]] * len(items)
@@ -317,7 +317,7 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_file(module: str) -> Path | None:
-    """Returns the source file of a module; None if there is no file, or if the name is not a module's name."""
+    """Returns the source file of a module, or None if there is no file or the name is not a module name."""
     # A name with a slash could refer to any file
     if not all(part.isidentifier() for part in module.split(".")):
         return None

@@ -1,4 +1,4 @@
-"""The command line of `train`, which Hydra composes, with sweeps and jobs of Hydra's launchers."""
+"""The command line of `train`: recipes composed by Hydra, sweeps, and jobs of Hydra's launchers."""
 
 import shutil
 import sys
@@ -137,7 +137,7 @@ def hydra_sweep(
         job: function that receives the composed configuration of each job.
         folder: folder of the configuration.
         stem: name of the configuration file without suffix; None = an empty configuration.
-        words: overrides, some of which have several values.
+        words: Hydra overrides, which may list several values to sweep over.
     """
     sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]
     GlobalHydra.instance().clear()
@@ -172,6 +172,6 @@ def _check_whole(config: Config, name: str) -> None:
     for key in LATE:
         value = config["trainer"].get(key)
         if isinstance(value, int | float) and value <= 0:
-            raise UserError(f"trainer.{key}={value}: must be above 0")
+            raise UserError(f"trainer.{key}={value}: must be greater than 0")
     if isinstance(config["seed"], int) and not 0 <= config["seed"] < 2**32:
-        raise UserError(f"seed={config['seed']}: must be from 0 to {2**32 - 1}")
+        raise UserError(f"seed={config['seed']}: must be between 0 and {2**32 - 1}")

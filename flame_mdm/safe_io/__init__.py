@@ -46,7 +46,7 @@ Recipes, skeletons, protocols and table specs are far smaller.
 YAML_NODES = 100_000
 YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
-"""Total size that the arrays in a compressed file may always have.
+"""Total size that is always permitted for the arrays in a compressed file.
 
 Beyond this size, arrays may have at most `INFLATION` times the size of the file. Motion data is
 compressed by a factor of less than 10.
@@ -219,11 +219,11 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
     """Holds a lock file that names the process and the host.
 
     Yields the name of a dead process that left the file behind, or "". If another process holds the
-    lock, `busy` is called with the name of the process that holds it. `busy` either raises an error,
-    or returns to wait. `advice` is part of the warning for file systems without locks. The operating
-    system releases the lock when the process ends for any reason. The lock is a POSIX record lock,
-    which also works between hosts on NFS and Lustre, unlike the locks of `filelock`. Windows has no
-    such locks.
+    lock, `busy` is called with the name of that process. `busy` either raises an error or returns.
+    If it returns, this function waits for the lock. `advice` is part of the warning for file
+    systems without locks. The operating system releases the lock when the process ends for any
+    reason. The lock is a POSIX record lock, which also works between hosts on NFS and Lustre,
+    unlike the locks of `filelock`. Windows has no such locks.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:
@@ -299,7 +299,7 @@ def _begins(path: str | Path, content: bytes) -> bool:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns the content of a UTF-8 text file of at most `limit` bytes; otherwise raises `UserError`."""
+    """Returns the content of a UTF-8 text file of at most `limit` bytes. Raises `UserError` for other files."""
     regular_file(path, limit)
     with (
         naming(path, UnicodeDecodeError, prefix="not a UTF-8 text file: "),
@@ -315,7 +315,7 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON text. Raises `ValueError` for content that `read_json` rejects."""
+    """Returns the content of a JSON string. Raises `ValueError` for content that `read_json` rejects."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
@@ -361,7 +361,7 @@ def read_package_yaml(path: Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of nodes of a YAML file after expanding its aliases; infinite for cycles."""
+    """Returns the number of nodes of a YAML file after expanding its aliases, or infinity for cycles."""
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
@@ -514,7 +514,7 @@ class _DirectoryReader:
 def check_member(member: zipfile.ZipInfo) -> None:
     """Refuses members of a zip archive that are not deflated.
 
-    `zipfile` limits the unpacked bytes of deflated members only.
+    `zipfile` limits the number of unpacked bytes only for deflated members.
     """
     if member.flag_bits & 1 or member.compress_type not in (
         zipfile.ZIP_STORED,

@@ -54,7 +54,7 @@ OF_BASE = (
 
 
 class AdaptationTask(GeneratorTask):
-    """Continues to train a model on the user's few clips and on clips from its own training data."""
+    """Continues training a model on a few clips of the user and on clips from its own training data."""
 
     def pretrain(self) -> None:
         """Does nothing, because the text encoder is already trained."""
@@ -99,7 +99,7 @@ def adapt(
         action: whether the clips show an action that the model does not know, instead of a style.
         full: whether to train all weights. The result is then a model file instead of an adapter.
         force: whether to accept clips that drift upward or float.
-        rank: rank of the changes to the weights, 1 or more. Increase it for motions that are very
+        rank: rank of the low-rank updates of the weights, 1 or more. Increase it for motions that are very
             different from the model's training data.
         data_root: folder of the prepared data sets. If it lacks the base model's data set, 300 motions are sampled
             from the base model instead.
@@ -216,7 +216,7 @@ def _recipe(
     config["run"]["name"] = config["data"]["name"] = name
 
     # Crop, kind of motion and learning rate are taken from the base model. A released model has no
-    # data, so its crops are as long as its longest motion, in units of 4 frames.
+    # data, so its crops are as long as its longest motion, rounded down to a multiple of 4 frames.
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
@@ -259,7 +259,7 @@ def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str
 
 
 class _Samples(MotionSource):
-    """A data set of `SAMPLED` motions that a model generates; a tenth is for validation."""
+    """A data set of `SAMPLED` motions that a model generates. A tenth of them are for validation."""
 
     name, workers = "prior", 1
 

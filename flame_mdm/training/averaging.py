@@ -19,7 +19,7 @@ class MovingAverage(WeightAveraging):
     for the device on CUDA. Buffers are not averaged.
 
     Args:
-        decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
+        decay: factor from 0 to 1 in average = decay * average + (1 - decay) * weights.
         update_every_n_steps: the average is updated at multiples of this number of steps.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
             them. The first update always copies them.

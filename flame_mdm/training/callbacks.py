@@ -82,7 +82,7 @@ class Checkpoints(Checkpoint):
         self.step = -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Starts to record signals, so that they do not end the process."""
+        """Starts recording signals, so that they do not end the process."""
         self.step = trainer.global_step
         self.stop.install()
 
@@ -119,7 +119,7 @@ class Checkpoints(Checkpoint):
 
 
 class Measurements(Callback):
-    """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`.
+    """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps` steps.
 
     The values that the task reports are logged at the same steps. Other steps are not slowed down.
     The norm of all gradients is measured before clipping. Seconds per step do not include validation.
@@ -147,7 +147,7 @@ class Measurements(Callback):
         self.first = trainer.global_step
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restarts the clock that measures the speed, which does not include validation."""
+        """Restarts the speed clock, so that validation time is not counted."""
         self.since, self.first = time.perf_counter(), trainer.global_step
 
     def on_save_checkpoint(
@@ -256,7 +256,7 @@ class Report(Callback):
 
 
 def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
-    """Returns the name of the package's extractor for a model's motions; "" if there is no such extractor."""
+    """Returns the name of the package's extractor for a model's motions, or "" if there is no such extractor."""
     name = f"motion_clip_{facts.get('dataset')}"
     if name not in SHIPPED or "captions" not in facts:
         return ""
@@ -265,7 +265,7 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics with their docstrings, and values for generated and real motions."""
+    """Returns lines that explain metrics with their docstrings, and show values for generated and real motions."""
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -413,7 +413,7 @@ class SampleMotions(Callback):
             )
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Samples a share of the motions on each rank; rank 0 measures, writes and logs them."""
+        """Samples a share of the motions on each rank. Rank 0 measures, writes and logs all motions."""
         assert isinstance(pl_module, GeneratorTask)
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
@@ -465,7 +465,7 @@ class SampleMotions(Callback):
         return sample(model, resolve(request, model, check_words=False))
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
-        """Computes all metrics of up to `REAL` training clips with the attributes that all prompts request."""
+        """Computes all metrics for up to `REAL` training clips with the attributes that all prompts request."""
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
         common, all_names = (

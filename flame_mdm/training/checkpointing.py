@@ -74,7 +74,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
     ) -> None:
         """Writes a checkpoint. Raises `UserError` if it cannot be written.
 
-        Earlier checkpoints remain.
+        Earlier checkpoints are kept.
         """
         path = Path(path)
         check_within(path.parent, self.folder.parent)

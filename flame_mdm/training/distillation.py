@@ -1,5 +1,5 @@
 # pyright: standard
-"""Training of models that sample in one to four steps, from a teacher that takes more steps."""
+"""Trains models that sample in one to four steps, with the help of a teacher that takes more steps."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -128,7 +128,7 @@ class DistillationTask(GeneratorTask):
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`.
 
-        Validation, which passes `u`, uses the grid of times that training uses at its end.
+        Validation, which passes `u`, uses the grid of times with which training ends.
         """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None

@@ -46,7 +46,8 @@ def fit(folder: Path, config: Config) -> None:
     step = resumed.step if resumed else 0
     if 0 <= config["trainer"]["max_steps"] <= step:
         say(
-            f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new run: run.name=..."
+            f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new "
+            "run with run.name=..."
         )
         return
     seed_everything(config["seed"], verbose=False)

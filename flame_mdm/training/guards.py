@@ -59,8 +59,8 @@ class BadLoss(Callback):
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
-        # Copying a loss from the GPU waits for the step. Therefore, losses stay on the device and
-        # are copied together, at the log interval and before a checkpoint.
+        # Copying a loss from the GPU waits until the step is finished. Therefore, losses stay on
+        # the device and are copied together, at the log interval and before a checkpoint.
         self.path, self.factor = Path(folder) / "bad_batch.json", factor
         self.usual = float("inf")
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
@@ -82,7 +82,7 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Checks the losses before a checkpoint is written, so that it never contains weights after a bad loss."""
+        """Checks the losses before a checkpoint is written, so that it never contains weights from after a bad loss."""
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
@@ -123,7 +123,7 @@ class BadLoss(Callback):
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns an explanation if an error means that a data loading process died; otherwise None."""
+    """Returns an explanation if an error means that a data loading process died, or None otherwise."""
     # If a worker dies while a checkpoint is written, its error is the cause of another error.
     message = f"{error} {error.__cause__ or ''}"
     lost = re.search(
@@ -140,7 +140,7 @@ def lost_worker(error: BaseException) -> UserError | None:
 
 
 def out_of_memory(error: BaseException, step: int) -> UserError | None:
-    """Returns an explanation if an error means that memory is exhausted; otherwise None."""
+    """Returns an explanation if an error means that memory is exhausted, or None otherwise."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
     return UserError(

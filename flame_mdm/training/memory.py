@@ -1,4 +1,4 @@
-"""Memory that training needs, computed from a recipe without building the network."""
+"""Memory that training requires, computed from a recipe without building the network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ FLOAT = 4
 
 @dataclass(frozen=True)
 class TrainingMemory:
-    """Memory that training needs in float32, in bytes per process.
+    """Memory that training in float32 requires, in bytes per process.
 
     The text encoder and the data are not included. Frozen encoders run before training, and data
     sets that are too large stay on disk.
@@ -34,7 +34,7 @@ class TrainingMemory:
     Attributes:
         parameters: number of weights of the denoiser.
         state: weights, gradients, both states of Adam and, if the recipe averages weights, the
-            average. Independent of the batch size.
+            average. Their size does not depend on the batch size.
         activations: tensors that the backward pass needs, for the longest batch. In bfloat16, they
             take about half of this memory.
         recomputed: `activations` with `task.checkpoint_activations=true`.

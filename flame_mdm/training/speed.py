@@ -10,7 +10,7 @@ from flame_mdm.errors import say
 from flame_mdm.task import GeneratorTask, Task
 
 COMPILED_FROM = 5000
-"""Minimum number of training steps for which the network is compiled.
+"""Minimum number of training steps in runs that compile the network.
 
 In shorter runs, compilation would take more time than it saves.
 """

@@ -198,7 +198,7 @@ class Evaluation:
             if ground_truth:
                 scores.append(self._score(self.evaluator, paired, paired, real, replication))
             if source is not None:
-                # Before motions are generated
+                # Checked before any motion is generated
                 for checked in filter(None, (self.evaluator, self.several)):
                     checked.check(paired)
                 # All replications are kept in memory. Joints are the largest part, and are kept

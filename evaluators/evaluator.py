@@ -92,9 +92,9 @@ class Evaluator:
     metrics: Mapping[str, Config]
     representation: Representation
     batch_size: int = 64
-    # Whether metrics that lack features have no value, instead of raising an error
+    # Whether metrics that lack features are skipped instead of raising an error
     skip_features: bool = False
-    # Training motions, to find copies of them among generated motions. None = not measured.
+    # Training motions, used to find copies of them among generated motions. None = not measured.
     training: TrainingMotions | None = None
 
     @torch.no_grad()

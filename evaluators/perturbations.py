@@ -1,8 +1,8 @@
 # pyright: standard
 """Graded perturbations of real motions for audits: changes that a metric should detect, or ignore.
 
-Each function takes joints (F, J, 3) in meters, y up, and keeps the number of frames unless its
-docstring says otherwise. All random draws come from a generator, so that the grades of a
+Each function takes joint positions (F, J, 3) in meters, y up, and keeps the number of frames unless
+its docstring says otherwise. All random draws come from a generator, so that the grades of a
 perturbation share their draws.
 """
 

@@ -12,7 +12,7 @@ from typing import Any, TextIO
 
 MAX_LINE = 2_000
 """Maximum length of an error line. The middle of longer lines is left out; the project's own messages are shorter."""
-# Bidirectional control characters of Unicode
+# Unicode's bidirectional control characters
 DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 

@@ -114,7 +114,7 @@ class Model:
 
 
 class MotionGenerator(Model, nn.Module):
-    """A denoiser, a process, a condition encoder and a representation, with the code to sample.
+    """A denoiser, a process, a condition encoder and a representation, with the code for sampling.
 
     Args:
         parts: the four parts.

@@ -20,7 +20,7 @@ class Value(Schema):
     # Half width of the 95 % interval over replications, or None for a single replication
     ci: Number | None
     replications: Int | None
-    n: Int | None  # motions per replication; None if replications have different numbers
+    n: Int | None  # motions per replication, or None if the numbers differ
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
     # Number of real motions if the metric compares two sets, or None otherwise

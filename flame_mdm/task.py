@@ -85,7 +85,7 @@ class Task(Model, LightningModule):
         size = encoder.load_cache(*self._captions())
         if device := data.choose_device(size):
             encoder.move_cache(device)
-        # Buffers are equal in all processes. If DDP sent them in each forward pass, a process
+        # Buffers are identical in all processes. If DDP sent them in each forward pass, a process
         # with more validation batches than the others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
         self.add_facts(
@@ -113,7 +113,7 @@ class Task(Model, LightningModule):
         return trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0  # type: ignore[attr-defined]
 
     def report(self, values: Mapping[str, Tensor | float]) -> None:
-        """Keeps values of the current training step by name, if they are logged.
+        """Stores values of the current training step by name if they will be logged.
 
         `Measurements` writes them to the loggers after the step. Lightning's `log` takes as long
         per value as running a small network, and keeps the host busy in all later steps.

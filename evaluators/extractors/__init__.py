@@ -48,8 +48,8 @@ class Extractor(ABC):
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Returns "features" (B, E) of motions; classifiers also return "logits" (B, A).
 
-        Motions are passed as `features` (B, F, D) in the data's units, and as joints (B, F, J, 3)
-        in meters, y up, both with mask (B, F).
+        Motions are passed as `features` (B, F, D) in the data's units, and as joint positions
+        `joints` (B, F, J, 3) in meters, y up, both with mask (B, F).
         """
 
     def texts(
@@ -108,7 +108,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) of features (B, F, D) in the data's units, with mask (B, F)."""
+        """Returns "features" (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return {"features": self.task(features, mask)}
 
 
@@ -226,7 +226,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) of features (B, F, D) in the data's units, with mask (B, F)."""
+        """Returns "features" (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return {"features": self.network(features, mask)}
 
 

@@ -34,18 +34,18 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) in (-1, 1) of joints (B, F, J, 3) in meters, y up, with mask (B, F)."""
+        """Returns features (B, 30) in (-1, 1) of joint positions (B, F, J, 3) in meters, y up, with mask (B, F)."""
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) of joints with y down, relative to the first position of the pelvis."""
+        """Returns features (B, 30) of joint positions, y down, relative to the first position of the pelvis."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
 
     def logits(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns unnormalized log-probabilities (B, actions) of joints (B, F, J, 3) in meters, with mask (B, F)."""
+        """Returns unnormalized log-probabilities (B, actions) for the same input as `forward`."""
         return self.linear2(self(joints, mask, state))
 
     def random_state(self, seeds: Sequence[int]) -> Tensor:

@@ -111,7 +111,7 @@ def info_nce(
 ) -> Tensor:
     """Contrastive loss over the pairs of all ranks: the mean of both cross-entropies.
 
-    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each rank compares its own pairs
+    See Oord et al. 2018, eq. 4. The loss is symmetric, as in Radford et al. 2021. Each rank compares its own pairs
     (B, E) with the motions and texts of all ranks. DDP averages gradients over ranks. If all ranks
     have the same number of pairs, the averages of losses and gradients equal the loss and gradient
     of a single rank with all pairs.

@@ -136,7 +136,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
 
 def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
-    """Returns the mean absolute difference between distances of features (B, E) and `strength` (B,).
+    """Returns the mean absolute difference between the distance of two features (B, E) and `strength` (B,).
 
     Features are scaled to norm 1 before their distance is computed.
     """

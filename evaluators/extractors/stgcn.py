@@ -123,22 +123,22 @@ class Unconstrained(STGCN):
         super().__init__(UNCONSTRAINED_PARENTS, 12, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joints (B, F, 24, 3) in meters, y up. The network reads them with y down."""
+        """Returns features (B, 256) of joint positions (B, F, 24, 3) in meters, y up. The network expects y down."""
         return self.published(
             x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask
         )
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joints (B, F, 15, 3) as in the reference motions.
+        """Returns features (B, 256) of joint positions (B, F, 15, 3) as in the reference motions.
 
-        The joints have y down, and the pelvis has index 8.
+        The y axis points down, and the pelvis has index 8.
         """
         return super().forward(x - x[:, :, 8:9], mask)
 
 
 class JointSTGCN(STGCN):
-    """A trainable classifier for any skeleton. It reads joints relative to the first position of the root."""
+    """A trainable classifier for any skeleton. It reads joint positions relative to the first position of the root."""
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joints (B, F, J, 3) in meters, with mask (B, F)."""
+        """Returns features (B, 256) of joint positions (B, F, J, 3) in meters, with mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)

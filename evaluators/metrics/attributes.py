@@ -160,7 +160,7 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
 def _lowered(
     smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float
 ) -> dict[str, str | int]:
-    """Reads crawling, lying down, sitting down and standing up.
+    """Detects crawling, lying down, sitting down and standing up.
 
     The pelvis is higher than 78 cm if a person is standing, between 35 and 72 cm if a person is
     sitting, and below 35 cm if a person is lying. The trunk of a person who is lying or crawling is
@@ -186,7 +186,7 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Reads walks and runs, which move more than 33 cm from their start and lift both ankles by 4 cm."""
+    """Detects walks and runs, which move more than 33 cm from their start and lift both ankles by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
@@ -209,7 +209,7 @@ def _locomotion(
 
 
 def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, str | int]:
-    """Reads kicks: a foot more than 35 cm in front of the pelvis and more than 25 cm above its standing height."""
+    """Detects kicks: a foot more than 35 cm in front of the pelvis and more than 25 cm above its standing height."""
     out = smooth[:, ANKLES] - smooth[:, [PELVIS]]
     ahead = (out[..., [0, 2]] * forward[:, None]).sum(-1)
     high = smooth[:, ANKLES, 1] - floor - 0.06
@@ -224,7 +224,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads throws, salutes, raised arms, waves, claps and punches, or standing if none of them is found."""
+    """Detects throws, salutes, raised arms, waves, claps and punches, or standing if none of them is found."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -363,7 +363,7 @@ class AttributeAccuracy(Timed, MotionMean):
 
 
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
-    """Reads which side, left or right, a motion from the Bandai set shows.
+    """Determines which side, left or right, a motion from the Bandai set shows.
 
     For walk-turn-left and walk-turn-right, the side is read from the turn of the body; for
     walk-left and walk-right, from the direction of travel. For all other contents, it is the side

@@ -96,14 +96,14 @@ def _raised_hand(view: View) -> int:
 
 
 def _to_head(view: View) -> Shown:
-    """Reads a hand within 27 cm of the head for more than 0.35 seconds."""
+    """Detects a hand within 27 cm of the head for more than 0.35 seconds."""
     away = np.linalg.norm(view.smooth[:, WRISTS] - view.smooth[:, [HEAD]], axis=-1)
     side = int(np.percentile(away, 30, axis=0).argmin())
     return {"side": SIDES[side]} if (away[:, side] < 0.27).sum() > 0.35 * view.fps else {}
 
 
 def _to_front(view: View) -> Shown:
-    """Reads a hand that is more than 15 cm in front of its shoulder for 0.4 seconds.
+    """Detects a hand that is more than 15 cm in front of its shoulder for 0.4 seconds.
 
     The hand must also be higher than the elbow of a hanging arm.
     """
@@ -114,7 +114,7 @@ def _to_front(view: View) -> Shown:
 
 
 def _point(view: View) -> Shown:
-    """Reads an arm that is stretched to 90 % of its length and within 35 degrees of level for 0.4 seconds."""
+    """Detects an arm that is stretched to 90 % of its length and within 35 degrees of level for 0.4 seconds."""
     side = _raised_hand(view)
     shoulder, elbow, wrist = (view.smooth[:, joint[side]] for joint in (SHOULDERS, ELBOWS, WRISTS))
     length = np.median(
@@ -138,7 +138,7 @@ def _knock(view: View) -> Shown:
 
 
 def _slash(view: View) -> Shown:
-    """Reads a hand that moves from 20 cm above to below the shoulder, and 15 cm inward, within 0.5 seconds."""
+    """Detects a hand that moves from 20 cm above to below the shoulder, and 15 cm inward, within 0.5 seconds."""
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
     above = (hand - shoulder)[:, 0, 1]
@@ -152,7 +152,7 @@ def _slash(view: View) -> Shown:
 
 
 def _hop(view: View) -> Shown:
-    """Reads hops on one foot and counts the flights. The other foot is 12 cm higher in half of the frames."""
+    """Detects hops on one foot and counts the flights. The other foot is 12 cm higher in half of the frames."""
     toes = view.smooth[:, TOES, 1] - view.floor
     side = int(toes.mean(0).argmin())
     if (toes[:, 1 - side] - toes[:, side] > 0.12).sum() < 0.4 * view.fps:
@@ -179,25 +179,25 @@ def _push_ups(view: View) -> Shown:
 
 
 def _lean(view: View) -> Shown:
-    """Reads a head that is more than 13 cm to one side of the pelvis."""
+    """Detects a head that is more than 13 cm to one side of the pelvis."""
     aside = view.aside(view.smooth[:, [HEAD]], view.smooth[:, [PELVIS]])[:, 0]
     farthest = aside[np.abs(aside).argmax()]
     return {"direction": "left" if farthest > 0 else "right"} if abs(farthest) > 0.13 else {}
 
 
 def _stretch_sideways(view: View) -> Shown:
-    """Reads a lean with both hands above the head."""
+    """Detects a lean with both hands above the head."""
     high = (view.smooth[:, WRISTS, 1] - view.smooth[:, [HEAD], 1]).min(1).max() > 0
     return _lean(view) if high else {}
 
 
 def _spin(view: View) -> Shown:
-    """Reads a turn of more than 270 degrees."""
+    """Detects a turn of more than 270 degrees."""
     return {"direction": "left" if view.turned > 0 else "right"} if abs(view.turned) > 270 else {}
 
 
 def _dodge(view: View) -> Shown:
-    """Reads a path of more than 25 cm sideways or backward, with one quick movement (above 0.6 m/s)."""
+    """Detects a path of more than 25 cm sideways or backward, with one quick movement (above 0.6 m/s)."""
     path = view.path()
     speed = np.linalg.norm(np.gradient(path, 1 / view.fps, axis=0), axis=-1)
     aside, ahead = path[-3:].mean(0)
@@ -209,7 +209,7 @@ def _dodge(view: View) -> Shown:
 
 
 def _strafe(view: View) -> Shown:
-    """Reads a path of more than 33 cm sideways, at least twice as long as its forward or backward part."""
+    """Detects a path of more than 33 cm sideways, at least twice as long as its forward or backward part."""
     aside, ahead = view.path()[-3:].mean(0)
     if abs(aside) < max(0.33, 2 * abs(ahead)):
         return {}
@@ -217,7 +217,7 @@ def _strafe(view: View) -> Shown:
 
 
 def _limp(view: View) -> Shown:
-    """Reads the leg on which the pelvis sinks while the other foot is in the air, during a walk.
+    """Determines the leg on which the pelvis sinks while the other foot is in the air, during a walk.
 
     The correlation between the height of the pelvis and the difference between the feet's heights
     exceeds 0.35. In an even walk, it is about 0.

@@ -18,7 +18,7 @@ CLOSE = 0.01
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
-    """Returns poses (F, 3J) of joints (F, J, 3), independent of position and heading.
+    """Returns poses (F, 3J) that do not depend on position and heading, from joint positions (F, J, 3).
 
     Joints are relative to the pelvis on the ground, and turned so that the body faces +z in every
     frame.

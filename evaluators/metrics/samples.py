@@ -211,7 +211,7 @@ class SampleMetric(Declared, Metric):
         if wrong := int((sizes != samples).sum()):
             have = f"{wrong} of {len(names)} prompts do not have {samples} motions"
             raise self.error(
-                f"{have} : found {int(sizes.min())} to {int(sizes.max())}. Generate {samples} motions per prompt"
+                f"{have}: found {int(sizes.min())} to {int(sizes.max())}. Generate {samples} motions per prompt"
             )
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 

@@ -27,7 +27,7 @@ from flame_mdm.safe_io import (
 CARD = Path(__file__).with_name("card.md")
 MOTION_LICENSES = Path(__file__).parent.parent / "data" / "licenses.yaml"
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
-"""Files that `push` writes next to the model, each with a text that identifies it as written by `push`.
+"""Files that `push` writes next to the model, each with text that identifies it as written by `push`.
 
 The model card also contains the hash of the model file.
 """

@@ -50,7 +50,7 @@ TINY = 1e-6  # an input of `to_x0` that is so small that the clean estimate is n
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
     """Writes a model as a folder of ONNX graphs that need only numpy and onnxruntime.
 
-    The folder contains `runner.py`, which samples from the graphs. docs/export.md describes the
+    The folder contains `runner.py`, which samples motions with the graphs. docs/export.md describes the
     files.
 
     Args:
@@ -60,7 +60,7 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if a graph's outputs
+        UserError: As in `flame_mdm.load`, and if a part cannot be exported, or if a graph's outputs
             differ from PyTorch's.
     """
     try:

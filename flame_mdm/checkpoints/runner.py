@@ -347,7 +347,7 @@ class Sampler:
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rest-pose offsets and the local rotations. Only defined for SMPL's 22 joints.
+        """Returns the rest-pose offsets and the local rotations. They are only defined for SMPL's 22 joints.
 
         The offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
         are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y, z); the quaternion of

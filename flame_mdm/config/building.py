@@ -52,7 +52,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     """Checks that the content of the untrusted file `where` has only plain values and no interpolations.
 
     Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any
-    environment variable. Only the interpolation `but` is allowed, at the beginning of a text. Raises
+    environment variable. Only the interpolation `but` is allowed, at the start of a string. Raises
     `UserError` if the check fails, or if the content is too large, nested too deeply or contains
     itself.
     """

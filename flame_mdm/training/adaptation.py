@@ -60,7 +60,7 @@ class AdaptationTask(GeneratorTask):
         """Does nothing, because the text encoder is already trained."""
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws the dropped captions, but never drops captions of the user's clips.
+        """Draws which captions are dropped, but never drops captions of the user's clips.
 
         If these clips had the null condition, guidance would lead away from their motions.
         """
@@ -151,7 +151,7 @@ def adapt(
         str(base),
         None if full else _about(model, captions, name, rank, file, action),
     )
-    # With a vocabulary, the model would reject texts with the new words.
+    # With a vocabulary, the model would reject prompts that contain the new words.
     model.facts.pop("vocabulary", None)
     prior = _prior(model, Path(data_root), out / "data", captions)
     config["data"]["source"] |= {"path": str(source), "prior": str(prior)}

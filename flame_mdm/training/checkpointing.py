@@ -127,7 +127,7 @@ def newest(folder: Path) -> Resumed | None:
 def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
     """Raises `UserError` if the saved state of the optimizer and its schedule does not match the recipe.
 
-    PyTorch accepts any values, and would fail only in the first training step.
+    PyTorch accepts any values, and would only fail in the first training step.
     """
     try:
         misfits = list(_misfits(resumed.content, optimizer))

@@ -29,7 +29,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM`
     steps or more.
 
-    On a CPU: bfloat16 if the CPU has instructions for its products, `CheapDropout`, and
+    On a CPU: bfloat16 if the CPU has instructions for bfloat16 products, `CheapDropout`, and
     `attention`, without dropout of the attention weights. Compilation made no difference on CPUs.
 
     If the recipe sets a precision other than 32-true, it is kept.

@@ -153,8 +153,8 @@ class Evaluator:
     def reference(self) -> Rows | None:
         """Returns the features of the extractor's own real motions.
 
-        Returns None for an extractor without such motions. Sets are then compared with the data
-        set.
+        Returns None for an extractor without such motions. Sets are then compared with motions
+        of the data set.
         """
         features = self.extractor and self.extractor.reference()
         if features is None:
@@ -223,7 +223,7 @@ class Evaluator:
         """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap.
 
         Metrics that compare two sets draw from both sets. The draws depend only on `seed` and the
-        numbers of motions, so that the same clips are drawn for two models. The arguments are
+        numbers of motions, so that two models are compared on the same draws. The arguments are
         described in `score`. Returns values (resamples,) by name.
         """
         count, others = len(generated["keys"]), len(real["keys"])

@@ -51,7 +51,7 @@ class Source(Interface):
     """A source of motions for the rows of a protocol."""
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of the rows on every rank. `name` identifies replication and purpose."""
+        """Returns the motions for the rows on every rank. `name` identifies replication and purpose."""
         ...
 
 
@@ -88,7 +88,7 @@ class Generator:
         self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not shown)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of the rows, cached or generated. Raises `UserError` if a motion is not finite."""
+        """Returns the motions for the rows, cached or generated. Raises `UserError` if a motion is not finite."""
         path = self.folder and self.folder / f"{name}.npz"
         if path is not None and shared(path.exists()):
             content = shared(self._read(path, rows) if is_first() else None)
@@ -227,7 +227,7 @@ class SampleFolder:
         return sha256_of_samples(self.files)
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of the rows from one file.
+        """Returns the motions for the rows from one file.
 
         Raises `UserError` if the file lists other clips.
         """
@@ -293,7 +293,7 @@ class Baseline:
         self.make, self.clips, self.condition, self.seed = kinds[kind], clips, condition, seed
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions of the rows; see `Source`."""
+        """Returns the motions for the rows; see `Source`."""
         return Samples(rows, self.make(rows, replication))
 
     def _real(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:

@@ -12,7 +12,7 @@ COMMANDS = {
     "adapt": "teach a trained model the motions in a folder",
     "distill": "train a student model that samples in one to four steps",
     "sample": "generate motions from a checkpoint",
-    "demo": "ask for motions in the browser",
+    "demo": "request motions in the browser",
     "edit": "keep part of a motion and resample the rest",
     "evaluate": "evaluate a checkpoint under a protocol",
     "audit": "audit an evaluator: which perturbations its metrics detect, and at which strength",

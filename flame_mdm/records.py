@@ -79,7 +79,7 @@ class ProtocolVersion(Schema):
 class Data(Schema):
     """The data set of an evaluation or audit.
 
-    `frames` are the limits of the clips' lengths. `excluded` counts excluded clips by reason.
+    `frames` contains the minimum and maximum clip length. `excluded` counts excluded clips by reason.
     """
 
     dataset: str

@@ -192,7 +192,7 @@ def test_padding_and_company_do_not_change_features(roughness, subtests):
             torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
     # The batch is padded beyond the table of lengths.
     clip(torch.zeros(1, 25, 7), length_mask(torch.tensor([20]), 25))
-    with pytest.raises(UserError, match=r"21 frames, but this motion-CLIP takes at most 20"):
+    with pytest.raises(UserError, match=r"21 frames, but this motion-CLIP accepts at most 20"):
         clip(torch.zeros(1, 21, 7), length_mask(torch.tensor([21])))
 
 

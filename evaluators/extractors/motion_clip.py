@@ -84,7 +84,7 @@ class MotionCLIP(nn.Module):
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
             longest = int(lengths.max())
             raise UserError(
-                f"a motion has {longest} frames, but this motion-CLIP takes at most {self.max_frames}"
+                f"a motion has {longest} frames, but this motion-CLIP accepts at most {self.max_frames}"
             )
         x = F.pad(x[..., self.blind_features :], (self.blind_features, 0))
         if self.roughness:

@@ -42,7 +42,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
       captions. Near-miss captions (see `near_misses`) are additional negatives.
     - Motions: half of them have a noisy copy. The strength of its noise is drawn from [0, 1], with
       small values more often. The distance between a motion and its copy, both scaled to norm 1, is
-      trained to be this strength. One half of the copies has white noise on the joints and is
+      trained to equal this strength. One half of the copies has white noise on the joints and is
       encoded again, like motions from files. The other half has noise on normalized features, like
       generated motions.
 

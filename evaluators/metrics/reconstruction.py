@@ -81,7 +81,7 @@ class PositionErrors(MotionMean):
         groups: Tensor | None = None,
         references: Sequence[Tensor] | None = None,
     ) -> None:
-        """Compares B pairs of motions, up to the end of the shorter one.
+        """Compares B pairs of motions, each up to the end of the shorter motion.
 
         Args:
             joints: (B, F, J, 3) generated motions in meters, y up.
@@ -114,7 +114,7 @@ class PositionErrors(MotionMean):
         for motion, real in zip(motions, real_motions, strict=True):
             a, b = self.positions(motion.double()), self.positions(real.double())
             length = min(len(a["root"]), len(b["root"]))
-            self.need(length, 2, "frames of a motion")
+            self.need(length, 2, "frames in a motion")
             errors.append(
                 self.errors(*({part: x[:length] for part, x in side.items()} for side in (a, b)))
             )
@@ -308,7 +308,7 @@ class DisplacementErrors(EditErrors):
         keys: Tensor,
         kept: Tensor | None = None,
     ) -> None:
-        """Compares B pairs of motions, up to the end of the shorter one.
+        """Compares B pairs of motions, each up to the end of the shorter motion.
 
         Args:
             joints: (B, F, J, 3) generated motions in meters.
@@ -361,7 +361,7 @@ class KeptDrift(EditErrors):
         keys: Tensor,
         kept: Tensor,
     ) -> None:
-        """Compares B pairs of motions, up to the end of the shorter one.
+        """Compares B pairs of motions, each up to the end of the shorter motion.
 
         Args:
             joints: (B, F, J, 3) edited motions in meters.

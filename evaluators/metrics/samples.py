@@ -62,7 +62,7 @@ class Declared:
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
         """Returns, by name, the metric's readings of motions, which do not depend on the conditions.
 
-        Each reading is an array with N rows. Metrics of features need no readings.
+        Each reading is an array with N rows. Metrics computed from features need no readings.
         """
         return {}
 

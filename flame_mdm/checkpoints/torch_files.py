@@ -34,7 +34,11 @@ def check_torch(path: Path) -> None:
     if not _is_archive(path):
         return
     damage = naming(
-        path, *ZIP_ERRORS, OSError, ValueError, prefix="damaged, or not a file of torch.save: "
+        path,
+        *ZIP_ERRORS,
+        OSError,
+        ValueError,
+        prefix="damaged, or not a file written by torch.save: ",
     )
     with damage, path.open("rb") as file, opened_zip(file) as archive:
         members = archive.infolist()

@@ -270,7 +270,7 @@ def _signature(target: str) -> dict[str, str]:
         package = module.partition(".")[0]
         missing = package and find_spec(package) is None
         hint = (
-            f". Python finds no {package}: set PYTHONPATH to the folder that contains it"
+            f". Python cannot find {package}: set PYTHONPATH to the folder that contains it"
             if missing
             else ""
         )

@@ -1,7 +1,7 @@
 """Atomic checkpoints, and resuming from them.
 
 A run directory may come from somebody else. Reading a checkpoint does not run code, and does not take
-more memory than the size of the file. Only files in the folder of the checkpoints are removed, even if the state of
+more memory than the size of the file. Only files in the checkpoint folder are removed, even if the state of
 a callback names other files.
 """
 

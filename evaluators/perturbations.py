@@ -42,7 +42,7 @@ def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
 
 
 def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Joints:
-    """Moves each joint along a line in a random direction, as a 1 Hz sine with the given amplitude."""
+    """Moves each joint back and forth in a random direction, as a 1 Hz sine with the given amplitude."""
     along = draws.standard_normal(joints.shape[1:])
     phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
     sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
@@ -111,7 +111,7 @@ def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
 
 
 def crop(joints: Joints, percent: float) -> Joints:
-    """Cuts off the end of the motion, by a percentage of its length. At least three frames remain."""
+    """Cuts a percentage of the frames off the end of the motion. At least three frames remain."""
     return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
 
 

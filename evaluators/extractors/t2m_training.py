@@ -192,7 +192,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
 
     @property
     def learns_words(self) -> bool:
-        """Whether the word vectors are trained, instead of read from a file."""
+        """Whether the word vectors are trained instead of being read from a file."""
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
@@ -200,7 +200,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the word vectors of a checkpoint. Raises `UserError` if a resumed run reads other vectors."""
+        """Restores the word vectors of a checkpoint. Raises `UserError` if a resumed run reads different vectors."""
         if self.learns_words:
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):

@@ -185,7 +185,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
-        """Returns the values of features (N, E), keys (N,) of plain captions and their embeddings (N, C)."""
+        """Returns the values for features (N, E), keys (N,) of plain captions, and caption embeddings (N, C)."""
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -282,7 +282,7 @@ class TMRRetrieval(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
-        """Returns the values of features (N, E), keys (N,) of plain captions and their embeddings (N, C)."""
+        """Returns the values for features (N, E), keys (N,) of plain captions, and caption embeddings (N, C)."""
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
         same = (caption_keys[None] == caption_keys[:, None]) | (meaning @ meaning.T > SAME)
         values = {

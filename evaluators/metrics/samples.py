@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class for metrics: properties of values, and values for individual samples and resamples.
+    """Base class that declares properties of a metric's values, and values for individual samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.

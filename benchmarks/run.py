@@ -142,7 +142,9 @@ def chosen(only: str, settings: Settings) -> list[str]:
     names: list[str] = only.split(",") if only else list(usual)
     unknown = [name for name in names if name not in possible]
     if unknown:
-        raise SystemExit(f"ONLY={','.join(unknown)}: no such section. Use {', '.join(possible)}")
+        raise SystemExit(
+            f"ONLY={','.join(unknown)}: no such section. Use one of {', '.join(possible)}"
+        )
     if "quality" in names and not settings.runs:
         raise SystemExit(
             "ONLY=quality: requires RUNS=..., a folder with trained and evaluated runs"

@@ -1,6 +1,6 @@
 """Times training steps in both speeds: `python benchmarks/steps.py`.
 
-The full-size step is a step of humanml3d/mdm with lengths as in HumanML3D. It is compared with the
+The full-size step trains humanml3d/mdm with lengths as in HumanML3D. It is compared with the
 authors' step, from a clone of their code, and with a plain PyTorch loop, which trains an
 `nn.TransformerEncoder` of the same size. Both receive the same clips, padded to 196 frames as in the
 published code. Further tables contain a step of every network in its CPU size and, on the CPU, the
@@ -172,7 +172,10 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
         table.append(row | {"frames per second": real / taken})
 
     padded = statistics.mean(padded_length(int(lengths.max()), 1, LONGEST) for lengths in drawn)
-    text = f"{rows} clips of {real / rows:.0f} frames on average, padded to {padded:.0f} by the framework"
+    text = (
+        f"{rows} clips that average {real / rows:.0f} frames and are padded to {padded:.0f} by the "
+        "framework"
+    )
     return table, text
 
 
@@ -268,7 +271,7 @@ def measure(settings: Settings) -> Section:
     )
     return section(
         "Training steps",
-        f"""The full-size step is a step of `humanml3d/mdm` (8 layers of width 512, dropout 0.1) on {batches}. Lengths
+        f"""The full-size step trains `humanml3d/mdm` (8 layers of width 512, dropout 0.1) on {batches}. Lengths
         are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
         the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
         padded to 196 frames as in the published code, in float32. All implementations alternate on each of {BATCHES}

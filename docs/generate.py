@@ -126,12 +126,11 @@ sentence-BERT), the checkpoint is our choice.
             key: [_cell(ours.get(key), published[name].get(key)) for name, ours in columns.items()]
             for key in rows
         }
-        equal = [key for key in rows if all(cell.startswith("**") for cell in cells[key])]
-        shared = (
-            HYPERPARAMETERS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1)
-            for key in equal
-        )
-        page += f"\n## {title}\n\n" + f"As in the paper: {'; '.join(shared)}.\n" * bool(equal)
+        equal = [
+            key for key in rows if len(set(cells[key])) == 1 and cells[key][0].startswith("**")
+        ]
+        shared = (f"{HYPERPARAMETERS[key]} {cells[key][0]}" for key in equal)
+        page += f"\n## {title}\n" + f"\nAs in the paper: {'; '.join(shared)}.\n" * bool(equal)
         if equal != rows:
             page += f"\n| | {' | '.join(f'`{name}`' for name in columns)} |\n|---|{'---|' * len(columns)}\n"
         page += "".join(

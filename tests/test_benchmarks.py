@@ -80,7 +80,7 @@ def test_all_sections_are_measured_unless_only_some_are_named(page):
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("only=host,none", "ONLY=none: no such section. Use steps, host, "),
+        ("only=host,none", "ONLY=none: no such section. Use one of steps, host, "),
         ("device=tpu", "DEVICE=tpu: unknown device. Use cpu"),
         ("only=quality", "ONLY=quality: requires RUNS="),
         ("mdm_repo=/none", "MDM_REPO=/none: contains no model/mdm.py. Use the path of a clone"),

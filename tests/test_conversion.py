@@ -113,7 +113,7 @@ def test_models_of_kit_take_files_of_22_joints(
 def test_a_skeleton_without_rotations_is_refused():
     motion = Motion(np.random.default_rng(0).normal(size=(9, 21, 3)), 20, KIT21)
     with pytest.raises(
-        UserError, match="needs rotations of SMPL's joints, but kit21 does not determine them"
+        UserError, match="needs rotations of SMPL's joints, but these cannot be derived from kit21"
     ):
         raw_motion(motion, SMPL())
     assert torch.is_tensor(raw_motion(motion, Rifke()).values)

@@ -281,7 +281,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
         (
             diffusion,
             suffix | {"method": "repaint"},
-            "method=repaint is unknown. Use mdm, flame, flame_code",
+            "method=repaint is unknown. Use one of mdm, flame, flame_code",
         ),
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion. Omit seconds"),
@@ -352,7 +352,8 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, su
                 read_motion(diffusion.representation, path, data_root=store, **options)
     np.savez(file, joints=joints[:, :21], fps=20)
     with one_line_error(
-        r"motion.npz: the model needs rotations of SMPL's joints, but kit21 does not determine them"
+        r"motion.npz: the model needs rotations of SMPL's joints, but these cannot be derived "
+        "from kit21"
     ):
         read_motion(SMPL(), file)
 

@@ -234,7 +234,7 @@ BAD = {
     ),
     "split": (
         lambda f: write_table(f, [{"id": "one", "split": "dev"}]),
-        "line 2: unknown split 'dev'. Use train, val",
+        "line 2: unknown split 'dev'. Use one of train, val",
     ),
     "columns": (
         lambda f: write_table(f, [{"id": "one", "name": "a"}]),
@@ -254,7 +254,7 @@ BAD = {
     ),
     "yaml key": (
         lambda f: skeleton(f, rate=30),
-        r"skeleton\.yaml: rate: Extra inputs are .* Use map, joints",
+        r"skeleton\.yaml: rate: Extra inputs are .* The keys are map, joints",
     ),
     "yaml map": (
         lambda f: skeleton(f, map={"pelvis": "Hips"}),

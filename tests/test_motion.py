@@ -122,7 +122,7 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
             np.testing.assert_array_equal(result.joints, expected.joints)
             assert result.feature_error == 0
     cases: list[tuple[Any, Any, str]] = [
-        (joints, None, "an array has no frame rate. Set it, for example with fps=20"),
+        (joints, None, "an array has no frame rate. Pass one, for example fps=20"),
         (joints, "fast", "fps is fast, not a number of frames per second"),
         (
             joints[:, :13],
@@ -134,7 +134,8 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
         (
             joints[:, :21],
             30,
-            r"^motion: it has shape \(.*, 21, 3\), but humanml-clean-smpl22 takes \(frames, 22, 3\)",
+            r"^motion: expected shape \(frames, 22, 3\) for humanml-clean-smpl22, but found "
+            r"\(.*, 21, 3\)",
         ),
         (
             joints * 100,

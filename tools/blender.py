@@ -55,7 +55,8 @@ def build(model: str, out: Path, target: str) -> None:
     """
     if target not in PLATFORMS:
         raise UserError(
-            f"PLATFORM={target}: unknown.{did_you_mean(target, PLATFORMS)} Use {', '.join(PLATFORMS)}"
+            f"PLATFORM={target}: unknown.{did_you_mean(target, PLATFORMS)} Use one "
+            f"of {', '.join(PLATFORMS)}"
         )
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -91,7 +91,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str]:
-    """Returns the figures for both halves of the recordings, each judged with the other half's thresholds."""
+    """Returns a table for both halves of the recordings, judged with each other's thresholds."""
     lines = [
         "",
         "This table covers both halves of the recordings, each judged with thresholds from the other half:",
@@ -116,7 +116,7 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
 
 
 def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the figures for constructed claims about durations, the start and the end."""
+    """Returns a table for constructed claims about durations, the start and the end."""
     lines = [
         "",
         "Captions hardly ever state a duration, a start or an end, so these claims were constructed instead. If the",

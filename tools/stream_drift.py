@@ -91,7 +91,7 @@ def main(model: str | None) -> None:
 
 
 def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
-    """Returns all figures for a model."""
+    """Returns all measurements of a model."""
     fps = model.representation.fps
     requests = [texts(number) for number in range(STREAMS)]
     joints, seams = streamed(model, requests)
@@ -129,7 +129,7 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
 
 
 def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
-    """Returns figures for every ten seconds of streams (B, F, 22, 3)."""
+    """Returns measurements for every ten seconds of streams (B, F, 22, 3)."""
     length = round(SECONDS_PER_TEXT * fps)
     parts = [joints[:, begin : begin + length] for begin in range(0, joints.shape[1], length)]
     return {
@@ -219,7 +219,7 @@ def seams_of(joints: np.ndarray, seams: np.ndarray) -> dict[str, float]:
 def in_period(
     joints: np.ndarray, fps: float, extractor: MotionCLIPExtractor, real: torch.Tensor
 ) -> dict[str, float]:
-    """Returns the figures for one period, over all streams."""
+    """Returns the measurements for one period, over all streams."""
     length = round(WINDOW * fps)
     windows = joints.reshape(-1, length, *joints.shape[2:])
     return {

@@ -345,7 +345,10 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
 
 
 class UnconstrainedExtractor(ClassifierExtractor):
-    """The classifier for unconstrained HumanAct12 synthesis and its reference motions, from a folder with two files."""
+    """Classifier and reference motions for unconstrained HumanAct12 synthesis.
+
+    They are loaded from a folder with two files.
+    """
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
 

@@ -269,10 +269,12 @@ def import_released(
     """
     file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):
-        needs = "takes no" if args else "needs an"
-        raise UserError(
-            f"{kind} {needs} options file: MDM's args.json, or MFM's .hydra/config.yaml"
+        needs = (
+            "takes no options file. Omit it"
+            if args
+            else "needs an options file, such as MDM's args.json or MFM's .hydra/config.yaml"
         )
+        raise UserError(f"{kind} {needs}")
     options = read_options(args, {} if num_heads is None else {"num_heads": num_heads})
     advice = "Add run_code=true if you trust the authors of the file"
     checkpoint = theirs.read_released(file, run_code=run_code, advice=advice)

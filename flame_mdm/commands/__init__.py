@@ -363,8 +363,8 @@ class DataSettings:
         if self.data is None:
             names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
             raise UserError(
-                f"no data set was given. Add data=NAME, where NAME is one of: {names}. Use folder for "
-                "your own motions"
+                f"no data set was given. Add data=NAME, where NAME is one of: {names}. For your "
+                "own motions, use data=folder"
             )
         chosen = [f"representation={self.representation}"] if self.representation else []
         return compose_data(

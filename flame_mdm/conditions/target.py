@@ -80,7 +80,8 @@ class TargetConditions:
         if unknown or not choices:
             advice = did_you_mean(unknown[0], SLOTS) if unknown else ""
             raise UserError(
-                f"task.targets.choices={list(choices)}:{advice} Use sets of {', '.join(SLOTS)}"
+                f"task.targets.choices={list(choices)}: unknown or missing names.{advice} "
+                f"Each choice must be a set of these names: {', '.join(SLOTS)}"
             )
         if not 0 <= drop_prob <= 1:
             raise UserError(

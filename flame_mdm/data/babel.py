@@ -182,7 +182,10 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the used fields of a label. Raises `TypeError` if a field has the wrong type."""
+    """Returns the fields of a label that are used.
+
+    Raises `TypeError` if a field has the wrong type.
+    """
     text, kinds, times = label["proc_label"], label["act_cat"], (label["start_t"], label["end_t"])
     are_texts = all(isinstance(value, str | None) for value in (text, *(kinds or ())))
     if not are_texts or not all(time is None or -1e6 < time < 1e6 for time in times):

@@ -49,7 +49,7 @@ def known_split(split: str) -> Split:
     for name in SPLITS:
         if split == name:
             return name
-    raise UserError(f"unknown split {split!r}. Use {', '.join(SPLITS)}")
+    raise UserError(f"unknown split {split!r}. Use one of {', '.join(SPLITS)}")
 
 
 def drawn_splits(

@@ -116,7 +116,8 @@ def read_unconstrained(path: Path) -> np.ndarray:
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
         raise UserError(
-            f"{path}: it has shape {data.shape}, not (motions, 15 or more joints, 3, frames)"
+            f"{path}: expected shape (motions, 15 or more joints, 3, frames), but found "
+            f"{data.shape}"
         )
     return np.ascontiguousarray(data[:, :15].transpose(0, 3, 1, 2), np.float32)
 

@@ -270,8 +270,8 @@ def _read_joints(path: Path) -> np.ndarray:
         or joints.shape[2] != 3
     ):
         raise UserError(
-            f"{path}: it has shape {joints.shape} and type {joints.dtype}. Expected numbers of "
-            "shape (frames, 22 or more joints, 3)"
+            f"{path}: expected numbers of shape (frames, 22 or more joints, 3), but found shape "
+            f"{joints.shape} and type {joints.dtype}"
         )
     return joints[:, :22]
 

@@ -251,8 +251,8 @@ class T2MFolder(MotionSource):
         array = read_npy(required(path, self.get_it), mmap=mmap)
         if array.ndim != dimensions or array.dtype.kind not in "fiu":
             raise UserError(
-                f"{path}: it has shape {array.shape} and type {array.dtype}. Expected an array of "
-                f"numbers with {dimensions} dimensions"
+                f"{path}: expected an array of numbers with {dimensions} dimensions, but found "
+                f"shape {array.shape} and type {array.dtype}"
             )
         return array
 

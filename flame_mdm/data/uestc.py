@@ -51,7 +51,7 @@ class Video(NamedTuple):
 
 
 class UESTC(MotionSource):
-    """The clips of `vibe_cache_refined.pkl` in front view, as raw SMPL motions.
+    """The clips of `vibe_cache_refined.pkl` as raw SMPL motions, rotated to the front view.
 
     As in the published data set, training clips of fewer than 45 frames are left out, and all test
     clips are kept. The published split trains on all 51 training subjects. The project's own split

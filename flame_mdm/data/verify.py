@@ -124,9 +124,9 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns figures for the store and for its raw data.
+    """Returns the numbers for the store and its raw data, next to the published ones.
 
-    If a figure exists for both, the figure of the raw data is returned.
+    If a number exists for both, the number of the raw data is returned.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}

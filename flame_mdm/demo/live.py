@@ -130,7 +130,8 @@ class LiveStreams:
         """
         if ending not in ENDINGS:
             raise UserError(
-                f"{ending[:20]}: a stream cannot be saved in this format. Use {', '.join(ENDINGS)}"
+                f"{ending[:20]}: a stream cannot be saved in this format. Use one "
+                f"of {', '.join(ENDINGS)}"
             )
         with self._working:
             live = self._running(name)

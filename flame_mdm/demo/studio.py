@@ -171,7 +171,8 @@ class Studio:
         """
         if extension not in FORMATS:
             raise UserError(
-                f"{one_line(extension[:20])}: this page does not offer this format. Use {', '.join(FORMATS)}"
+                f"{one_line(extension[:20])}: this page does not offer this format. Use "
+                f"one of {', '.join(FORMATS)}"
             )
         motions = None
         if model := self._models.get(request.model):

@@ -1,4 +1,4 @@
-"""The page of the demo: form, player, edits, downloads and links.
+"""The demo page: form, player, edits, downloads and links.
 
 `page.js` writes the links, and the server reads and answers them.
 """

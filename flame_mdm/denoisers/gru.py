@@ -9,7 +9,9 @@ from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
 
 
 class MDMGRU(Denoiser):
-    """GRU over the frames. Time + condition is concatenated to each frame.
+    """GRU over the frames.
+
+    The sum of the time and condition embeddings is concatenated to each frame.
 
     The network runs forward in time, so padding at the end does not affect real frames.
 

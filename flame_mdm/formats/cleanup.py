@@ -178,8 +178,8 @@ def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) ->
     """Bends limbs whose foot or hand has moved down because bone lengths have changed.
 
     Between two very different poses in a sequence, for example when a crawl changes to a walk, the
-    poses are averages of the two and have short bones. With full lengths, they would reach through
-    the floor.
+    poses are averages of the two and have short bones. With bones of full length, the limbs would
+    go through the floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):

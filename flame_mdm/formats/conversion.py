@@ -96,8 +96,8 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
     """Returns SMPL rotations in coordinates that `axes` (3, 3) converts to y up."""
     if motion.skeleton.joints[: len(SMPL22)] != SMPL22.joints:
         raise UserError(
-            f"the model needs rotations of SMPL's joints, but {motion.skeleton.name} does not determine them. Use a "
-            "motion with SMPL's 22 joints"
+            f"the model needs rotations of SMPL's joints, but these cannot be derived "
+            f"from {motion.skeleton.name}. Use a motion with SMPL's 22 joints"
         )
     note, error = "", 0.0
     if motion.poses is not None:

@@ -106,7 +106,10 @@ def facing(joints: np.ndarray) -> np.ndarray:
 
 
 def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
-    """Adds a root below joints (F, 22, 3). Its path and its direction are smooth."""
+    """Adds a root on the floor below the pelvis of joints (F, 22, 3).
+
+    The path and the direction of the root are smooth.
+    """
     # The root is the pelvis, projected onto the floor and smoothed in time. In an engine, the sway
     # of a walk belongs to the pose, not to the path.
     joints = joints.astype(float)

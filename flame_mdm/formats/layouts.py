@@ -381,7 +381,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
         )
         where = ".".join(map(str, first["loc"]))[:100]
         raise UserError(
-            f"{path}: {where}: {first['msg']}. Use {keys} (docs/own-data.md)"
+            f"{path}: {where}: {first['msg']}. The keys are {keys} (docs/own-data.md)"
         ) from error
     if missing := sorted(set(SMPL22.joints) - set(fields.get("map", SMPL22.joints))):
         raise UserError(f"{path}: the map has no joint for {', '.join(missing)}")

@@ -212,7 +212,7 @@ def from_array(joints: Any, fps: float | None) -> Motion:
     check_numbers("joints", values)
     skeleton = _skeleton(values)
     if fps is None:
-        raise UserError("an array has no frame rate. Set it, for example with fps=20")
+        raise UserError("an array has no frame rate. Pass one, for example fps=20")
     return Motion(values, frame_rate(fps), skeleton)
 
 

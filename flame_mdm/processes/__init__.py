@@ -95,7 +95,7 @@ class Process(nn.Module, ABC):
     def grid(self, count: int) -> list[float]:
         """Returns `count` evenly spaced times from pure noise to one interval before the data.
 
-        If the process has fewer than `count` times, all of them are returned.
+        If the process has fewer time steps than `count`, all of them are returned.
         """
 
     def loss(

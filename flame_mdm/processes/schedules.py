@@ -35,8 +35,9 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns the noise variances (T,) float64 of the linear schedule (Ho et al. 2020, section 4).
 
-    The variances increase from 1e-4 to 0.02 at T = 1000. For other T, they are scaled by 1000 / T,
-    so that the final noise is the same, as in guided-diffusion. All variances are clipped at 0.999.
+    For T = 1000, the variances increase from 1e-4 to 0.02. For other T, they are scaled by 1000 /
+    T, so that the final noise is the same, as in guided-diffusion. All variances are clipped at
+    0.999.
 
     Example:
         >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]

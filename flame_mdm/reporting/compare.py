@@ -54,7 +54,7 @@ class ComparedRun:
 
 
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
-    """Returns two or more runs and folders of motion files.
+    """Returns the runs and the folders of motion files to compare. At least two are required.
 
     The label of a run consists of the recipe and the run name. The label of a folder is its name.
     Identical labels are replaced by paths.

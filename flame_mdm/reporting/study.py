@@ -63,7 +63,7 @@ class Pair(Schema):
 
     @property
     def share(self) -> tuple[float, float, float]:
-        """Share of the votes for a, and the limits of its 95 % interval."""
+        """Share of the votes for run `a`, with the bounds of its 95 % interval."""
         return wilson(self.wins_a, self.votes)
 
 

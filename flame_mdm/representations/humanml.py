@@ -197,11 +197,12 @@ class HumanML(Representation):
             name = f"motion {number}" if len(motions) > 1 else "motion"
             if motion.ndim != 3 or motion.shape[1:] != (joints := len(self.skeleton), 3):
                 raise UserError(
-                    f"{name}: it has shape {tuple(motion.shape)}, but {self.name} takes (frames, {joints}, 3)"
+                    f"{name}: expected shape (frames, {joints}, 3) for {self.name}, but found "
+                    f"{tuple(motion.shape)}"
                 )
             if len(motion) < 3:
                 raise UserError(
-                    f"{name}: it has only {len(motion)} frames, but encoding needs at least 3. Exclude it"
+                    f"{name}: only {len(motion)} frames, but encoding needs at least 3. Exclude it"
                 )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]

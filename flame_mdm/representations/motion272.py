@@ -52,9 +52,7 @@ class Motion272(Representation):
         """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
-            raise UserError(
-                "motion: it has only 1 frame, but encoding needs at least 2. Exclude it"
-            )
+            raise UserError("motion: only 1 frame, but encoding needs at least 2. Exclude it")
         # Z up -> y up
         axes = torch.tensor(
             [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64

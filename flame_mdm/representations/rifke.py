@@ -58,7 +58,8 @@ class Rifke(Representation):
         """
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
             raise UserError(
-                f"motion: it has shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)"
+                f"motion: expected shape (frames, 21, 3) for {self.name}, but found "
+                f"{tuple(motion.shape)}"
             )
         check_finite(motion)
         joints = motion.double() * self.units_per_metre

@@ -287,6 +287,7 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
         if not isinstance(name, str) or name not in indices:
             near = did_you_mean(str(name), indices)
             raise UserError(
-                f"skeleton {skeleton.name} has no joint or part '{name}'.{near} Use {', '.join(indices)}"
+                f"skeleton {skeleton.name} has no joint or part '{name}'.{near} Use one "
+                f"of {', '.join(indices)}"
             )
     return sorted({index for name in chosen for index in indices[name]})

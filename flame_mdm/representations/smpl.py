@@ -47,7 +47,8 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:
         raise UserError(
-            f"motion: it has shape {tuple(motion.shape)}, not (frames, 3 + 3 x joints) with 24, 52 or 55 joints"
+            "motion: expected shape (frames, 3 + 3 x joints) with 24, 52 or 55 joints, but found "
+            f"{tuple(motion.shape)}"
         )
     check_finite(motion)
     motion = motion.double()

@@ -110,7 +110,8 @@ class EditRequest:
             value = getattr(self, name)
             if isinstance(value, str) and value not in choices:
                 raise UserError(
-                    f"{name}={value} is unknown.{did_you_mean(value, choices)} Use {', '.join(choices)}"
+                    f"{name}={value} is unknown.{did_you_mean(value, choices)} Use one "
+                    f"of {', '.join(choices)}"
                 )
         _ = self.ranges  # raises if they are invalid
         if self.joints is not None and not self.joints:

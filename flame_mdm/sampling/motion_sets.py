@@ -101,7 +101,9 @@ def read_set(source: str) -> MotionSet:
         path = SETS / f"{source}.yaml"
     elif path.suffix not in (".yaml", ".yml"):
         near = did_you_mean(source, names)
-        raise UserError(f"set={source}: no such set.{near} Use {', '.join(names)}, or a .yaml file")
+        raise UserError(
+            f"set={source}: no such set.{near} Use a .yaml file or one of {', '.join(names)}"
+        )
     try:
         content = check_shape(read_yaml(path), MotionSet)
     except UserError:
@@ -140,7 +142,8 @@ def changed(content: MotionSet, **values: Any) -> MotionSet:
 def _check_rig(content: MotionSet, name: str) -> None:
     if content.rig is not None and content.rig not in presets():
         raise UserError(
-            f"{name}{content.rig}: unknown.{did_you_mean(content.rig, presets())} Use {', '.join(presets())}"
+            f"{name}{content.rig}: unknown.{did_you_mean(content.rig, presets())} Use one "
+            f"of {', '.join(presets())}"
         )
 
 

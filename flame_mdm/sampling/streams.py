@@ -590,7 +590,7 @@ def read_text(model: MotionGenerator, text: str) -> str:
 def starting_point(
     model: MotionGenerator, start: str | Path | Motion | None
 ) -> tuple[Tensor, Placement | None]:
-    """Returns the normalized frames (1, C, D) that a stream continues, and the next placement.
+    """Returns the normalized frames (1, C, D) that a stream continues from, and the next placement.
 
     Raises:
         UserError: If the model cannot stream, or the motion cannot be read or is too short.

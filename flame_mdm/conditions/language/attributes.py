@@ -49,8 +49,8 @@ class Reader:
     def read(self) -> dict[str, Value]:
         """Returns the attributes that the clause states and that the action can have.
 
-        Afterward, `used` contains the tokens that state such attributes, and `dropped` contains the
-        tokens that state attributes which the action cannot have.
+        Afterward, `used` contains the tokens for these attributes, and `dropped` contains the
+        tokens for attributes that the action cannot have.
         """
         for position, number in enumerate(self.numbers):
             word = self.tokens[number].word

@@ -324,7 +324,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, su
         (
             {"joints": joints[:, :21], "fps": 20},
             {},
-            r"motion\.npz.* shape \(9, 21, 3\), but humanml-clean-smpl22",
+            r"motion\.npz.* for humanml-clean-smpl22, but found \(9, 21, 3\)",
         ),
         (
             {"joints": joints[..., 0], "fps": 20},

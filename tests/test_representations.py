@@ -298,7 +298,7 @@ def test_bad_motions_and_options(subtests):
     bent, raw = torch.zeros(5, 22, 3), torch.zeros(4, 75)
     for representation, motion, message in (
         (HumanML(), bent[:2], "2 frames"),
-        (HumanML(), bent[:, :21], r"\(5, 21, 3\).*\(frames, 22, 3\)"),
+        (HumanML(), bent[:, :21], r"\(frames, 22, 3\).*\(5, 21, 3\)"),
         (
             HumanML(),
             bent.index_fill(0, torch.tensor([3]), math.inf),
@@ -307,7 +307,7 @@ def test_bad_motions_and_options(subtests):
         (SMPL(), raw[:, :69], r"\(4, 69\)"),
         (Rot6D(), raw[:0], r"\(0, 75\)"),
         (Motion272(), raw[:1], "1 frame, but encoding needs at least 2"),
-        (Rifke(), bent, r"shape \(5, 22, 3\), but rifke takes \(frames, 21, 3\)"),
+        (Rifke(), bent, r"shape \(frames, 21, 3\) for rifke, but found \(5, 22, 3\)"),
     ):
         with subtests.test(motion=motion, message=message):
             with pytest.raises(UserError, match=message):

@@ -24,6 +24,7 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.errors import UserError
+from flame_mdm.formats.readers import read
 from flame_mdm.records import read_result
 from flame_mdm.reporting.report import write_report
 from flame_mdm.reporting.study import tally
@@ -222,10 +223,23 @@ def test_damaged_motions(refused, bad):
         cases += [(suffix, data) for data in (*damaged[:5], *damaged[6::3])]
     for suffix, data in cases:
         (bad / f"bad.{suffix}").write_bytes(data)
+        if suffix == "bvh" and is_unharmed(bad / "bad.bvh"):
+            continue
         out = "out=out.bvh" if suffix == "json" else "out=out.json"
         refused(
             "convert", str(bad / f"bad.{suffix}"), out, *(["fps=20"] if suffix == "npy" else [])
         )
+
+
+def is_unharmed(path: Path) -> bool:
+    """Whether a changed file still has the motion of the whole one: a joint's name may have any characters."""
+    whole = path.with_name("whole.bvh")
+    whole.write_text(bvh_text())
+    try:
+        joints = read(path).joints
+    except UserError:
+        return False
+    return np.array_equal(joints, read(whole).joints)
 
 
 def test_strange_texts_are_legal(trained, tmp_path, monkeypatch, subtests):

@@ -459,7 +459,9 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
         UserError, match=r"trained on .* of synthetic at .*, but the motions are .* of bandai"
     ):
         extractor.check(own, "bandai")
-    with pytest.raises(UserError, match=r"rot6d-25 of synthetic at 20\. Train a matching ex"):
+    with pytest.raises(
+        UserError, match=r"rot6d-25 features of synthetic at 20\. Train a matching ex"
+    ):
         extractor.check(Rot6D(), "synthetic")
 
     released = tmp_path / "released.tar"

@@ -373,6 +373,8 @@ def test_a_sentence_becomes_parts_and_a_suggestion_a_button(server):
     _, notes, *_, text = generated(server, request.model_copy(update={"split": False}).query())
     assert text == request.text
     refused = generated(server, query_of("text=asdf+qwer"))[1]
+    assert "no word says what happens. Name an action" in refused
+    refused = generated(server, query_of("text=a+person+on+a+shelf"))[1]
     assert "no word says what happens. Nearest in meaning:" in refused
     assert refused.count('<button type="button"><img src="data:image/webp;base64,') == 3
 

@@ -273,7 +273,7 @@ def test_launchers_are_found_for_recipes_in_folders_or_named_by_their_extra(monk
             assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
     monkeypatch.setattr("flame_mdm.config.composition.source_file", lambda module: None)
     with pytest.raises(
-        UserError, match=r'launch=slurm needs .*\. Run pip install "flame-mdm\[slurm\]"'
+        UserError, match=r'launch=slurm requires .*\. Run pip install "flame-mdm\[slurm\]"'
     ):
         compose("quickstart", ["launch=slurm"])
 

@@ -435,7 +435,7 @@ def test_each_number_carries_its_own_number_of_motions(runs, full, tmp_path):
     assert fid.counts == result.counts == f"{count} + {count - 30}"
     assert result.ground_truth["fid"].n == count
     assert any(
-        f"replications have {count}, {count - 30} motions" in line for line in result.warnings
+        f"different numbers of motions ({count}, {count - 30})" in line for line in result.warnings
     )
 
 
@@ -701,7 +701,7 @@ def test_what_does_not_fit_is_refused(runs, tmp_path, subtests):
         (
             "replications: 5",
             "replications: 5\nexpected: {x: {fidd: [0, 1]}}",
-            "called fidd. Did you mean fid",
+            "unknown value fidd. Did you mean fid",
         ),
     ):
         with (

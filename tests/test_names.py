@@ -108,9 +108,9 @@ def test_skeletons_of_other_programs_are_recognized(names: str, skeleton: str):
     [
         (
             [f"{person}:{name}" for person in ("A", "B") for name in MIXAMO],
-            "Hips may be A:Hips or B:Hips",
+            "Hips could refer to A:Hips or B:Hips",
         ),
-        ([*map(str.upper, MIXAMO), "Left_Leg"], "LeftLeg may be LEFTLEG or Left_Leg"),
+        ([*map(str.upper, MIXAMO), "Left_Leg"], "LeftLeg could refer to LEFTLEG or Left_Leg"),
     ],
 )
 def test_names_that_may_mean_two_joints_are_refused_with_both(names: list[str], candidates: str):

@@ -528,7 +528,7 @@ def test_rewriting_ends_at_its_threshold(sampler, subtests):
 
 REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
     GaussianDiffusion: [
-        ({"sampler": "euler"}, "has ancestral, ddim, dpm_solver_pp_2m"),
+        ({"sampler": "euler"}, "GaussianDiffusion: ancestral, ddim, dpm_solver_pp_2m"),
         ({"num_inference_steps": 1}, "2 to 1000"),
         ({"num_inference_steps": 1001}, "1000"),
         ({"num_inference_steps": [5, 3]}, "increasing"),
@@ -553,7 +553,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ),
     ],
     FlowMatching: [
-        ({"sampler": "ddim"}, "has euler, midpoint, heun, rk4, dopri5"),
+        ({"sampler": "ddim"}, "FlowMatching: euler, midpoint, heun, rk4, dopri5"),
         ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a flow takes equal steps"),
         (
             {"sampler": "euler", "spacing": "stride"},

@@ -636,4 +636,5 @@ def test_an_action_counts_as_recognized_if_it_is_shown_in_time(subtests):
         with subtests.test(frames=frames):
             motion = np.concatenate([still[:frames], kick, np.repeat(kick[-1:], 100, 0)])[None]
             request = [[("kicks", {"action": "kick"})]]
-            assert drift.recognized(motion, request, FPS)["right"] == right
+            recognized = drift.recognized(motion, request, FPS)
+            assert recognized["right"] == recognized["in_time"] == right

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -147,6 +148,23 @@ def test_noise_and_words_of_the_runner_are_those_of_the_package(subtests) -> Non
     assert all(
         runner.hashed(word, 97) == vocabulary.hashed(word, 97) for word in runner.words(text)
     )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def poses_written_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Most of the time of an export goes into the graph of the poses, which does not depend on the model."""
+    write, shared = onnx.write_graph, tmp_path_factory.mktemp("poses") / "poses.onnx"
+
+    def write_once(graph: onnx.Graph, path: Path, half: bool) -> None:
+        if graph.name != "poses":
+            return write(graph, path, half)
+        if not shared.exists():
+            write(graph, shared, half)
+        shutil.copy(shared, path)
+        return None
+
+    with patch.object(onnx, "write_graph", write_once):
+        yield
 
 
 def tiny(name: str, condition: str) -> MotionGenerator:

@@ -31,7 +31,7 @@ from flame_mdm.reporting.plots import Panel, Series, svg, svg_file
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import read_json, write_json, write_text
 from flame_mdm.sampler_options import SamplerOptions
-from flame_mdm.sampling.streams import Streams, starting_point
+from flame_mdm.sampling.streams import OnlineCleanup, Streams, starting_point
 from flame_mdm.seeds import key
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "benchmarks"
@@ -43,6 +43,8 @@ PERIODS = {"0–10 s": (0, 10), "50–60 s": (50, 60), "290–300 s": (290, 300)
 WINDOW = 2.0  # seconds of the windows whose features are compared
 SHOWN = (2.0, 3.0, 4.0)  # lengths in seconds of the windows that are searched for an action
 LATEST = 4.0  # seconds from a text change to the latest end of these windows
+IN_TIME = 2.0  # seconds from a text change in which an action is recognized "in time"
+DEEP = 0.03  # depth in meters below the floor of toes that are counted
 TOES = [10, 11]
 HEAD = 15
 
@@ -53,7 +55,7 @@ INTRODUCTION = """# Long streams, measured
 
 {streams} streams of {minutes} minutes each receive a new text every ten seconds, {texts} texts per stream. The texts
 are captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both can be
-compared. No frame is cleaned up.
+compared. Unless stated otherwise, no frame is cleaned up.
 
 ## Drift
 
@@ -64,7 +66,8 @@ compared. No frame is cleaned up.
 FID is computed with the package's motion-CLIP between windows of two seconds and synthetic motions that the model has
 not seen. For a second draw of such motions, it is {real_fid}. The jitter is {first} m/s³ in the first minute and
 {last} m/s³ in the last minute, {ratio} times as much. In 99.9 % of the frames, no toe is more than {low} cm below the
-floor. The lowest toe is {lowest} cm below the floor.
+floor. The lowest toe is {lowest} cm below the floor. With `cleanup=true`, the lowest toe of the same streams is
+{cleaned_lowest} cm below the floor, and {cleaned_deep} of {cleaned_frames} frames are more than 3 cm below it.
 
 ## Seams
 
@@ -75,8 +78,10 @@ meters:
 
 ## Texts
 
-{right} of {changes} actions ({share} %) are recognized in at least one window of two, three or four seconds that ends
-at most four seconds after the text changed. These actions are not always recognized: {actions}.
+{in_time} of {changes} actions ({in_time_share} %) are recognized in the first two seconds after the text changed. For
+comparison, the rules recognize 285 of 323 procedural motions (88.2 %) in the first two seconds. {right} actions
+({share} %) are recognized in at least one window of two, three or four seconds that ends at most four seconds after the
+change. These actions are not always recognized: {actions}.
 """
 
 
@@ -94,8 +99,8 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
     """Returns all measurements of a model."""
     fps = model.representation.fps
     requests = [texts(number) for number in range(STREAMS)]
-    joints, seams = streamed(model, requests)
-    lows = joints[..., TOES, 1].min(-1)
+    joints, seams, cleaned = streamed(model, requests)
+    lows, cleaned_lows = (positions[..., TOES, 1].min(-1) for positions in (joints, cleaned))
     extractor = MotionCLIPExtractor("motion_clip_synthetic", "cpu")
     windows = round(WINDOW * fps)
     per_period = round((PERIODS["0–10 s"][1] - PERIODS["0–10 s"][0]) * fps) // windows * STREAMS
@@ -117,6 +122,11 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
             "minimum": float(lows.min()),
             "percentile_0.1": float(np.quantile(lows, 0.001)),
             "percentile_1": float(np.quantile(lows, 0.01)),
+        },
+        "cleaned_toes": {
+            "minimum": float(cleaned_lows.min()),
+            "frames": cleaned_lows.size,
+            "deep": int((cleaned_lows < -DEEP).sum()),
         },
         "jitter_first_minute": jitter[0],
         "jitter_last_minute": jitter[1],
@@ -176,8 +186,11 @@ def texts(stream: int) -> list[tuple[str, Attributes]]:
 
 def streamed(
     model: MotionGenerator, requests: Sequence[Sequence[tuple[str, Attributes]]]
-) -> tuple[np.ndarray, dict[str, float]]:
-    """Returns joints (B, F, 22, 3) from streams, and how much they move at seams and inside blocks."""
+) -> tuple[np.ndarray, dict[str, float], np.ndarray]:
+    """Returns joints (B, F, 22, 3) from streams, how much they move at seams, and the cleaned joints.
+
+    The cleaned joints do not include the last block.
+    """
     prefix, _ = starting_point(model, None)
     first = [request[0][0] for request in requests]
     streams = Streams(
@@ -194,12 +207,18 @@ def streamed(
             schedule.add(round(number * SECONDS_PER_TEXT * fps), text)
     frames = round(MINUTES * 60 * fps)
     blocks, begins = [], [0]
+    cleanups = [OnlineCleanup(model.representation) for _ in requests]
+    clean_blocks = []
     for _ in ProgressBar(range(-(-frames // streams.block)), desc="streaming"):
-        block = np.stack([motion.joints for motion in next(streams)])
+        motions = next(streams)
+        block = np.stack([motion.joints for motion in motions])
+        pairs = zip(cleanups, motions, strict=True)
+        clean = [cleaned.joints for online, motion in pairs if (cleaned := online.add(motion))]
+        clean_blocks += [np.stack(clean)] if clean else []
         blocks.append(block)
         begins.append(begins[-1] + block.shape[1])
     joints = np.concatenate(blocks, 1)[:, :frames]
-    return joints, seams_of(joints, np.array(begins[1:-1]))
+    return joints, seams_of(joints, np.array(begins[1:-1])), np.concatenate(clean_blocks, 1)
 
 
 def seams_of(joints: np.ndarray, seams: np.ndarray) -> dict[str, float]:
@@ -265,7 +284,11 @@ def value(metric: FootSkating | Jitter, joints: np.ndarray) -> float:
 def recognized(
     joints: np.ndarray, requests: Sequence[Sequence[tuple[str, Attributes]]], fps: float
 ) -> dict[str, Any]:
-    """Returns how often each requested action is recognized in a window that ends in time."""
+    """Returns how many requested actions are recognized.
+
+    `in_time` counts the first two seconds alone, `right` any window that ends in time.
+    """
+    in_time = 0
     right: dict[str, list[int]] = {}
     for motion, request in zip(joints, requests, strict=True):
         for number, (_, attributes) in enumerate(request):
@@ -279,11 +302,18 @@ def recognized(
                 for length in SHOWN
                 for late in np.arange(0, LATEST - length + 0.01, 0.25)
             )
+            first = motion[round(begin * fps) : round((begin + IN_TIME) * fps)]
+            in_time += is_shown(first, attributes, fps)
             counts = right.setdefault(str(attributes["action"]), [0, 0])
             counts[0] += shown
             counts[1] += 1
     total = sum(count for count, _ in right.values()), sum(count for _, count in right.values())
-    return {"right": total[0], "changes": total[1], "actions": dict(sorted(right.items()))}
+    return {
+        "in_time": in_time,
+        "right": total[0],
+        "changes": total[1],
+        "actions": dict(sorted(right.items())),
+    }
 
 
 def is_shown(motion: np.ndarray, attributes: Attributes, fps: float) -> bool:
@@ -295,6 +325,7 @@ def is_shown(motion: np.ndarray, attributes: Attributes, fps: float) -> bool:
 def page(results: dict[str, Any]) -> str:
     """Returns the page that shows the figures."""
     low, seams, shown = results["lowest_toe"], results["seams"], results["recognized"]
+    cleaned = results["cleaned_toes"]
     ratio = results["jitter_last_minute"] / results["jitter_first_minute"]
     rows = [
         "| period | FID | skating | height of the head, m | lowest toe, m | jitter, m/s³ |",
@@ -327,6 +358,11 @@ def page(results: dict[str, Any]) -> str:
         ratio=f"{ratio:.2f}",
         low=f"{100 * -low['percentile_0.1']:.1f}",
         lowest=f"{100 * -low['minimum']:.1f}",
+        cleaned_lowest=f"{100 * -cleaned['minimum']:.1f}",
+        cleaned_deep=cleaned["deep"],
+        cleaned_frames=f"{cleaned['frames']:,}",
+        in_time=shown["in_time"],
+        in_time_share=f"{100 * shown['in_time'] / shown['changes']:.1f}",
         seams="\n".join(moves),
         right=shown["right"],
         changes=shown["changes"],

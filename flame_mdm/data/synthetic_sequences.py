@@ -10,14 +10,19 @@ from flame_mdm.data.synthetic_motions.joining import frames_of, join
 
 # Duration of the motion that the captions describe
 SECONDS = 2.0, 3.0
-# Duration of the visible end of the previous motion
-EARLIER_SECONDS = 1.4, 2.0
+# Duration of the visible end of the previous motion. In the shortest clips, it has just the frames
+# that a model continues, so that the model learns to follow a new text at once.
+EARLIER_SECONDS = 1.0, 1.2
 # Fraction of clips in which the previous motion shows the same action
 AGAIN = 0.25
 # Fraction of clips in which the person stands before the motion
 RESTING = 0.25
 # Fraction of clips in which the person stands up before a motion that begins in a standing posture
 FROM_THE_FLOOR = 0.15
+# Fraction of clips with one of the actions that models learn last: quick and small motions that
+# repeat
+HARD_SHARE = 0.3
+HARD = ("nod", "dance", "dodge", "spin", "wave", "clap")
 # Maximum duration, in seconds, of the overlap of both motions
 OVERLAP = 0.45
 # Motions that have no natural end. Clips show up to 6 seconds of such a motion without its end, so
@@ -70,14 +75,22 @@ class SyntheticSequences(Synthetic):
     def clip(self, index: int, fps: float) -> Clip:
         """Returns clip number `index`."""
         rng = np.random.default_rng((self.seed, index, 2))
-        attributes = self.attributes(rng)
-        while attributes.get("ends"):
-            attributes = self.attributes(rng)
+        attributes = self._attributes(rng)
         joints = _joined(rng, attributes, fps).joints()
         joints -= joints[0, 0] * np.array([1, 0, 1])
         name = f"{self.name}_{self.seed}_{index:06d}"
         words = np.random.default_rng((self.seed, index, 3))
         return self.described(name, joints.astype(np.float32), attributes, words)
+
+    def _attributes(self, rng: np.random.Generator) -> Attributes:
+        """Draws the attributes of a clip, more often of a hard action."""
+        if rng.random() < HARD_SHARE:
+            name = str(rng.choice(HARD))
+            return ACTIONS[name].draw(rng, name)
+        attributes = self.attributes(rng)
+        while attributes.get("ends"):
+            attributes = self.attributes(rng)
+        return attributes
 
 
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
@@ -93,7 +106,8 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
     posture = ENDS.get(str(earlier["action"]), "standing")
     before = _moved(rng, earlier, fps)
     frames = np.arange(len(before.t))
-    tail = frames[-round(rng.uniform(*EARLIER_SECONDS) * fps) :]
+    overlap = rng.uniform(0, OVERLAP)
+    tail = frames[-round((rng.uniform(*EARLIER_SECONDS) + overlap) * fps) :]
 
     if posture != start and posture == ENDS.get(action):
         # A person who is already sitting stays seated.
@@ -108,7 +122,7 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
     motion = _moved(rng, attributes, fps, whole=False)
     if posture != start:
         return join(before, motion, blend=0.9)
-    return join(before, motion, overlap=rng.uniform(0, OVERLAP))
+    return join(before, motion, overlap=overlap)
 
 
 def _earlier(rng: np.random.Generator, start: str) -> Attributes:

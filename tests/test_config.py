@@ -480,6 +480,7 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys, subte
     job({"job": 2})
     assert (evaluated[-1].options.guidance_scale, evaluated[-1].seed) == (2.5, 0)
 
+    monkeypatch.setenv("PATH", "")  # no srun
     for extra, message in (
         (["launch=slurm"], "launch=slurm: this machine has no srun"),
         (["launch=nothing"], "unknown launch 'nothing'"),

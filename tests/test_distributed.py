@@ -260,6 +260,7 @@ def test_what_is_wrong_is_told_before_anything_is_submitted(
     tmp_path, capsys, monkeypatch, subtests
 ):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", "")  # no srun
     for line, message in REFUSED.items():
         with subtests.test(line=line, message=message):
             assert main(line.split()) == 1

@@ -80,7 +80,7 @@ const editor = (() => {
     }
   })
   return (...values) => {  // without values: the editors have appeared
-    if (values.length) shown = [values[0] || '', values[1] || 3, values[2] || '']
+    if (values.length) shown = [values[0] || '', +values[1] || 3, values[2] || '']
     if (!document.querySelector('#floor')) return
     drawParts(shown[0])
     drawPath(points(shown[2]), duration(shown[0], shown[1]))
@@ -90,7 +90,7 @@ const editor = (() => {
 // Query strings of requests. The server checks them; `flame_mdm/demo/request.py` describes the keys.
 const links = (() => {
   const STRENGTH = 0.5, SAMPLES = 3  // of variations
-  const NUMBERS = ['seconds', 'seed', 'samples']
+  const NUMBERS = ['seed', 'samples']
 
   function compose(keys, values) {
     const pairs = keys.map((key, k) => [key, values[k]]).filter(([, value]) => value != null && value !== '')

@@ -211,8 +211,9 @@ def _layout(studio: Studio) -> SimpleNamespace:
             ui.files = gr.HTML(elem_id="files")
         with gr.Column(elem_id="options"):
             with gr.Row():
-                ui.seconds = gr.Number(
-                    None, label="Seconds", placeholder="automatic", step=0.5, min_width=90
+                # An empty number field would be read as 0.
+                ui.seconds = gr.Textbox(
+                    label="Seconds", placeholder="automatic", max_length=9, min_width=90
                 )
                 ui.seed = gr.Number(0, label="Seed", precision=0, min_width=90)
                 ui.samples = gr.Number(1, label="Samples", precision=0, min_width=90)

@@ -107,7 +107,10 @@ class DemoRequest(BaseModel):
         return path_targets(self.path, self.total_seconds(parts))
 
     def total_seconds(self, parts: Sequence[tuple[str, float | None]]) -> float:
-        """Returns the duration of all parts. A part without a duration counts as `USUAL_SECONDS`."""
+        """Returns the duration of all parts.
+
+        A part without a duration is as long as `seconds` or, if it is None, `USUAL_SECONDS`.
+        """
         return sum(seconds or self.seconds or USUAL_SECONDS for _, seconds in parts)
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:

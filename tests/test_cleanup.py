@@ -91,6 +91,23 @@ def test_limbs_stay_above_the_floor_between_poses_that_differ_much():
     assert cleanup(motion, FPS, SMPL22)[..., 1].min() > motion[..., 1].min() - 0.02
 
 
+def test_toes_below_the_floor_are_lifted_without_a_jolt(clips):
+    deep = np.repeat(clips[0].motion[:1], 120, 0)
+    deep[50:62, :, 1] -= 0.06 * np.sin(np.linspace(0, np.pi, 12))[:, None] ** 2
+    toes = [chain[-1] for chain in SMPL22.chains[:2]]
+    after = cleanup(deep, FPS, SMPL22)
+    assert deep[:, toes, 1].min() < -0.05
+    assert after[:, toes, 1].min() > -0.012
+    assert peak([after[:, toes]]) < peak([deep[:, toes]])
+
+
+def test_the_floor_may_be_far_below_the_origin(clips):
+    motion = clips[0].motion
+    lower = motion - np.array([0, 0.9, 0], np.float32)
+    after = cleanup(lower, FPS, SMPL22) + np.array([0, 0.9, 0], np.float32)
+    np.testing.assert_allclose(after, cleanup(motion, FPS, SMPL22), atol=1e-5)
+
+
 def test_contacts_of_the_features_find_feet_that_slide_fast():
     """The feet of a run slide about as fast as they would swing, so only the features tell which of them stand."""
     representation = HumanML(fps=FPS, skeleton="smpl22", variant="clean")

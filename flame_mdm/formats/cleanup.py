@@ -1,7 +1,7 @@
 """Cleanup of generated motion.
 
-Cleanup smooths the paths of joints, makes bone lengths constant, keeps feet in place, and moves
-hands out of the body.
+Cleanup smooths the paths of joints, makes bone lengths constant, keeps feet in place and above the
+floor, and moves hands out of the body.
 """
 
 from collections.abc import Sequence
@@ -43,6 +43,9 @@ Above 1.5 times this speed, the body follows its feet entirely.
 """
 # A hand begins to avoid the body this many seconds before it would enter the body
 CLEAR = 0.15
+# Depth in meters below the floor from which a toe is lifted. Toes of captured motions are within
+# this depth.
+DEEP = 0.01
 # Maximum distance from hip to ankle, relative to the straight leg, unless it was already longer
 REACH = 0.999
 
@@ -80,7 +83,10 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 def cleanup(
     joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None
 ) -> np.ndarray:
-    """Removes pops, changes in bone lengths, foot sliding, and hands inside the body.
+    """Removes pops, changes in bone lengths, foot sliding, toes below the floor, and hands inside the body.
+
+    The floor is at y = 0. If more than a tenth of the motion is below it, the floor is at the
+    lowest tenth of the toes' heights.
 
     Args:
         joints: (F, J, 3) in meters, y up. Motions with fewer than 4 frames are returned unchanged.
@@ -117,6 +123,9 @@ def cleanup(
             len(toe), (1, 30 * weight, still), (0, 0.03, 0.0), (2, 0.1, 0.0)
         )
         bend(motion, chain[1:], shift)
+    floor = min(np.percentile(motion[:, toes, 1].min(1), 10), 0.0)
+    for chain in skeleton.chains[:2]:
+        _lift(motion, chain[1:], floor)
     for side in ("left", "right"):
         _push_out(motion, skeleton, side, fps)
     return motion.astype(np.float32)
@@ -238,6 +247,26 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
     return out
 
 
+def _lift(motion: np.ndarray, leg: Sequence[int], floor: float) -> None:
+    """Bends a leg where its toe is more than `DEEP` below the floor."""
+    # The shift fades in and out within a frame, because the path of the toe is already smooth. The
+    # second pass lifts what the fading has left below the floor.
+    for _ in range(2):
+        depth = np.maximum(floor - DEEP - motion[:, leg[-1], 1], 0)
+        if not depth.any():
+            return
+        shift = np.zeros((len(motion), 3))
+        shift[:, 1] = _faded(depth, frames=1.0)
+        bend(motion, leg, shift)
+
+
+def _faded(size: np.ndarray, frames: float) -> np.ndarray:
+    """Returns sizes (F, ...) that rise and fall smoothly, `frames` before and after each peak."""
+    return gaussian_filter1d(
+        maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0
+    )
+
+
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
     """Moves a wrist away from the axis of the trunk or thigh until wrist and hand are outside the body."""
     arm = _arm(skeleton, side)
@@ -255,10 +284,7 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
             return
         away = size * (np.take_along_axis(away, deepest[..., None], 1)[:, 0] + 0.7 * aside)
         away = unit(gaussian_filter1d(away, frames, axis=0, mode="nearest"))
-        size = gaussian_filter1d(
-            maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0
-        )
-        bend(motion, arm, size * away)
+        bend(motion, arm, _faded(size, frames) * away)
 
 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from flame_mdm.data import Clip
 from flame_mdm.data.synthetic import Synthetic, content, draw_captions, example
 from flame_mdm.data.synthetic_actions import ACTIONS, BASES, CORE, CYCLES, GESTURES, MORE
 from flame_mdm.data.synthetic_motions.body import Attributes
+from flame_mdm.data.synthetic_sequences import SyntheticSequences
 from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22
 
@@ -51,6 +52,37 @@ def test_the_clips_of_the_core_do_not_change():
     assert Synthetic.actions == tuple(CORE)
     assert Synthetic(1).options == {"clips": 1, "seed": 0}
     assert len(Synthetic.verbs) < len(Synthetic(1, actions="all").verbs)
+
+
+@pytest.mark.parametrize("source", [Synthetic, SyntheticSequences])
+def test_a_share_of_the_clips_shows_the_actions_that_are_drawn_often(source):
+    often = ("nod", "spin")
+    more = {} if source is SyntheticSequences else {"actions": "all"}
+    data = source(300, often=often, often_share=0.6, **more)
+    rng = np.random.default_rng(0)
+    drawn = [data.attributes(rng)["action"] for _ in range(1000)]
+    shares = [drawn.count(name) / len(drawn) for name in often]
+    assert shares == pytest.approx([0.31, 0.31], abs=0.05)
+    assert data.options["often"] == ["nod", "spin"]
+    assert data.options["often_share"] == 0.6
+    assert "often" not in source(1).options
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"often": ["spinn"], "often_share": 0.3},
+            "often=spinn: unknown action. Did you mean spin",
+        ),
+        ({"often": ["spin"]}, "often_share=0.0: expected names of actions, and a number above 0"),
+        ({"often": ["spin"], "often_share": 1.5}, "often_share=1.5"),
+        ({"often_share": 0.3}, r"often=\[\], often_share=0.3"),
+    ],
+)
+def test_wrong_options_of_actions_drawn_often_are_refused(options, message):
+    with pytest.raises(UserError, match=message):
+        Synthetic(1, actions="all", **options)
 
 
 def test_a_share_of_the_clips_shows_actions_of_the_core():

@@ -22,11 +22,12 @@ from flame_mdm.data.synthetic_actions import (
     CYCLES,
     GESTURES,
     MORE,
+    Action,
     drawn_from,
     move,
 )
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.safe_io import read_package_yaml
 
 # Durations of clips
@@ -219,6 +220,9 @@ class Synthetic(MotionSource):
             actions, and parts of cycles.
         core_share: if `actions` is "all", the fraction of clips that are drawn from the 22 core
             actions, as with "core". All other clips are drawn from all actions.
+        often: names of actions that `often_share` of the clips show, each equally often. Models
+            learn quick, small and rare motions last.
+        often_share: fraction of the clips that show an action of `often`.
     """
 
     name = "synthetic"
@@ -236,6 +240,8 @@ class Synthetic(MotionSource):
         workers: int = 0,
         actions: Literal["core", "all"] = "core",
         core_share: float = 0.0,
+        often: Sequence[str] = (),
+        often_share: float = 0.0,
     ):
         if clips < 1 or seed < 0:
             raise UserError(
@@ -249,7 +255,11 @@ class Synthetic(MotionSource):
             )
         self.size, self.seed, self.workers, self.everything = clips, seed, workers, actions == "all"
         self.core_share = core_share
+        self.often, self.often_share = tuple(often), often_share
         self.options = {"clips": clips, "seed": seed}
+        if often or often_share:
+            _check_often(self.often, often_share, ACTIONS if self.everything else CORE)
+            self.options |= {"often": list(self.often), "often_share": often_share}
         if self.everything:
             self.options["actions"] = actions
             if core_share:
@@ -303,6 +313,9 @@ class Synthetic(MotionSource):
 
     def attributes(self, rng: np.random.Generator) -> Attributes:
         """Draws the attributes of a clip."""
+        if self.often_share and rng.random() < self.often_share:
+            action = str(rng.choice(self.often))
+            return ACTIONS[action].draw(rng, action)
         if self.core_share and rng.random() < self.core_share:
             action = drawn_from(rng, CORE)
             return CORE[action].draw(rng, action)
@@ -319,6 +332,19 @@ class Synthetic(MotionSource):
         actions = ACTIONS if self.everything else CORE
         action = drawn_from(rng, actions)
         return actions[action].draw(rng, action)
+
+
+def _check_often(often: Sequence[str], share: float, actions: Mapping[str, Action]) -> None:
+    for name in often:
+        if name not in actions:
+            raise UserError(
+                f"synthetic: often={name}: unknown action.{did_you_mean(name, list(actions))}"
+            )
+    if not often or not 0 < share <= 1:
+        raise UserError(
+            f"synthetic: often={list(often)}, often_share={share}: expected names of actions, and a "
+            "number above 0, up to 1"
+        )
 
 
 def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:

@@ -1,5 +1,7 @@
 """Synthetic clips for models that continue frames: a motion that follows the end of another motion."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from flame_mdm.data import Clip
@@ -9,7 +11,7 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.data.synthetic_motions.joining import frames_of, join
 
 # Duration of the motion that the captions describe
-SECONDS = 2.0, 3.0
+SECONDS = 1.8, 2.4
 # Duration of the visible end of the previous motion. In the shortest clips, it has just the frames
 # that a model continues, so that the model learns to follow a new text at once.
 EARLIER_SECONDS = 1.0, 1.2
@@ -19,10 +21,6 @@ AGAIN = 0.25
 RESTING = 0.25
 # Fraction of clips in which the person stands up before a motion that begins in a standing posture
 FROM_THE_FLOOR = 0.15
-# Fraction of clips with one of the actions that models learn last: quick and small motions that
-# repeat
-HARD_SHARE = 0.3
-HARD = ("nod", "dance", "dodge", "spin", "wave", "clap")
 # Maximum duration, in seconds, of the overlap of both motions
 OVERLAP = 0.45
 # Motions that have no natural end. Clips show up to 6 seconds of such a motion without its end, so
@@ -65,12 +63,21 @@ class SyntheticSequences(Synthetic):
         clips: number of clips.
         seed: seed of the clips; 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
+        often: see `Synthetic`.
+        often_share: see `Synthetic`.
     """
 
     name = "synthetic_sequences"
 
-    def __init__(self, clips: int = 5000, seed: int = 0, workers: int = 0):
-        super().__init__(clips, seed, workers, actions="all")
+    def __init__(
+        self,
+        clips: int = 5000,
+        seed: int = 0,
+        workers: int = 0,
+        often: Sequence[str] = (),
+        often_share: float = 0.0,
+    ):
+        super().__init__(clips, seed, workers, actions="all", often=often, often_share=often_share)
 
     def clip(self, index: int, fps: float) -> Clip:
         """Returns clip number `index`."""
@@ -83,10 +90,7 @@ class SyntheticSequences(Synthetic):
         return self.described(name, joints.astype(np.float32), attributes, words)
 
     def _attributes(self, rng: np.random.Generator) -> Attributes:
-        """Draws the attributes of a clip, more often of a hard action."""
-        if rng.random() < HARD_SHARE:
-            name = str(rng.choice(HARD))
-            return ACTIONS[name].draw(rng, name)
+        """Draws the attributes of a clip that shows a whole motion, not a part of a cycle."""
         attributes = self.attributes(rng)
         while attributes.get("ends"):
             attributes = self.attributes(rng)
@@ -160,7 +164,7 @@ def _moved(
     """
     action = ACTIONS[str(attributes["action"])]
     shortest = max(SECONDS[0], 0.35 + 0.8 * int(attributes.get("count", 0)), action.seconds)
-    seconds = rng.uniform(shortest, SECONDS[1])
+    seconds = rng.uniform(shortest, max(shortest, SECONDS[1]))
     # A circle has a fixed angle, so it would become wider with more time.
     circle = attributes.get("direction") in ("clockwise", "counterclockwise")
     endless = attributes["action"] in ENDLESS and not whole and not circle

@@ -1,10 +1,12 @@
 """Condition encoders: values against the language models themselves, nulls, and the cache on disk."""
 
+import copy
 import importlib.util
 import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -243,6 +245,64 @@ def test_pretraining_draws_captions_of_the_same_clip_together():
     torch.testing.assert_close(encoders[0].state_dict(), encoders[1].state_dict(), rtol=0, atol=0)
     encoders[0].pretrain([["he walks", "she walks"]], seed=1)  # nothing to compare with
     assert torch.equal(encoders[0].null, encoders[1].null)
+
+
+def test_pretraining_is_simcse_with_64_clips_per_step_and_a_temperature_of_a_tenth():
+    """A loop in plain PyTorch. Captions that a clip has twice are not paired with themselves."""
+    groups = [[f"word{k} walks", f"word{k} runs", f"word{k} walks"] for k in range(70)]
+    torch.manual_seed(0)
+    encoder = LearnedTokens(8, heads=2, buckets=512, dropout=0.0, pretrain_steps=3)
+    expected = copy.deepcopy(encoder)
+    encoder.pretrain([*groups, ["waves", "waves"]], seed=5)
+    optimizer = torch.optim.AdamW(expected.parameters(), lr=1e-3)
+    for step in range(3):
+        draw = np.random.default_rng((5, step))
+        clips = draw.choice(70, 64, replace=False)
+        pairs = [
+            draw.choice([f"word{k} runs", f"word{k} walks"], 2, replace=False).tolist()
+            for k in clips
+        ]
+        first, second = (
+            torch.nn.functional.normalize(expected(batch_of(list(side))).pooled, dim=-1)
+            for side in zip(*pairs, strict=True)
+        )
+        loss = torch.nn.functional.cross_entropy(first @ second.T / 0.1, torch.arange(64))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    # Adam makes much of gradients that are 0 but for rounding, as those of the biases of keys.
+    for name in ("words.weight", "positions", "norm.weight"):
+        torch.testing.assert_close(
+            encoder.state_dict()[name], expected.state_dict()[name], rtol=0, atol=1e-5
+        )
+
+
+def test_every_option_that_changes_encodings_has_a_cache_of_its_own(tmp_path):
+    common: dict[str, Any] = {
+        "model": "owner/name",
+        "features": 8,
+        "max_tokens": 20,
+        "pooling": "mean",
+        "revision": "a" * 40,
+    }
+    changes: list[dict[str, Any]] = [
+        {},
+        {"model": "other/name"},
+        {"features": 16},
+        {"max_tokens": 21},
+        {"pooling": "pooler"},
+        {"revision": "b" * 40},
+        {"sha256": "c" * 64},
+        {"tokens": True},
+        {"attend_padding": True},
+    ]
+    encoders = [PretrainedText(**common | change) for change in changes]
+    paths = [encoder._cache_path(["walks", "sits"], tmp_path) for encoder in encoders]
+    assert len({*paths, encoders[0]._cache_path(["walks"], tmp_path)}) == len(changes) + 1
+    assert encoders[0]._cache_path(["sits", "walks", "sits"], tmp_path) == paths[0]
+    # What is computed after the cache needs no other one.
+    normalized = PretrainedText(**common, normalize=True, encode_null=True)
+    assert normalized._cache_path(["walks", "sits"], tmp_path) == paths[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)

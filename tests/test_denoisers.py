@@ -9,10 +9,12 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from support.fixtures import ROOT
+from torch import Tensor
+from torch.nn import functional
 
 from flame_mdm.batch import Condition, length_mask
 from flame_mdm.denoisers import Denoiser
-from flame_mdm.denoisers.flame import FLAME
+from flame_mdm.denoisers.flame import FLAME, cosine_first_sinusoid
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
 from flame_mdm.errors import UserError
@@ -187,6 +189,76 @@ def test_flame_rounds_lengths_down_to_those_of_its_training(subtests) -> None:
     for unit in (0, -4, 1.5, "4", True):
         with subtests.test(unit=unit), pytest.raises(UserError, match="length_unit"):
             FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("cond_features", [C, 0])
+def test_time_and_condition_can_be_added_to_the_frames_of_flame(cond_features: int) -> None:
+    """The sum is the same for all frames of a motion, so that it can be part of the bias of the input."""
+    torch.manual_seed(0)
+    plain, adding = (
+        FLAME(D, D, cond_features, **TRANSFORMER, max_frames=20, condition_frames=added).double()
+        for added in (False, True)
+    )
+    x_t, t, mask, cond = batch([11])
+    adding.load_state_dict(plain.state_dict())
+    expected = adding(x_t, t + 3, mask, cond)
+    added = cosine_first_sinusoid(t + 3, 16).double()[0]
+    if plain.pooled_projection is not None:
+        added += plain.pooled_projection(cond.pooled)[0]
+    plain.input.bias.data += added
+    assert_same(plain(x_t, t + 3, mask, cond), expected)
+
+
+@pytest.mark.parametrize("max_tokens", [0, 5])
+def test_the_first_token_can_be_added_to_the_frames_of_the_encoder(max_tokens: int) -> None:
+    """The first token is the time and, unless all tokens are read, the condition."""
+    torch.manual_seed(0)
+    plain, adding = (
+        MDMEncoder(D, D, C, **TRANSFORMER, max_tokens=max_tokens, condition_frames=added).double()
+        for added in (False, True)
+    )
+    x_t, t, mask, cond = batch([11])
+    adding.load_state_dict(plain.state_dict())
+    added = plain.condition.time(t) if max_tokens else plain.condition(t, cond.pooled)
+    expected = adding(x_t, t, mask, cond)
+    plain.input.bias.data += added[0]
+    assert_same(plain(x_t, t, mask, cond), expected)
+
+
+def test_the_unet_is_that_of_ddpm_with_a_scale_and_a_shift() -> None:
+    """Plain convolutions and norms of torch, for motions without padding."""
+    torch.manual_seed(0)
+    sizes: dict[str, Any] = {"latent_dim": 16, "channels": [8, 12], "num_groups": 4, "dropout": 0.0}
+    unet = MDMUNet(D, D, C, **sizes).double()
+    for weight in unet.parameters():
+        weight.data += 0.1 * torch.randn_like(weight)
+    x_t, t, mask, cond = batch([10, 10])
+    weights = unet.state_dict()
+
+    def conv(name: str, x: Tensor, **options: int) -> Tensor:
+        return functional.conv1d(x, weights[f"{name}.weight"], weights[f"{name}.bias"], **options)
+
+    def norm(name: str, x: Tensor) -> Tensor:
+        return functional.group_norm(x, 4, weights[f"{name}.weight"], weights[f"{name}.bias"])
+
+    token = functional.silu(unet.condition(t, cond.pooled))
+
+    def block(name: str, x: Tensor) -> Tensor:
+        y = conv(f"{name}.conv1", functional.silu(norm(f"{name}.norm1", x)), padding=1)
+        line = f"{name}.scale_shift"
+        both = functional.linear(token, weights[f"{line}.weight"], weights[f"{line}.bias"])
+        scale, shift = both[..., None].chunk(2, 1)
+        y = functional.silu(norm(f"{name}.norm2", y) * (1 + scale) + shift)
+        y = conv(f"{name}.conv2", y, padding=1)
+        return y + (conv(f"{name}.skip", x) if f"{name}.skip.weight" in weights else x)
+
+    fine = block("down.0", conv("input", x_t.transpose(1, 2), padding=1))
+    coarse = block("down.1", conv("downsample.0", fine, stride=2, padding=1))
+    x = block("middle.1", block("middle.0", coarse))
+    x = block("up.1", torch.cat([x, coarse], 1))
+    x = conv("upsample.0", functional.interpolate(x, scale_factor=2), padding=1)
+    x = functional.silu(norm("output_norm", block("up.0", torch.cat([x, fine], 1))))
+    assert_same(unet(x_t, t, mask, cond), conv("output", x, padding=1).transpose(1, 2))
 
 
 def test_token_positions_do_not_move_the_frames() -> None:

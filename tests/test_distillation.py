@@ -5,7 +5,8 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -174,6 +175,86 @@ def test_the_target_of_a_student_has_its_averaged_weights(
         targets, (initial, first, average, (average + third) / 2), strict=True
     ):
         torch.testing.assert_close(target, expected)
+
+
+def recorded_terms(monkeypatch, step: int, u: Tensor | None = None, **changes: Any) -> Any:
+    """What a student passes on in a step of 100: positional arguments and options."""
+    passed: list[Any] = []
+    monkeypatch.setattr(
+        distillation,
+        "consistency_terms",
+        lambda *values, **options: passed.extend((values, options)),
+    )
+    stub = SimpleNamespace(
+        _trainer=SimpleNamespace(global_step=step, max_steps=100),
+        config={"distillation": {"intervals": [8, 4, 1]}},
+        generator=SimpleNamespace(
+            process=FlowMatching(),
+            denoiser="student",
+            condition=SimpleNamespace(features=1),
+            representation=SimpleNamespace(features=3),
+        ),
+        grids={},
+        device=torch.device("cpu"),
+        target=["average"],
+        teacher=["teacher"],
+        teacher_guidance=None,
+        losses="losses",
+    )
+    vars(stub).update(changes)
+    x = torch.zeros(4, 2, 3)
+    batch = MotionBatch(x, x[..., 0] == 0, list("abcd"))
+    distillation.DistillationTask.loss_terms(cast(Any, stub), batch, NO_CONDITION, u)
+    return passed
+
+
+@pytest.mark.parametrize(
+    ("step", "count"), [(0, 8), (33, 8), (34, 4), (66, 4), (67, 1), (99, 1), (100, 1)]
+)
+def test_each_number_of_intervals_is_used_for_an_equal_share_of_the_training(
+    monkeypatch, step, count
+):
+    (_, student, follower, teacher, *_), options = recorded_terms(monkeypatch, step)
+    assert (student, follower, teacher) == ("student", "average", "teacher")
+    assert options["times"].tolist() == [number / count for number in range(count)]
+    assert options["auxiliary"] == "losses"
+    assert ((options["index"] >= 0) & (options["index"] < count)).all()
+
+
+def test_students_are_validated_on_the_last_grid_with_times_that_are_equally_likely(monkeypatch):
+    u = torch.tensor([0.0, 0.24, 0.26, 0.999])
+    config = {"distillation": {"intervals": [8, 4]}}
+    (_, student, follower, *_), options = recorded_terms(monkeypatch, 0, u, config=config)
+    assert (student, follower) == ("student", "student")
+    assert options["index"].tolist() == [0, 0, 1, 3]
+    assert options["times"].tolist() == [0, 0.25, 0.5, 0.75]
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, 2.5), (4.0, 4.0), (1.0, 1.0)])
+def test_the_teacher_is_guided_as_the_recipe_says_or_else_as_by_default(
+    monkeypatch, chosen, expected
+):
+    teacher = SimpleNamespace(
+        config={part: {} for part in distillation.PARTS[1:]},
+        facts={},
+        state_dict=lambda: nn.Linear(1, 1).state_dict(),
+        sampler_options=SimpleNamespace(guidance_scale=2.5),
+    )
+    for function, result in (("find", None), ("read_teacher", teacher), ("weights_sha256", "a")):
+        monkeypatch.setattr(distillation, function, lambda _, result=result: result)
+    generator = nn.Linear(1, 1)
+    generator.denoiser = nn.Linear(1, 1)
+    generator.load_state_dict = lambda state: None  # type: ignore[assignment]
+    options = {"teacher": "base", "guidance_scale": chosen}
+    stub: Any = SimpleNamespace(
+        config=teacher.config | {"distillation": options}, facts={}, generator=generator
+    )
+    distillation.DistillationTask.start_from_teacher(stub)
+    assert stub.teacher_guidance == expected
+    assert stub.target == [generator.denoiser]
+    assert stub.teacher[0] is not generator.denoiser
+    assert not any(weight.requires_grad for weight in stub.teacher[0].parameters())
+    assert all(weight.requires_grad for weight in generator.denoiser.parameters())
 
 
 def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teacher(
@@ -580,6 +661,26 @@ def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(
     for number, batch in enumerate(itertools.islice(data.train_dataloader(), 3)):
         with subtests.test(batch=number):
             assert [name.startswith("prior/") for name in batch.ids] == [False, False, True, True]
+
+
+def test_samples_of_the_base_cover_its_captions_evenly_and_a_tenth_is_for_validation(monkeypatch):
+    requested: list[Any] = []
+
+    def generated(_: Any, texts: list[str], *, frames: int, seed: int) -> list[Any]:
+        requested.append((len(texts), frames, seed))
+        return [SimpleNamespace(features=np.zeros((frames, 3)), text=text) for text in texts]
+
+    monkeypatch.setattr(adaptation, "generate", generated)
+    model: Any = SimpleNamespace(
+        facts={"max_frames": 50}, representation=SimpleNamespace(name="humanml3d")
+    )
+    clips = list(adaptation._Samples(model, ["runs", "sits", "walks"]).clips(20.0))
+    assert [clip.captions for clip in clips] == [["runs"]] * 100 + [["sits"]] * 100 + [
+        ["walks"]
+    ] * 100
+    assert [row for row, clip in enumerate(clips) if clip.split == "val"] == list(range(0, 300, 10))
+    assert len({clip.id for clip in clips}) == 300
+    assert requested == [(min(32, 300 - seed), 50, seed) for seed in range(0, 300, 32)]
 
 
 def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):

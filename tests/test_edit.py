@@ -15,13 +15,14 @@ import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
 from flame_mdm.representations.smpl import SMPL
-from flame_mdm.sampling.editing import Edited, edit
+from flame_mdm.sampling.editing import Edited, _part_length, edit
 from flame_mdm.sampling.reading import decoded, read_motion
 from flame_mdm.seeds import seeded_noise
 
@@ -89,7 +90,7 @@ def test_regions(diffusion, motion, length, subtests):
 
 
 def test_frames_and_joints_meet_and_the_upper_body_is_what_mdm_resamples(diffusion, motion):
-    seconds = edit(diffusion, motion, region_seconds=[0.5, 1.25])[0]
+    seconds = edit(diffusion, motion, region_seconds=[0.52, 1.23])[0]  # frames 10.4 and 24.6
     frames = edit(diffusion, motion, region=[10, 25])[0]
     assert np.array_equal(seconds.keep, frames.keep)
     assert np.array_equal(seconds.features, frames.features)
@@ -161,9 +162,12 @@ def test_other_methods_keep_roughly(diffusion, flow, motion):
     """The last of repeated steps is taken once; flows are rewritten in the first 6 of 25 steps, up to time 0.2."""
     options = {"method": "flame_code", "num_inference_steps": 4, "resample": 3}
     with inputs_of(diffusion.denoiser) as repeated, inputs_of(flow.denoiser) as rewritten:
-        assert edit(diffusion, motion, region="in_between", **options)[0].feature_error > 1e-3
+        rough = edit(diffusion, motion, region="in_between", **options)[0]
         default = edit(flow, motion, region="in_between")[0]
     assert (len(repeated), len(rewritten)) == (3 * 3 + 1, 25)
+    off = np.abs(rough.features - motion.features) / diffusion.representation.std.numpy()
+    assert rough.feature_error == pytest.approx(off[rough.keep].max(), rel=1e-3)
+    assert rough.feature_error > 1e-3
     assert default.feature_error > 1e-3
     six, five = (
         edit(flow, motion, region="in_between", until=time, num_inference_steps=25)[0]
@@ -172,6 +176,20 @@ def test_other_methods_keep_roughly(diffusion, flow, motion):
     assert np.array_equal(default.features, six.features)
     assert not np.array_equal(default.features, five.features)
     assert edit(flow, motion, region="in_between", method="mdm")[0].feature_error == 0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "frames"),
+    [([None], 60), ([1.29, None], 34), ([1.24, None, None], None), ([3.0], 0)],
+)
+def test_parts_of_an_edit_share_what_the_durations_leave(seconds, frames):
+    """Durations are rounded to the nearest frame: 25.8 becomes 26, and 24.8 becomes 25."""
+    parts = [("walks", duration) for duration in seconds]
+    if frames is None:
+        with pytest.raises(UserError, match="the parts are not as long as the motion"):
+            _part_length(parts, 60, 20)
+    else:
+        assert _part_length(parts, 60, 20) == frames
 
 
 def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
@@ -184,7 +202,7 @@ def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
     assert moved > 0.1
 
 
-@pytest.mark.parametrize("strength", [0.3, 1.0])
+@pytest.mark.parametrize("strength", [0.37, 1.0])
 @pytest.mark.parametrize("kind", ["diffusion", "flow"])
 def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, request):
     model = request.getfixturevalue(kind)

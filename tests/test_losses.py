@@ -104,13 +104,21 @@ def test_equal_motions_lose_nothing_but_sliding_feet(subtests):
     assert terms["velocity"].item() == pytest.approx(0.3**2 / 9)
     assert terms["joints"].item() == pytest.approx(0.09 * (0 + 1 + 4 + 9) / (4 * 9))
     assert losses(2 * x, x, mask)["foot_contact"] == 0
-    # 1 cm per frame in the data is standing, 1.5 cm is not.
-    for step, stands in ((0.0099, True), (0.015, False)):
+    # 1 cm per frame in the data is standing, also along a diagonal, and 1.01 cm is not.
+    pairs, foot = (
+        torch.ones(1, 2, dtype=torch.bool),
+        MotionLosses(joints_as_features, [2], foot_contact=1.0),
+    )
+    for step, stands in (
+        ((0.01, 0.0, 0.0), True),
+        ((0.0, 0.0, 0.0101), False),
+        ((0.0057, 0.0057, 0.0057), True),
+        ((0.0058, 0.0058, 0.0058), False),
+    ):
         with subtests.test(step=step):
-            loss = MotionLosses(joints_as_features, [2], foot_contact=1.0)(
-                step * x, step * x, mask
-            )["foot_contact"]
-            assert (loss > 0) == stands
+            moved = torch.zeros(1, 2, 9)
+            moved[0, 1, 6:] = torch.tensor(step)
+            assert (foot(moved, moved, pairs)["foot_contact"] > 0) == stands
 
 
 def test_bones_lose_their_change_of_length_and_not_their_turns():

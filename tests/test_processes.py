@@ -30,8 +30,6 @@ from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import (
-    STEERING_LIMIT,
-    STEERING_STEPS,
     Positions,
     classifier_free_guidance,
     steer,
@@ -407,4 +405,19 @@ def test_a_step_toward_a_distant_position_is_limited_over_all_features_of_a_moti
     )
     steered = steer(lambda noisy: noisy, x, lambda motion: motion.unflatten(-1, (2, 3)), far)
     rms = (steered - x).square().mean((1, 2)).sqrt()
-    torch.testing.assert_close(rms, torch.full((2,), STEERING_STEPS * STEERING_LIMIT))
+    # Two steps of 0.02 each
+    torch.testing.assert_close(rms, torch.full((2,), 0.04))
+
+
+def test_steps_of_training_are_equally_likely():
+    """Each of the T steps has the same share of (0, 1), also the first one and the last one."""
+    process = GaussianDiffusion(4)
+    u = torch.tensor([0.0, 0.24, 0.25, 0.49, 0.51, 0.74, 0.76, 1.0])
+    assert process.training_times(u).tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_times_of_distillation_are_evenly_spaced_and_end_one_interval_before_the_data():
+    assert GaussianDiffusion(50).grid(4) == [49, 37, 24, 11]
+    assert GaussianDiffusion(1000).grid(3) == [999, 666, 332]
+    assert GaussianDiffusion(10).grid(20) == list(range(9, -1, -1))
+    assert FlowMatching().grid(4) == [0, 0.25, 0.5, 0.75]

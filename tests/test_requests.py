@@ -1,5 +1,6 @@
 """Requests: keywords of Python, what a request means for a model, and the best of several candidates."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -23,7 +24,7 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling import motion_request, resolution
 from flame_mdm.sampling.generation import best
 from flame_mdm.sampling.keywords import EditKeywords, SamplerKeywords, SamplingKeywords
-from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest, path_targets
 from flame_mdm.sampling.resolution import resolve
 from flame_mdm.sampling.targets import read_targets
 
@@ -174,6 +175,51 @@ def test_the_best_of_several_candidates_is_kept(model):
         np.testing.assert_allclose(
             motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4
         )
+
+
+@pytest.mark.parametrize(
+    ("path", "times"),
+    [
+        # 3.8 seconds at a constant speed, over 1 m and then 5 m
+        ([(0.0, 1.0), (3.0, 5.0)], [0.633, 3.8]),
+        ([(0.0, 2.0)], [3.8]),
+        ([(0.0, 0.0)], [0.0]),
+        ([(1.0, 0.0), (1.0, 0.0), (2.0, 0.0)], [1.9, 1.9, 3.8]),
+    ],
+)
+def test_a_path_begins_at_the_origin_and_ends_a_fifth_of_a_second_before_the_motion(path, times):
+    targets = path_targets(path, 4.0)
+    assert targets.keys() == {"root"}
+    assert [entry["time"] for entry in targets["root"]] == times
+    assert [tuple(entry["position"]) for entry in targets["root"]] == path
+
+
+LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [
+    (SamplerOptions, "eta", [0, 1], [-0.01, 1.01, math.nan]),
+    (SamplerOptions, "guidance_scale", [0, -1, 100], [math.inf, "2"]),
+    (
+        SamplerOptions,
+        "num_inference_steps",
+        [1, 100_000, [0, 100_000]],
+        [0, 100_001, [-1, 2], True],
+    ),
+    (SamplerOptions, "spacing", ["linspace", "stride"], ["even"]),
+    (EditRequest, "strength", [0.01, 1], [0, 1.01]),
+    (EditRequest, "resample", [1, 10], [0, 1.5]),
+    (SamplingRequest, "samples", [1, 10_000], [0, 10_001, 1.5]),
+    (SamplingRequest, "candidates", [1, 10_000], [0, 10_001]),
+    (SamplingRequest, "texts", ["a" * 2000, "a @0.01"], ["a" * 2001, " ", "a @0", "a |"]),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "valid", "invalid"), LIMITS)
+def test_limits_of_options_belong_to_what_is_valid(kind, name, valid, invalid, subtests):
+    for value in valid:
+        with subtests.test(value=str(value)[:20]):
+            kind(**{name: value})
+    for value in invalid:
+        with subtests.test(value=str(value)[:20]), pytest.raises(UserError):
+            kind(**{name: value})
 
 
 def test_without_a_score_the_fewest_faulty_frames_decide():

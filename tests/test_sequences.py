@@ -2,6 +2,8 @@
 
 import itertools
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,9 +21,10 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.processes.guidance import Positions, reach
 from flame_mdm.processes.windows import blended, cover, spans
+from flame_mdm.sampling import targets as targets_module
 from flame_mdm.sampling.motion_request import read_parts
-from flame_mdm.sampling.sequences import overlap
-from flame_mdm.sampling.targets import errors, read_targets
+from flame_mdm.sampling.sequences import overlap, part_frames
+from flame_mdm.sampling.targets import Targets, errors, read_targets
 
 CPU, TEXT = torch.device("cpu"), "a person walks forward"
 
@@ -49,6 +52,108 @@ def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop, subtests
     sums = torch.zeros(1, total).index_put(index, covered.weights, accumulate=True)
     torch.testing.assert_close(sums, torch.ones(1, total))
     assert not covered.weights[~covered.batch.mask].any()
+
+
+def test_windows_of_a_long_part_are_evenly_spaced():
+    """Starts are rounded to the nearest frame."""
+    assert spans([200], longest=60, overlap=16) == [
+        (0, 0, 53),
+        (0, 37, 53),
+        (0, 74, 53),
+        (0, 110, 53),
+        (0, 147, 53),
+    ]
+    assert spans([30, 100], longest=60, overlap=10, loop=True) == [
+        (0, -5, 40),
+        (1, 25, 60),
+        (1, 75, 60),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("fps", "longest", "context", "frames"),
+    [
+        (20, 60, 0, 10),
+        (30, 200, 0, 16),
+        (25, 200, 0, 12),
+        (60, 400, 0, 30),
+        (20, 20, 0, 6),
+        (20, 22, 0, 8),
+        (20, 60, 10, 0),
+    ],
+)
+def test_windows_share_half_a_second_but_at_most_a_third_of_the_longest_motion(
+    fps, longest, context, frames
+):
+    """The number of frames is even, so that a window extends equally far into both neighbors."""
+    assert overlap(sized(fps, longest, context)) == frames
+
+
+def sized(fps: float, longest: int, context: int = 0) -> Any:
+    """What lengths depend on: a model of motions of up to `longest` frames."""
+    return SimpleNamespace(
+        representation=SimpleNamespace(fps=fps),
+        facts={"max_frames": longest},
+        denoiser=SimpleNamespace(context_frames=context),
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "usual", "frames"),
+    [
+        (sized(20, 80), 29.8, 30),
+        (sized(20, 80), 29.2, 29),
+        (sized(20, 80), 80.4, 80),
+        (sized(20, 80), 1.6, 2),
+        (sized(20, 80), None, 60),
+        (sized(20, 50), None, 50),
+        (sized(30, 200), None, 90),
+    ],
+)
+def test_a_motion_has_the_nearest_number_of_frames_and_three_seconds_by_default(
+    model, usual, frames
+):
+    parts = [("walks", None)]
+    assert part_frames(model, "walks", parts, [usual], is_sequence=False, loop=False) == [frames]
+
+
+@pytest.mark.parametrize(
+    ("model", "seconds", "usual", "loop", "frames"),
+    [
+        # Without a duration, a part fits into one window with its overlap.
+        (sized(20, 60), [1.49, None], None, False, [30, 50]),
+        (sized(20, 60), [None], None, False, [60]),
+        (sized(20, 60), [None], None, True, [50]),
+        (sized(20, 200), [None, None], None, False, [60, 60]),
+        (sized(20, 60), [1.0, None], 29.8, False, [20, 30]),
+        (sized(20, 60), [0.5, 0.52], None, False, [10, 10]),
+        (sized(20, 60), [300, 300], None, False, [6000, 6000]),
+        (sized(20, 40, 10), [0.05, None], None, False, [1, 60]),
+    ],
+)
+def test_parts_have_their_durations_or_as_many_frames_as_fit_into_a_window(
+    model, seconds, usual, loop, frames
+):
+    parts = [("walks", duration) for duration in seconds]
+    lengths = part_frames(model, "walks", parts, [usual] * len(parts), is_sequence=True, loop=loop)
+    assert lengths == frames
+
+
+@pytest.mark.parametrize(
+    ("model", "seconds", "usual", "message"),
+    [
+        (sized(20, 60), [None], 1.4, "0.05 seconds .1 frames. are too short"),
+        (sized(20, 60), [None], 61.0, "trained on motions of up to 3 seconds"),
+        (sized(20, 60), [2.0, 0.45], None, "a part of 0.45 seconds is too short. .* at least 0.5"),
+        (sized(20, 60), [300, 300.1], None, "600.1 seconds are too long. Use at most 600 seconds"),
+        (sized(20, 40, 10), [0.02], None, "0 seconds are too short. Use at least 0.05 seconds"),
+    ],
+)
+def test_lengths_out_of_range_are_refused(model, seconds, usual, message):
+    parts = [("walks", duration) for duration in seconds]
+    timed = seconds != [None]
+    with pytest.raises(UserError, match=message):
+        part_frames(model, "walks", parts, [usual] * len(parts), is_sequence=timed, loop=False)
 
 
 def test_one_window_changes_nothing_and_two_are_averaged():
@@ -190,6 +295,54 @@ def test_a_linear_decoder_is_solved_exactly_and_changes_least():
     assert moved[4, :2].tolist() == pytest.approx([2.0, 0.0], abs=1e-2)
 
 
+def squared(features: torch.Tensor) -> torch.Tensor:
+    """One joint (F, 1, 3) whose x is the square of the first feature."""
+    return torch.stack([features[:, 0] ** 2, features[:, 1], features[:, 2]], -1)[:, None]
+
+
+def test_a_search_ends_below_5_mm_or_after_8_steps(subtests):
+    """A thousandth of the error remains after each step of a linear decoder."""
+    no_bones = torch.zeros(3, 0, dtype=torch.long)
+    x, free = torch.zeros(1, 1, 3), torch.ones(1, 1, 3, dtype=torch.bool)
+    place = torch.tensor([0])
+    for value, reached in ((4.0, 4 / 1.001), (6.0, 6 - 6 / 1001**2)):
+        with subtests.test(value=value):
+            goal = Positions(place, place, place, torch.tensor([value]))
+            moved = reach(x, lambda y: y[:, None], goal, no_bones, free, smoothness=1.0)
+            assert moved[0, 0, 0].item() == pytest.approx(reached, abs=1e-5)
+    # Newton's method halves the root of a square.
+    goal = Positions(place, place, place, torch.tensor([0.0]))
+    x[..., 0] = 100.0
+    moved = reach(x, squared, goal, no_bones, free, smoothness=1.0)
+    assert moved[0, 0, 0].item() == pytest.approx(100 * (1 - 0.5 / 1.001) ** 8, rel=1e-3)
+
+
+def test_the_prior_of_a_change_ends_after_three_standard_deviations():
+    x, free = torch.zeros(1, 11, 3), torch.ones(1, 11, 3, dtype=torch.bool)
+    goal = Positions(torch.tensor([5]), torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
+    no_bones = torch.zeros(3, 0, dtype=torch.long)
+    moved = reach(x, lambda y: y[:, None], goal, no_bones, free, smoothness=1.0)[0, :, 0]
+    offsets = torch.arange(11) - 5
+    expected = torch.where(offsets.abs() <= 3, torch.exp(-0.5 * offsets**2), 0.0) * 2 / 1.001
+    torch.testing.assert_close(moved, expected)
+
+
+def test_bones_have_their_median_length_in_the_frame_of_a_position_and_nearly_their_own_elsewhere():
+    """The bone from joint 0 to joint 1 is 1, 1, 1, 2 and 3 m long, with a median of 1 m."""
+    x = torch.zeros(1, 5, 6)
+    x[0, :, 3] = torch.tensor([1.0, 1.0, 1.0, 2.0, 3.0])
+    free = torch.ones(1, 5, 6, dtype=torch.bool)
+    bones = torch.tensor([[2], [0], [1]])
+    frame, joint, axis = (torch.tensor([number]) for number in (2, 1, 1))
+    goal = Positions(frame, joint, axis, torch.tensor([0.3]))
+    moved = reach(x, lambda y: y.unflatten(-1, (2, 3)), goal, bones, free, smoothness=0.5)
+    joints = moved[0].unflatten(-1, (2, 3))
+    lengths = (joints[:, 1] - joints[:, 0]).norm(dim=-1)
+    share = np.exp(-0.5 * (1 / 0.5) ** 2)  # of the neighboring frames
+    assert lengths.tolist() == pytest.approx([1, 1, 1, share + (1 - share) * 2, 3], abs=0.006)
+    assert joints[2, 1, 1].item() == pytest.approx(0.3, abs=0.006)
+
+
 def test_waypoints_joints_and_poses_are_reached(model, tmp_path):
     bow = flame_mdm.generate(model, "a person bows", seconds=2, num_inference_steps=10)[0]
     bow.save(tmp_path / "bow.npz")
@@ -228,6 +381,109 @@ def test_waypoints_joints_and_poses_are_reached(model, tmp_path):
     assert pose[0, [0, 2]].tolist() == pytest.approx([0.2, 0.5])
     left = (pose[1] - pose[2] + pose[16] - pose[17]).numpy()
     assert np.degrees(np.arctan2(-left[2], left[0])) == pytest.approx(90, abs=1e-3)
+
+
+def root_targets(frames: list[int], axis: int, values: list[float]) -> Targets:
+    index = torch.tensor(frames)
+    positions = Positions(index, 0 * index, torch.full_like(index, axis), torch.tensor(values))
+    return Targets(positions, ((12, torch.zeros(3)), (40, torch.ones(3))))
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize(
+    ("begin", "frames", "expected"),
+    [
+        # From the target in the window, in 19 of the 40 frames to the next one
+        (0, 30, [(10, 1.0), (29, 1 + 4 * 19 / 40)]),
+        # From the position at the beginning, 2 m, whose frame is the last one before the window
+        (20, 20, [(19, 2 + 3 * 20 / 31)]),
+        # The last frame of the window has a target.
+        (31, 20, [(19, 5.0)]),
+        # One frame earlier, the target is after the window.
+        (30, 20, [(19, 2 + 3 * 20 / 21)]),
+        (60, 20, [(10, 9.0)]),
+        (71, 20, []),
+    ],
+)
+def test_a_window_ends_on_the_way_to_the_next_target(axis, begin, frames, expected):
+    here = [2.0, -7.0] if axis == 0 else [-7.0, 2.0]
+    window = root_targets([10, 50, 70], axis, [1.0, 5.0, 9.0]).window(begin, frames, here)
+    positions = window.positions
+    assert positions.frames.tolist() == [frame for frame, _ in expected]
+    assert positions.values.tolist() == pytest.approx([value for _, value in expected])
+    assert set(positions.axes.tolist()) <= {axis}
+    poses = [frame - begin for frame in (12, 40) if begin <= frame < begin + frames]
+    assert [frame for frame, _ in window.poses] == poses
+
+
+def test_a_target_may_be_in_the_last_frame():
+    targets = root_targets([10, 50, 70], 0, [1.0, 5.0, 9.0])
+    targets.check_end(71, 20)
+    with pytest.raises(UserError, match=r"3\.5 seconds is after the end .* is at 3\.45 seconds"):
+        targets.check_end(70, 20)
+
+
+@pytest.mark.parametrize(
+    ("content", "refused"),
+    [
+        ({"joints": [(0.0, [None, 2.5, None])]}, None),
+        ({"joints": [(0.0, [None, 2.51, None])]}, "2.51 m is out of reach"),
+        ({"joints": [(0.0, [None, -0.1, None])]}, None),
+        ({"joints": [(0.0, [None, -0.11, None])]}, "-0.11 m is out of reach"),
+        # 8 m/s, and 2.5 m for the body
+        ({"root": [(1.0, [0.0, 10.5])]}, None),
+        ({"root": [(1.0, [0.0, 10.6])]}, "10.6 m from the start in 1 seconds is too far"),
+        ({"root": [(1.0, [0.0, 10.0]), (1.5, [6.0, 12.4])]}, None),
+        ({"root": [(1.0, [0.0, 10.0]), (1.5, [6.0, 12.6])]}, "6.5 m from .* in 0.5 seconds"),
+        ({"root": [(1.0, [0.0, 1.0])] * 300}, None),
+        (
+            {"root": [(1.0, [0.0, 1.0])] * 300, "joints": [(1.0, [None, 1.0, None])]},
+            "601 coordinates are too many. Use at most 600",
+        ),
+    ],
+)
+def test_targets_have_limits(model, content, refused):
+    names = {"root": {}, "joints": {"joint": "head"}}
+    listed = {
+        kind: [{"time": time, "position": position} | names[kind] for time, position in entries]
+        for kind, entries in content.items()
+    }
+    if refused is None:
+        read_targets(model.representation, listed)
+    else:
+        with pytest.raises(UserError, match=refused):
+            read_targets(model.representation, listed)
+
+
+def test_the_distance_from_a_target_is_that_in_space_over_its_requested_coordinates(model):
+    content = {
+        "root": [{"time": 0.1, "position": [0.3, 0.4]}, {"time": 0.05, "position": [None, -0.2]}],
+        "joints": [{"time": 0.1, "joint": "head", "position": [0.2, 0.3, 0.6]}],
+    }
+    targets = read_targets(model.representation, content)
+    still = flame_mdm.Motion(np.zeros((3, 22, 3), np.float32), 20)
+    np.testing.assert_allclose(errors(still, targets), [0.2, 0.5, 0.7], rtol=1e-6)
+
+
+def test_poses_leave_the_root_free_and_bones_are_kept_where_a_joint_is_led(model, monkeypatch):
+    representation = model.representation
+    features = torch.randn(263)
+    frames = torch.tensor([4, 9])
+    positions = Positions(
+        frames, torch.tensor([0, 20]), torch.tensor([0, 1]), torch.tensor([0.5, 1.2])
+    )
+    edit = Targets(positions, ((7, features),)).edit(representation, 12, CPU)
+    of_root = representation.joint_features([0])
+    assert edit.keep[0, 7].tolist() == (~of_root).tolist()
+    assert edit.keep.sum() == (~of_root).sum()
+    torch.testing.assert_close(edit.known[0, 7], representation.normalize(features))
+    guide: Any = edit.guide
+    assert guide.bones.T.tolist() == [[9, *edge] for edge in representation.skeleton.edges]
+    # A correction fades over 0.2 seconds.
+    smoothness = []
+    monkeypatch.setattr(targets_module, "reach", lambda x, *rest: smoothness.append(rest[-1]) or x)
+    replace(guide, fps=30.0).reach(torch.zeros(1, 12, 263))
+    assert smoothness == [pytest.approx(6)]
 
 
 def test_bad_targets_give_one_clear_line(model, tmp_path, subtests):

@@ -6,6 +6,7 @@ import re
 import shutil
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from torch import Tensor
 
 import flame_mdm
 from flame_mdm import generate, stream
-from flame_mdm.batch import Condition
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.data.standing import standing
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.denoisers import Denoiser
@@ -26,13 +27,14 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling import streams as streams_module
 from flame_mdm.sampling import waypoints
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
 from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
-from flame_mdm.sampling.streams import Schedule, Streams, starting_point
-from flame_mdm.sampling.targets import errors, read_targets
+from flame_mdm.sampling.streams import OnlineCleanup, Schedule, Streams, starting_point
+from flame_mdm.sampling.targets import Targets, errors, read_targets
 from flame_mdm.sampling.waypoints import bends
 
 CONTEXT, BLOCK, FPS = 10, 30, 20.0
@@ -404,6 +406,88 @@ def test_online_cleanup_waits_for_one_block_and_has_no_jump_between_blocks(walk)
     assert jumps(clean)[seams].max() <= 1.2 * jumps(clean)[~seams].max()
     assert jumps(clean).max() < jumps(raw).max()
     assert jumps(clean).mean() < 0.8 * jumps(raw).mean()
+
+
+def test_online_cleanup_moves_blocks_over_the_floor_and_blends_heights(monkeypatch):
+    """The stand-in for cleanup moves all joints by the number of its frames times (1, 10, 100)."""
+    direction = np.array([1.0, 10.0, 100.0], np.float32)
+
+    def moved(joints: np.ndarray, fps: float, skeleton: Any, contacts: np.ndarray) -> np.ndarray:
+        assert (fps, len(contacts)) == (30.0, len(joints))
+        return joints + len(joints) * direction
+
+    monkeypatch.setattr(streams_module, "clean_joints", moved)
+    representation: Any = SimpleNamespace(contacts=lambda features: features[:, :2])
+    cleanup = OnlineCleanup(representation)
+    rng = np.random.default_rng(0)
+    blocks = [
+        Motion(
+            rng.normal(size=(count, 22, 3)).astype(np.float32),
+            30.0,
+            features=np.zeros((count, 4), np.float32),
+            representation="humanml3d",
+        )
+        for count in (4, 6, 5, 7)
+    ]
+    assert cleanup.add(blocks[0]) is None
+    results = [cleanup.add(block) for block in blocks[1:]]
+    # The first block is cleaned with 10 frames, the next ones with 10 and then 15 or 18 frames.
+    heights = [np.full(4, 100.0), np.linspace(100, 150, 6), np.linspace(150, 180, 5)]
+    for result, block, height in zip(results, blocks, heights, strict=False):
+        assert result is not None
+        assert (result.cleanup, result.representation, result.features.size) == (True, "", 0)
+        offset = np.stack([np.full_like(height, 10), height, np.full_like(height, 1000)], -1)
+        np.testing.assert_allclose(result.joints, block.joints + offset[:, None], atol=1e-3)
+
+
+def test_times_are_rounded_to_the_nearest_frame(model):
+    running = stream(model, "a person walks")
+    running.change("a person sits down", at=2.29)
+    blocks = list(islice(running, 3))
+    assert [len(block.joints) for block in blocks] == [30, 16, 30]
+    running.go_back(2.69)
+    assert running.frames == 54
+    running.change("a person waves", at=2.7)  # in the next frame
+    assert next(running).text == "a person waves"
+
+
+def test_a_path_is_straight_from_where_the_last_block_ended(model, monkeypatch):
+    """The way to a target starts at the root of the last frame."""
+    starts, ends = [], []
+    window = Targets.window
+
+    def recorded(self: Targets, begin: int, frames: int, here: Any) -> Targets:
+        starts.append([begin, *here])
+        return window(self, begin, frames, here)
+
+    monkeypatch.setattr(Targets, "window", recorded)
+    running = Streams(
+        model, ["#0"], ["a person walks"], *starting_point(model, None), SamplerOptions()
+    )
+    goal = {"root": [{"time": 4.0, "position": [0.5, 1.0]}]}
+    running.targets = read_targets(model.representation, goal)
+    for _ in range(2):
+        (block,) = next(running)
+        ends.append(block.joints[-1, 0, [0, 2]].tolist())
+    next(running)
+    assert starts[0] == [0, 0.0, 0.0]
+    for start, frame, end in zip(starts[1:], (30, 60), ends, strict=True):
+        assert start == pytest.approx([frame, *end], abs=1e-5)
+
+
+def test_a_replication_has_its_own_noise(model):
+    prefix, _ = starting_point(model, None)
+    batch = MotionBatch(
+        prefix[:, :1].expand(1, BLOCK, -1),
+        torch.ones(1, BLOCK, dtype=torch.bool),
+        ["a"],
+        text=["a person walks"],
+    )
+    first, again, other = (
+        model.generate(batch, prefix=prefix, replication=number) for number in (0, 0, 1)
+    )
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other, atol=1e-3)
 
 
 def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):

@@ -19,16 +19,21 @@ from support.runs import TINY, ended, forked
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchmetrics import MeanMetric
 
+from flame_mdm import task as task_module
 from flame_mdm.__main__ import main
+from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
+from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.runs import read_history
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
-from flame_mdm.task import GeneratorTask
-from flame_mdm.training.callbacks import SampleMotions
+from flame_mdm.task import GeneratorTask, Task
+from flame_mdm.training import callbacks
+from flame_mdm.training.callbacks import Measurements, SampleMotions
+from flame_mdm.training.guards import BadLoss
 
 STEPS = [
     "trainer.val_check_interval=4",
@@ -373,6 +378,178 @@ def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
     # The last step is the mean of the posterior, which is the estimate itself.
     np.testing.assert_allclose(stages[3].joints, motion.joints, atol=1e-5)
     assert np.abs(stages[0].joints - motion.joints).max() > 1e-3
+
+
+class Stub(GeneratorTask):
+    """A task without a network."""
+
+    def __init__(self, **attributes: Any) -> None:
+        Task.__init__(self, optimizer={}, seed=0)
+        self.__dict__ |= attributes
+
+
+def running(step: int, **attributes: Any) -> Any:
+    """A trainer at a step, of 3 processes that accumulate 2 batches of 4 of 60 clips."""
+    return SimpleNamespace(
+        global_step=step,
+        log_every_n_steps=5,
+        datamodule=SimpleNamespace(batch_size=4, train=range(60), val=[]),
+        world_size=3,
+        accumulate_grad_batches=2,
+        callback_metrics={},
+        logged_metrics={},
+        loggers=[],
+        current_epoch=0,
+        precision="32-true",
+        strategy=SimpleNamespace(root_device=torch.device("cpu")),
+        **attributes,
+    )
+
+
+def test_speed_is_that_of_the_steps_since_the_last_log_or_validation(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(callbacks, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    measurements, task, trainer = Measurements(), Stub(), running(10)
+
+    def logged(step: int, seconds: float) -> dict[str, float]:
+        trainer.global_step, clock[0] = step, seconds
+        trainer.logged_metrics.clear()
+        measurements.on_train_batch_end(trainer, task)
+        return {name: float(value) for name, value in trainer.logged_metrics.items()}
+
+    measurements.on_train_start(trainer, task)
+    task.reported["train/loss"] = torch.tensor(3.0)
+    assert logged(14, 15.0) == {}
+    pace = {"train/samples_per_second": 6.0, "train/seconds_per_step": 4.0}
+    assert logged(15, 20.0) == {"train/loss": 3.0, "train/epochs": 15 * 24 / 60} | pace
+    assert logged(15, 21.0) == {}  # gradients are accumulated
+    trainer.global_step, clock[0] = 17, 100.0
+    measurements.on_validation_end(trainer, task)
+    pace = {"train/samples_per_second": 12.0, "train/seconds_per_step": 2.0}
+    assert logged(20, 106.0) == {"train/epochs": 20 * 24 / 60} | pace
+
+
+def test_a_checkpoint_holds_the_hours_and_the_greatest_memory_of_all_parts_of_a_run(monkeypatch):
+    clock, memory = [100.0], SimpleNamespace(ru_maxrss=3 * 2**20)
+    monkeypatch.setattr(callbacks, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(callbacks, "getrusage", lambda _: memory)
+    monkeypatch.setattr(callbacks, "sys", SimpleNamespace(platform="linux"))
+    measurements, task, trainer = Measurements(), Stub(), running(10)
+    earlier = {"facts": {"training": {"hours": 1.5, "memory_gib": 2.0}}}
+    measurements.on_load_checkpoint(trainer, task, earlier)
+    measurements.on_train_start(trainer, task)
+    for seconds, kilobytes, hours, gib in (
+        (1900.0, 3 * 2**20, 2.0, 3.0),
+        (3700.0, 2**20, 2.5, 2.0),
+    ):
+        clock[0], memory.ru_maxrss = seconds, kilobytes
+        measurements.on_save_checkpoint(trainer, task, {})
+        training = task.facts["training"]
+        assert (training["hours"], training["memory_gib"], training["processes"]) == (hours, gib, 3)
+
+
+def test_samples_are_written_at_the_first_chance_after_their_number_of_steps(tmp_path, monkeypatch):
+    """A resumed run counts from the step at which it resumes."""
+    written = []
+    monkeypatch.setattr(
+        SampleMotions, "write", lambda _, trainer, __: written.append(trainer.global_step)
+    )
+    samples = SampleMotions(str(tmp_path), every_n_steps=50, prompts=[], seconds=1.0)
+    task = Stub(generator=SimpleNamespace(condition=None))
+    task.facts = {"actions": []}
+    samples.on_train_start(running(120), task)
+    for step in (149, 169, 170, 171, 219, 230, 231, 269, 270):
+        samples.on_train_batch_end(running(step), task)
+    assert written == [170, 230, 270]
+
+
+@pytest.mark.parametrize(("count", "stride"), [(130, 3), (64, 1), (65, 2)])
+def test_metrics_of_real_motions_are_those_of_up_to_64_clips_with_all_requested_attributes(
+    tmp_path, count, stride
+):
+    """Every second clip lacks an attribute that all prompts request."""
+
+    class Motions(list[Any]):
+        def __init__(self) -> None:
+            self.clips = [
+                SimpleNamespace(
+                    attributes={"action": k, "speed": -k, "hand": 0} if k % 2 else {"speed": k}
+                )
+                for k in range(2 * count)
+            ]
+
+        def __getitem__(self, index: Any) -> Any:
+            return "", torch.full((3, 1), float(index[0]))
+
+    prompts = [("walks", {"action": 1, "speed": 2}), ("jumps", {"action": 1})]
+    samples = SampleMotions(str(tmp_path), every_n_steps=1, prompts=prompts, seconds=1.0)
+    measured: list[Any] = []
+    samples.measure = lambda motions, requested: measured.extend((motions, requested)) or {}  # type: ignore[method-assign]
+    representation = SimpleNamespace(mean=torch.zeros(1), to_joints=lambda x: x)
+    task = Stub(generator=SimpleNamespace(representation=representation))
+    samples._measure_real(Motions(), task)  # type: ignore[arg-type]
+    motions, requested = measured
+    rows = list(range(1, 2 * count, 2))[::stride]
+    assert [int(motion[0, 0]) for motion in motions] == rows
+    assert requested == [{"action": row, "speed": -row} for row in rows]
+
+
+def test_a_loss_is_bad_above_a_thousand_times_the_median_of_the_interval_before(tmp_path):
+    guard, task = BadLoss(str(tmp_path)), Stub()
+    trainer = running(0, global_rank=0, is_global_zero=True)
+    trainer.world_size, trainer.log_every_n_steps = 1, 3
+    batch = MotionBatch(torch.zeros(1, 2, 1), torch.ones(1, 2) > 0, ["clip"])
+
+    def end(step: int, loss: float) -> None:
+        trainer.global_step = step
+        guard.on_train_batch_end(trainer, task, {"loss": torch.tensor(loss)}, batch, step - 1)
+
+    for step, loss in enumerate((1.0, 2.0, 900.0, 3.0, 1999.0, 1.0, 2.0, 2999.0), start=1):
+        end(step, loss)
+    with pytest.raises(UserError, match=r"the loss at step 9 is 3001 \(typical: 3\)"):
+        end(9, 3001.0)
+    bad = json.loads((tmp_path / "bad_batch.json").read_text())
+    assert (bad["step"], bad["usual_loss"], bad["batches"][0]["loss"]) == (9, "3.0", "3001.0")
+    assert (bad["batches"][0]["batch"], bad["batches"][0]["ids"]) == (8, ["clip"])
+
+
+def test_the_draws_of_a_step_depend_on_seed_batch_and_process(monkeypatch):
+    numbers = []
+
+    def seeded(number: int, device: torch.device) -> None:
+        numbers.append(number)
+        raise StopIteration
+
+    monkeypatch.setattr(task_module, "seed_generator", seeded)
+    for seed, batch, rank in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0)):
+        stub: Any = SimpleNamespace(seed=seed, global_rank=rank, device=torch.device("cpu"))
+        with pytest.raises(StopIteration):
+            GeneratorTask.training_step(stub, cast(Any, None), batch)
+    assert len(set(numbers)) == 4
+    assert numbers[1] == numbers[4]
+
+
+def test_a_clip_is_validated_with_its_own_time_noise_and_target_in_every_batch(monkeypatch):
+    drawn: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(
+        task_module, "_conditioned", lambda _, __, batch, v: drawn.append((v,)) or (batch, None)
+    )
+
+    def loss_terms(batch: MotionBatch, cond: Any, u: Any, noise: Any) -> dict[str, Any]:
+        drawn[-1] = (*drawn[-1], u, noise)
+        return {}
+
+    stub: Any = SimpleNamespace(
+        device=torch.device("cpu"), generator=None, targets=None, loss_terms=loss_terms
+    )
+    for names in (["a", "b"], ["b", "c", "a"]):
+        batch = MotionBatch(torch.zeros(len(names), 4, 3), torch.ones(len(names), 4) > 0, names)
+        GeneratorTask.losses_of(stub, batch)
+    first, second = drawn
+    for one, other in zip(first, second, strict=True):
+        assert torch.equal(one, other[[2, 0]])
+        assert not torch.equal(other[0], other[1])
+    assert not torch.equal(first[0], first[1])
 
 
 @pytest.mark.parametrize("collapsed", [False, True])

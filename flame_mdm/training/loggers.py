@@ -22,7 +22,8 @@ from flame_mdm.schemas import read_json
 class History(Logger):
     """Appends all logged values to `metrics.jsonl` in the run directory.
 
-    A resumed run drops the lines after `step`.
+    Lightning counts steps from 0. A run that resumes after `step` steps keeps the lines of steps 0
+    ... `step` - 1, and drops later lines.
     """
 
     def __init__(self, folder: str | Path, step: int = 0):
@@ -48,10 +49,10 @@ class History(Logger):
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Appends a line of metrics.
 
-        A resumed run first drops the lines after the step from which it resumes.
+        A resumed run first drops the lines of steps that it repeats.
         """
         if not self.begun:
-            kept = [line for line in records(self.path) if line["step"] <= self.step]
+            kept = [line for line in records(self.path) if line["step"] < self.step]
             write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
             self.begun = True
         with open_in_place(self.path) as file:

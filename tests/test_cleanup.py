@@ -5,13 +5,23 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter1d
 from support.motions import posed, synthetic
 
 from evaluators.metrics.attributes import read_attributes
 from evaluators.metrics.physics import FootSkating
 from evaluators.perturbations import draw_in
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.formats.cleanup import cleaned, cleanup
+from flame_mdm.formats.cleanup import (
+    _constant_bones,
+    _contacts,
+    _follow_feet,
+    _push_out,
+    _smooth,
+    bend,
+    cleaned,
+    cleanup,
+)
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
@@ -148,6 +158,118 @@ def test_a_foot_that_is_in_contact_with_even_odds_is_held_too():
     assert moved[2] <= moved[1] < 0.5 * moved[0]
 
 
+def test_paths_are_those_of_whittaker_with_pops_cut_off():
+    """A loop with dense matrices: 0.034 times squared third differences, and half a weight at 3 cm."""
+    rng = np.random.default_rng(0)
+    path = rng.normal(0, 0.01, (40, 3)).cumsum(0)
+    path[20] += [0.3, 0.0, -0.2]
+    third = np.diff(np.eye(40), n=3, axis=0)
+    weight, expected = np.ones(40), path
+    for _ in range(4):
+        matrix = np.diag(weight) + 0.034 * third.T @ third
+        expected = np.linalg.solve(matrix, weight[:, None] * path)
+        weight = 1 / (1 + (np.linalg.norm(path - expected, axis=1) / 0.03) ** 2)
+    np.testing.assert_allclose(_smooth(path[:, None])[:, 0], expected, atol=1e-9)
+
+
+def test_bones_have_their_median_length_and_their_own_direction():
+    motion = posed(5).joints.astype(float)
+    elbow, wrist = (SMPL22.joints.index(f"left_{name}") for name in ("elbow", "wrist"))
+    direction = np.array([0.6, 0.0, 0.8])
+    motion[:, wrist] = motion[:, elbow] + np.outer([0.2, 0.2, 0.3, 0.7, 0.9], direction)
+    bone = np.diff(_constant_bones(motion, SMPL22)[:, [elbow, wrist]], axis=1)[:, 0]
+    np.testing.assert_allclose(bone, np.tile(0.3 * direction, (5, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+def test_a_toe_is_on_the_floor_if_it_is_low_and_slower_than_half_the_body(fps):
+    """The left toe is still on the floor, the right one moves at 0.25 m/s and lifts. The body becomes faster."""
+    speeds = np.repeat([0.6, 1.2], [20, 19])
+    root = np.zeros((40, 3))
+    root[1:, 0] = speeds.cumsum() / fps
+    toes = np.zeros((40, 2, 3))
+    toes[..., 1] = 0.5  # of the floor
+    toes[5, :, 1] = 0.2  # a glitch
+    toes[:, 1, 2] = 0.25 * np.arange(40) / fps
+    toes[10:, 1, 1] += np.repeat([0.035, 0.0, 0.08], 10)
+    travel = gaussian_filter1d(speeds, 0.15 * fps, mode="nearest")
+    slow = (1 - (0.25 / (0.5 + 0.5 * travel)) ** 2) ** 2
+    low = (1 - 0.5**2) ** 2
+    # From each frame to the next one: the greater height of both counts.
+    expected = slow * np.array([1.0] * 9 + [low] * 11 + [1.0] * 9 + [0.0] * 10)
+    contacts = _contacts(toes, root, fps, 0.5)
+    np.testing.assert_allclose(contacts[:, 0], np.ones(39), atol=1e-9)
+    np.testing.assert_allclose(contacts[:, 1], expected, atol=1e-9)
+
+
+def test_feet_may_slide_with_half_of_the_body_before_and_two_fifths_after_it_follows_them(
+    monkeypatch,
+):
+    shares = []
+
+    def recorded(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
+        shares.append(share)
+        return _contacts(toes, root, fps, share)
+
+    monkeypatch.setattr("flame_mdm.formats.cleanup._contacts", recorded)
+    cleanup(synthetic("walk").joints[:8], FPS, SMPL22)
+    assert shares == [0.5, 0.4]
+
+
+def test_the_shift_of_a_foot_is_a_least_squares_solution():
+    """Steps of planted feet count 30, positions 0.03, and second differences 0.1. The body slides by 6 mm per frame."""
+    slides = posed(30, root=np.arange(30)[:, None] * [0.006, 0, 0] + [0, 0.955, 0])
+    contacts = np.zeros((30, 4))
+    contacts[8:16] = 0.5  # counts half
+    first, second = (np.diff(np.eye(30), n=order, axis=0) for order in (1, 2))
+    weight = np.zeros(29)
+    weight[8:16] = 30 * 0.5
+    matrix = first.T @ (weight[:, None] * first) + 0.03 * np.eye(30) + 0.1 * second.T @ second
+    shift = np.linalg.solve(matrix, first.T @ (weight * -0.006))
+    toe = SMPL22.joints.index("left_foot")
+    moved = cleanup(slides.joints, FPS, SMPL22, contacts)[:, toe] - slides.joints[:, toe]
+    np.testing.assert_allclose(moved[:, 0], shift, atol=1e-4)
+    np.testing.assert_allclose(moved[:, 2], 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+@pytest.mark.parametrize("speed", [0.19, 0.22, 0.25, 0.28, 0.4])
+def test_a_body_that_slides_fast_follows_its_feet(fps, speed):
+    """The legs compensate for slow drifts of up to 0.2 m/s, and for none above 0.3 m/s."""
+    motion = np.zeros((60, 3, 3))
+    motion[:, 0, 1] = 1.0
+    motion[..., 0] = speed / fps * np.arange(60)[:, None]
+    followed = np.diff(_follow_feet(motion, [1, 2], fps)[:, :, 0], axis=0) * fps
+    weight = 2 * (1 - (speed / (0.5 + 0.5 * speed)) ** 2) ** 2
+    drift = speed * weight / (weight + 0.01)
+    expected = speed - drift * np.clip(2 * drift / 0.2 - 2, 0, 1)
+    np.testing.assert_allclose(followed[25:35], expected, rtol=1e-3, atol=1e-4)
+
+
+def test_of_two_feet_that_slide_the_slower_one_counts_more_at_any_rate():
+    """The body moves at 0.35 m/s over feet that slide at 0.25 and 0.6 m/s."""
+    speeds = []
+    for fps in (20.0, 30.0, 60.0):
+        motion = np.zeros((80, 3, 3))
+        motion[:, 0, 1] = 1.0
+        motion[..., 0] = np.outer(np.arange(80) / fps, [0.35, 0.25, 0.6])
+        followed = _follow_feet(motion, [1, 2], fps)[:, 1, 0]
+        speeds.append(np.diff(followed)[35:45].mean() * fps)
+    assert speeds == pytest.approx([0.1198] * 3, abs=1e-4)
+
+
+def test_a_leg_is_stretched_to_999_thousandths_and_its_knee_stays_in_front():
+    motion = np.array([[[0, 1.0, 0], [0, 0.6, 0.3], [0, 0.2, 0], [0, 0.2, 0.1]]] * 3)
+    shift = np.array([[0, 0, 0], [0, 0.1, 0.0], [0, -9.0, 0]])
+    bent = motion.copy()
+    bend(bent, [0, 1, 2, 3], shift)
+    np.testing.assert_allclose(bent[0], motion[0], atol=1e-9)
+    np.testing.assert_allclose(bent[1, 2:], motion[1, 2:] + shift[1], atol=1e-9)
+    np.testing.assert_allclose(bent[1, 1], [0, 0.65, np.sqrt(0.25 - 0.35**2)], atol=1e-9)
+    np.testing.assert_allclose(bent[2, 2], [0, 1 - 0.999, 0], atol=1e-9)
+    np.testing.assert_allclose(bent[2, 3] - bent[2, 2], [0, 0, 0.1], atol=1e-9)
+
+
 def test_a_foot_that_lands_does_not_skate():
     motion = torch.full((3, 22, 3), 0.5)
     for toe in (10, 11):
@@ -177,6 +299,19 @@ def test_hands_leave_the_body_without_a_jolt(clips):
     jerk = [np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1).mean() for x in (motion, after)]
     assert jerk[1] < 1.1 * jerk[0]
     assert np.ptp(bones(after), axis=0).max() < 1e-5
+
+
+@pytest.mark.parametrize(("fps", "reach"), [(20.0, 9), (40.0, 18)])
+def test_a_hand_begins_to_avoid_the_body_half_a_second_before(fps, reach):
+    """The shift of one frame is held for 0.15 s before and after it, and fades over four times half of that."""
+    walk = synthetic("walk").joints[:1].astype(float)
+    motion = np.repeat(walk, 81, axis=0)
+    motion[40] = draw_in(walk, 25)[0]
+    before = motion.copy()
+    for side in ("left", "right"):
+        _push_out(motion, SMPL22, side, fps)
+    moved = np.flatnonzero(np.abs(motion - before).max((1, 2)) > 1e-9)
+    assert (moved.min(), moved.max()) == (40 - reach, 40 + reach)
 
 
 def test_any_length_and_skeleton(subtests):

@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from support.runs import built, reference
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from flame_mdm import task as task_module
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch, collate, length_mask
 from flame_mdm.checkpoints.model_files import read_checkpoint
@@ -285,6 +288,39 @@ def test_the_loss_of_targets_is_measured_at_the_end_of_each_motion():
     assert padded["target"].min() > 0.01
     for name in ("target", "loss"):
         torch.testing.assert_close(padded[name][1:], alone[name])
+
+
+def test_a_motion_has_no_target_with_the_given_probability(monkeypatch):
+    monkeypatch.setattr(
+        task_module,
+        "_conditioned",
+        lambda _, __, batch, u: (batch, Condition(u[:, None], batch.x[:, :0], None)),
+    )
+    conditions: list[Condition] = []
+
+    def loss_terms(batch: MotionBatch, cond: Condition) -> dict[str, Tensor]:
+        conditions.append(cond)
+        return {"loss": batch.x.sum((1, 2))}
+
+    stub: Any = SimpleNamespace(
+        seed=0,
+        global_rank=0,
+        device=torch.device("cpu"),
+        generator=None,
+        targets=SimpleNamespace(drop_prob=0.2),
+        loss_terms=loss_terms,
+        is_reported=False,
+    )
+    x = torch.zeros(4000, 1, 1)
+    batch = MotionBatch(x, x[..., 0] == 0, [""] * 4000)
+    GeneratorTask.training_step(stub, batch, 0)
+    (cond,) = conditions
+    assert cond.target_mask is not None
+    assert cond.target_mask.float().mean() == pytest.approx(0.8, abs=0.02)
+    # Which targets are drawn does not depend on which motions have one.
+    u = cond.pooled[:, 0]
+    assert u[cond.target_mask].mean() == pytest.approx(0.5, abs=0.03)
+    assert u[~cond.target_mask].mean() == pytest.approx(0.5, abs=0.03)
 
 
 RUN = [

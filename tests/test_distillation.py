@@ -21,7 +21,7 @@ from torch.nn.utils import parameters_to_vector
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.batch import Denoise, MotionBatch
+from flame_mdm.batch import Denoise, MotionBatch, length_mask
 from flame_mdm.checkpoints.adapters import About, attach, copy_weights, word_rows, write_adapter
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
@@ -34,6 +34,7 @@ from flame_mdm.demo.request import DemoRequest
 from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.losses import masked_mse
 from flame_mdm.processes import Process
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
@@ -107,6 +108,42 @@ def test_the_exact_student_of_gaussian_data_has_no_loss(process):
     assert loss(process, student, times).max() < 1e-9
     exact[0] += 0.1
     assert loss(process, student, times)[0] > 1e-3
+
+
+@pytest.mark.parametrize("process", PROCESSES, ids=name)
+def test_padding_is_no_part_of_the_losses_of_a_student(process):
+    times = torch.tensor(process.grid(4)).double()
+    x, noise = torch.randn(2, 2, 6, 3, generator=torch.Generator().manual_seed(0)).double()
+    mask = length_mask(torch.tensor([6, 2]))
+
+    def denoise(x_t: Tensor, *_: object) -> Tensor:
+        return 0.3 * x_t
+
+    def student(x_t: Tensor, *_: object) -> Tensor:
+        return torch.where(mask[..., None], 0.5 * x_t, 100.0)
+
+    def losses(rows: slice, frames: int, network: Denoise) -> dict[str, Tensor]:
+        return consistency_terms(
+            process,
+            network,
+            denoise,
+            denoise,
+            x[rows, :frames],
+            mask[rows, :frames],
+            NO_CONDITION,
+            times=times,
+            index=torch.tensor([1, 2])[rows],
+            noise=noise[rows, :frames],
+            auxiliary=lambda *motions: {"same": masked_mse(*motions)},
+        )
+
+    padded = losses(slice(None), 6, student)
+    alone = losses(slice(1, None), 2, lambda x_t, *_: 0.5 * x_t)
+    for term in ("consistency", "same", "loss"):
+        torch.testing.assert_close(padded[term][1:], alone[term])
+    # Geometric losses are computed between the same motions.
+    torch.testing.assert_close(padded["same"], padded["consistency"])
+    torch.testing.assert_close(padded["loss"], 2 * padded["same"])
 
 
 @pytest.mark.parametrize("process", PROCESSES[1:], ids=name)
@@ -681,6 +718,50 @@ def test_samples_of_the_base_cover_its_captions_evenly_and_a_tenth_is_for_valida
     assert [row for row, clip in enumerate(clips) if clip.split == "val"] == list(range(0, 300, 10))
     assert len({clip.id for clip in clips}) == 300
     assert requested == [(min(32, 300 - seed), 50, seed) for seed in range(0, 300, 32)]
+
+
+def test_an_adaptation_has_the_rate_and_the_crops_of_its_base_unless_they_are_chosen(
+    monkeypatch, tmp_path
+):
+    def resolved(recipe: Any, words: list[str], *_: Any) -> Any:
+        return {
+            "run": {},
+            "data": {"crop": {"max_frames": 196, "unit": 4}, "source": {}},
+            "optimizer": {"lr": 0.5 if "optimizer.lr=0.5" in words else 0.001},
+            "callbacks": {"samples": {}},
+        }
+
+    monkeypatch.setattr(adaptation, "resolve", resolved)
+    monkeypatch.setattr(adaptation, "prepare_overrides", lambda _, words: (words,))
+    monkeypatch.setattr(adaptation, "needs_rotations", lambda _: True)
+    parts = {part: {"of": part} for part in adaptation.OF_BASE}
+    base: dict[str, Any] = parts | {
+        "task": {"_target_": "flame_mdm.task.GeneratorTask", "cond_drop_prob": 0.2},
+        "optimizer": {"lr": 0.0123},
+        "data": {"crop": {"max_frames": 52, "unit": 2}},
+    }
+    facts = {"max_frames": 63, "captions": ["a person sits", "a person runs", "he bows", "he hops"]}
+    model: Any = SimpleNamespace(config=base, facts=facts, representation=None)
+    captions = [f"text {number}" for number in range(7)]
+
+    def recipe(*words: str) -> Any:
+        return adaptation._recipe(model, captions, "limp", tmp_path, words)
+
+    taught = recipe()
+    assert (taught["optimizer"]["lr"], taught["data"]["crop"]) == (0.0123, base["data"]["crop"])
+    assert (taught["data"]["name"], taught["data"]["source"]["motion"]) == ("limp", "smpl")
+    assert taught["callbacks"]["samples"]["prompts"] == [
+        f"{text} in limp style"
+        for text in ("text 0", "text 3", "text 6", "a person sits", "a person runs", "he bows")
+    ]
+    assert taught["task"] == {"_target_": adaptation.TASK, "cond_drop_prob": 0.2}
+    assert all(taught[part] == parts[part] for part in parts if part != "task")
+    # A released model has no data: crops are as long as its longest motion, in multiples of 4 frames.
+    model.config = {name: value for name, value in base.items() if name != "data"}
+    taught = recipe("optimizer.lr=0.5")
+    assert (taught["optimizer"]["lr"], taught["data"]["crop"]["max_frames"]) == (0.5, 60)
+    with pytest.raises(UserError, match="keeps the denoiser of its base model"):
+        recipe("denoiser.latent_dim=8")
 
 
 def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):

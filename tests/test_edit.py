@@ -23,7 +23,7 @@ from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.editing import Edited, _part_length, edit
-from flame_mdm.sampling.reading import decoded, read_motion
+from flame_mdm.sampling.reading import decoded, part_of, read_motion, with_features
 from flame_mdm.seeds import seeded_noise
 
 CLIP = "synthetic:synthetic_0_000003"
@@ -190,6 +190,38 @@ def test_parts_of_an_edit_share_what_the_durations_leave(seconds, frames):
             _part_length(parts, 60, 20)
     else:
         assert _part_length(parts, 60, 20) == frames
+
+
+def test_the_error_of_kept_joints_includes_cleanup(diffusion, motion):
+    result = edit(diffusion, motion, region="prediction", cleanup=True)[0]
+    kept = int(0.25 * len(motion.joints))
+    moved = np.linalg.norm(result.joints - motion.joints, axis=-1)[:kept].max()
+    assert moved > 1e-4
+    assert result.joint_error == pytest.approx(moved)
+    assert result.feature_error == 0
+
+
+def test_a_part_of_a_motion_begins_and_ends_at_the_nearest_frame(diffusion, motion):
+    """At 20 frames per second, 0.52 s is 10.4 frames, and 1.23 s is 24.6 frames."""
+    part = part_of(diffusion.representation, motion, [0.52, 1.23])
+    np.testing.assert_allclose(part.features[:, 4:67], motion.features[10:25, 4:67], atol=1e-4)
+    assert len(part.features) == 15
+
+
+def test_the_last_frame_of_a_read_motion_steps_on_at_the_same_height(diffusion):
+    """Features have a row for each pair of frames, so that the last frame is continued over the floor."""
+    representation = diffusion.representation
+    joints = np.repeat(walk(20)[:1], 12, axis=0)
+    joints = joints + np.arange(12)[:, None, None] * np.array([0.01, 0.02, 0.03])
+    read = with_features(representation, Motion(joints, 20.0))
+    assert len(read.features) == 12
+    steps = np.diff(read.joints[:, 0], axis=0)
+    np.testing.assert_allclose(np.hypot(steps[:, 0], steps[:, 2]), np.hypot(0.01, 0.03), atol=1e-5)
+    velocities = read.features[:, representation.slices["velocities"]].reshape(12, 22, 3)
+    np.testing.assert_allclose(velocities[:-1, :, 1], 0.02, atol=1e-5)
+    np.testing.assert_allclose(velocities[-1, :, 1], 0, atol=1e-5)
+    np.testing.assert_allclose(velocities[-1, :, 2], velocities[-2, :, 2], atol=1e-5)
+    np.testing.assert_allclose(read.features[-1, 1:3], read.features[-2, 1:3], atol=1e-5)
 
 
 def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):

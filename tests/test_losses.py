@@ -177,6 +177,23 @@ def test_only_what_weighs_is_computed():
     )
 
 
+def test_all_losses_of_joints_are_relative_to_the_root_if_requested():
+    """The foot moves with the root in the data, so that it counts as in contact."""
+    x, mask, time = torch.zeros(1, 4, 9), torch.ones(1, 4, dtype=torch.bool), torch.arange(4.0)
+    x[0, :, [0, 3]] = 0.5 * time[:, None]
+    x0_hat = x.clone()
+    x0_hat[0, :, 3] += 0.3 * time
+    relative, absolute = (
+        MotionLosses(joints_as_features, [1], joints=1.0, foot_contact=1.0, root_relative=flag)(
+            x0_hat, x, mask
+        )
+        for flag in (True, False)
+    )
+    assert relative["foot_contact"].item() == pytest.approx(0.3**2 / 3)
+    assert absolute["foot_contact"] == 0
+    torch.testing.assert_close(relative["joints"], absolute["joints"])
+
+
 def test_losses_can_be_computed_in_a_validation_before_the_training():
     losses = MotionLosses(
         lambda x: x.unflatten(-1, (-1, 3)), [1], [(0, 1)], foot_contact=1.0, bone_length=1.0

@@ -76,6 +76,17 @@ def test_a_recipe_recomputes_activations_and_learns_the_same(tiny, tmp_path):
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
 
 
+def test_frames_of_a_prefix_take_the_place_of_frames_to_predict():
+    config = compose("humanml3d/mdm", [])
+    sizes = {"latent_dim": 16, "ff_size": 16, "num_layers": 1, "num_heads": 2, "dropout": 0.1}
+    decoder = sizes | {"_target_": "flame_mdm.denoisers.mdm.MDMDecoder"}
+    continued, whole = (
+        training_memory(config | {"denoiser": decoder | {"context_frames": count}})
+        for count in (90, 0)
+    )
+    assert continued.activations == pytest.approx(whole.activations, rel=0.05)
+
+
 def test_memory_follows_from_parameters_batch_size_and_averages():
     need = training_memory(compose("humanml3d/mdm", []))
     assert need.parameters == pytest.approx(17.88e6, rel=1e-3)

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -248,6 +249,70 @@ def test_a_set_has_files_with_a_path_and_in_place_and_a_description(small: Path)
     np.testing.assert_allclose(
         (moving.positions - shift)[:, bones], still.positions[:, bones], atol=1e-4
     )
+
+
+def test_the_description_has_meters_seconds_and_degrees(monkeypatch):
+    monkeypatch.setattr(motion_sets, "closure", lambda _: (0.0123456, 1.23456))
+    path = np.array([[1.0, 2.0], [1.3, 2.4], [1.3, 2.4], [1.3, 2.9], [1.3, 3.0]])
+    contacts = np.array([[True, False], [True, False], [False, True], [False, True], [False, True]])
+    motion = GroundedMotion(
+        np.zeros((5, 22, 3)), path, np.array([0.5, 1, 1, 1, 0.5 + np.pi / 2]), contacts, 30.0
+    )
+    entry = motion_sets._entry(Clip("Walk", "loop", motion, "walks"), None, {"in_place": "a"})  # type: ignore[arg-type]
+    assert (entry["frames"], entry["seconds"]) == (5, round(4 / 30, 4))
+    assert (entry["travel"], entry["turn"]) == ([0.3, 1.0], 90.0)
+    assert entry["speed"] == [15.0, 3.0]  # 0.5 m and 0.1 m in a thirtieth of a second
+    assert entry["closure"] == {"meters": 0.01235, "degrees": 1.235}
+    assert entry["planted_at_start"] == {"left": True, "right": False}
+    assert [(event["foot"], event["event"], event["frame"]) for event in entry["contacts"]] == [
+        ("left", "lift", 2),
+        ("right", "plant", 2),
+    ]
+
+
+def test_the_closure_of_a_loop_is_its_farthest_joint_and_its_largest_angle():
+    turns = np.tile(np.eye(3), (4, 3, 1, 1))
+    for joint, angle in ((1, 10), (2, -25)):
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        turns[-1, joint] = turns[0, joint] @ [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+    positions = np.zeros((4, 3, 3))
+    positions[-1] = [[0.03, 0.0, 0.04], [0.0, 0.01, 0.0], [0.02, 0.02, 0.0]]
+    clip: Any = SimpleNamespace(turns=turns, world=lambda: (positions, None))
+    assert motion_sets.closure(clip) == pytest.approx((0.05, 25.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "score"),
+    [
+        ({}, 0.0),
+        ({"slide": [0.01, 0.03, 0.02]}, 200 * 0.03),
+        ({"pivot": [1.0, 5.0, 2.0]}, 0.5),
+        ({"jolt": [4.0, 1.0, 9.0]}, 0.9),
+        ({"faulty": 7}, 3 * 7 * 0.2),
+        ({"difference": 0.04}, 4.0),
+        ({"slide": [0.01] * 3, "pivot": [1.0] * 3, "difference": 0.01}, 2 + 0.1 + 1),
+    ],
+)
+def test_candidates_are_compared_by_poses_feet_and_faults(monkeypatch, values, score):
+    """1 cm between poses counts as 0.5 cm of sliding, 10 degrees, 10 m/s² or 5 faulty frames."""
+    cycle = SimpleNamespace(difference=values.get("difference", 0.0))
+    monkeypatch.setattr(motion_sets.gaits, "find_cycle", lambda *_: cycle)
+    monkeypatch.setattr(motion_sets.gaits, "gait", lambda *_: (0, 1, 2))
+    for name in ("slide", "pivot", "jolt"):
+        measured = values.get(name, [0.0] * 3)
+        monkeypatch.setattr(motion_sets, name, lambda part, measured=measured: measured[part])
+    fault = SimpleNamespace(start=3, end=3 + values.get("faulty", 0))
+    monkeypatch.setattr(motion_sets, "find_faults", lambda _: [fault])
+    monkeypatch.setattr(motion_sets, "motion_of", lambda clip: clip)
+    walk: Any = SimpleNamespace(kind="gait", degrees=0.0, text="walks")
+    version = motion_sets._clips("Walk", walk, None, np.zeros((0, 3)))  # type: ignore[arg-type]
+    assert version is not None
+    assert version[0] == pytest.approx(score)
+    assert [(clip.name, clip.kind) for clip in version[1]] == [
+        ("Walk_Start", "start"),
+        ("Walk_Loop", "loop"),
+        ("Walk_Stop", "stop"),
+    ]
 
 
 def test_contacts_are_in_the_description_and_markers_in_the_files(small: Path, tmp_path: Path):

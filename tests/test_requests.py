@@ -4,29 +4,34 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_type_hints
 from unittest.mock import patch
 
 import numpy as np
 import pytest
+import torch
 from support.motions import synthetic
 from support.refusals import error_of, one_line_error
 
 import flame_mdm
 from flame_mdm.__main__ import main
+from flame_mdm.batch import Edit
 from flame_mdm.commands.sample import SampleSettings
 from flame_mdm.conditions import prompts
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
+from flame_mdm.processes.guidance import Positions
 from flame_mdm.sampler_options import SamplerOptions
-from flame_mdm.sampling import motion_request, resolution
-from flame_mdm.sampling.generation import best
+from flame_mdm.sampling import generation, motion_request, resolution
+from flame_mdm.sampling.generation import _edit, _stages, best
 from flame_mdm.sampling.keywords import EditKeywords, SamplerKeywords, SamplingKeywords
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest, path_targets
+from flame_mdm.sampling.output import degenerate_notes
 from flame_mdm.sampling.resolution import resolve
-from flame_mdm.sampling.targets import read_targets
+from flame_mdm.sampling.targets import Targets, read_targets
 
 TEXT = "a person walks forward"
 FAST: dict[str, Any] = {"seconds": 1.5, "num_inference_steps": 4}
@@ -192,6 +197,64 @@ def test_a_path_begins_at_the_origin_and_ends_a_fifth_of_a_second_before_the_mot
     assert targets.keys() == {"root"}
     assert [entry["time"] for entry in targets["root"]] == times
     assert [tuple(entry["position"]) for entry in targets["root"]] == path
+
+
+def test_a_variation_with_targets_starts_from_the_motion_with_its_poses(model):
+    known = torch.randn(1, 20, 263)
+    kept = torch.zeros(1, 20, 263, dtype=torch.bool)
+    nothing = torch.zeros(0, dtype=torch.long)
+    pose = torch.randn(263)
+    targets = Targets(Positions(nothing, nothing, nothing, torch.zeros(0)), ((3, pose),))
+    resolved: Any = SimpleNamespace(edit=Edit(known, kept, strength=0.4), targets=targets)
+    edit = _edit(model, resolved, torch.zeros(2, 20, 263))
+    assert edit is not None
+    assert (edit.strength, edit.known.shape, edit.keep.shape) == (0.4, (2, 20, 263), (2, 20, 263))
+    body = ~model.representation.joint_features([0])
+    assert edit.keep[1].nonzero()[:, 0].unique().tolist() == [3]
+    assert torch.equal(edit.keep[0, 3], body)
+    expected = known[0].clone()
+    expected[3] = torch.where(body, model.representation.normalize(pose), expected[3])
+    torch.testing.assert_close(edit.known[1], expected)
+
+
+def test_stages_are_those_of_the_first_motion_and_batches_change_nothing(model, monkeypatch):
+    options: dict[str, Any] = {"samples": 3, "frames": 20, "num_inference_steps": 2}
+    stages: list[Motion] = []
+    whole = flame_mdm.generate(model, TEXT, **options)
+    monkeypatch.setattr(generation, "BATCH", 2)
+    motions = flame_mdm.generate(model, TEXT, stages=stages, **options)
+    assert [stage.text for stage in stages] == [
+        "estimate after 0% of the sampling",
+        "estimate after 50% of the sampling",
+        f"result: {TEXT}",
+    ]
+    for one, other in zip(motions, whole, strict=True):
+        np.testing.assert_allclose(one.joints, other.joints, atol=1e-4)
+    assert np.array_equal(stages[-1].joints, motions[0].joints)
+
+
+def test_stages_are_ten_estimates_at_equal_intervals(model):
+    motion = flame_mdm.generate(model, TEXT, frames=5, num_inference_steps=2)[0]
+    trajectory = [torch.full((1, 8, 263), float(call)) for call in range(25)]
+    joints = [
+        model.representation.to_joints(trajectory[call][0, :5]).numpy()
+        for call in (0, 2, 5, 7, 10, 12, 15, 17, 20, 22)
+    ]
+    stages = _stages(model, trajectory, motion)
+    assert len(stages) == 11
+    for stage, expected in zip(stages, joints, strict=False):
+        np.testing.assert_array_equal(stage.joints, expected)
+    assert stages[2].text == "estimate after 20% of the sampling"
+
+
+def test_frames_without_rotations_are_counted_over_all_motions():
+    motions = [
+        Motion(np.zeros((frames, 22, 3)), 20.0, degenerate=count)
+        for frames, count in ((10, 2), (5, 0), (7, 1))
+    ]
+    (note,) = degenerate_notes(motions)
+    assert note.startswith("warning: 3 of 22 frames have degenerate rotations")
+    assert degenerate_notes(motions[1:2]) == []
 
 
 LIMITS: list[tuple[type, str, list[Any], list[Any]]] = [

@@ -564,6 +564,7 @@ def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_sha
     kept = vocabulary.vocabulary([*CAPTIONS, *CAPTIONS])
     assert kept == {"vocabulary": sorted(set(" ".join(CAPTIONS).lower().replace(".", "").split()))}
     assert vocabulary.vocabulary(CAPTIONS, CAPTIONS)["captions"] == sorted(CAPTIONS)
+    assert vocabulary.MAX_CAPTIONS == 1000
     many = [f"caption {number:05d}" for number in range(3 * vocabulary.MAX_CAPTIONS)]
     assert vocabulary.vocabulary(many, many)["captions"] == many[::3]
     assert vocabulary.vocabulary([], []) == {"vocabulary": [], "captions": []}
@@ -606,6 +607,23 @@ def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, ca
         flame_mdm.edit(model, walk, text, region="prefix")
     assert "no word says what happens" in error_of(capsys, "sample", "quickstart", f"text={text}")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_plain_captions_are_about_a_person_and_short():
+    captions = [
+        "he sits",
+        "a person walks fast",
+        "a person sits",
+        "a person jogs",
+        "a personal walk",
+    ]
+    assert vocabulary.plainest(captions) == [
+        "a person jogs",
+        "a person sits",
+        "a person walks fast",
+        "he sits",
+        "a personal walk",
+    ]
 
 
 def test_words_are_read_in_a_known_form_and_unknown_ones_are_dropped():

@@ -26,6 +26,8 @@ from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.processes.guidance import Positions
+from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling import streams as streams_module
 from flame_mdm.sampling import waypoints
@@ -33,9 +35,15 @@ from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
 from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
-from flame_mdm.sampling.streams import OnlineCleanup, Schedule, Streams, starting_point
+from flame_mdm.sampling.streams import (
+    OnlineCleanup,
+    Schedule,
+    Streams,
+    root_target,
+    starting_point,
+)
 from flame_mdm.sampling.targets import Targets, errors, read_targets
-from flame_mdm.sampling.waypoints import bends
+from flame_mdm.sampling.waypoints import RouteGuide, bends
 
 CONTEXT, BLOCK, FPS = 10, 30, 20.0
 
@@ -475,6 +483,35 @@ def test_a_path_is_straight_from_where_the_last_block_ended(model, monkeypatch):
         assert start == pytest.approx([frame, *end], abs=1e-5)
 
 
+def test_a_jump_between_blocks_fades_in_half_a_second(model, monkeypatch):
+    for fps, frames in ((20.0, 10), (30.0, 15), (60.0, 30)):
+        monkeypatch.setattr(model.representation, "fps", fps)
+        running = stream(model, "a person walks")
+        assert running._streams.blocks.fade == frames
+        running.change("a person sits down", at=0.7)
+        assert running._streams.schedules[0].until_change(0) == round(0.7 * fps)
+
+
+def test_the_target_of_a_block_is_the_position_in_its_last_frame_seen_from_its_first_one():
+    """The body is at x = 1 and z = 2 and faces +x. A goal 3 m further along z is to its right, at -x."""
+    placement = Placement(
+        torch.tensor([math.pi / 2], dtype=torch.float64), torch.tensor([[1.0, 0, 2]]).double()
+    )
+    frames, axes = torch.tensor([29, 29, 10, 10, 29]), torch.tensor([0, 2, 0, 2, 1])
+    joints = torch.tensor([0, 0, 0, 0, 5])
+    values = torch.tensor([1.0, 5.0, -7.0, -7.0, 9.0])
+    window = Targets(Positions(frames, joints, axes, values), ())
+    target = root_target(window, 30, placement)
+    assert target is not None
+    expected = torch.zeros(1, 8, 4)
+    expected[0, 6] = torch.tensor([-3.0, 0.0, 0.0, 1.0])
+    torch.testing.assert_close(target, expected, rtol=0, atol=1e-6)
+    for left in (slice(1, None), slice(1)):  # only z or only x
+        part = Targets(Positions(frames[left], joints[left], axes[left], values[left]), ())
+        assert root_target(part, 30, placement) is None
+    assert root_target(window, 31, placement) is None
+
+
 def test_a_replication_has_its_own_noise(model):
     prefix, _ = starting_point(model, None)
     batch = MotionBatch(
@@ -629,6 +666,80 @@ def test_waypoints_are_two_numbers(walking, point):
     running = stream(walking, "a person walks")
     with pytest.raises(UserError, match=r"waypoint .*: expected x and z in meters"):
         running.lead([point])
+
+
+def test_a_path_with_turns_and_side_steps_bends_as_measured():
+    """At first straight ahead, then to the right as fast as the path allows."""
+    turns = [0.02 * math.sin(frame) for frame in range(24)]
+    steps = [(0.01 * math.cos(frame), 0.04 + 0.001 * frame) for frame in range(24)]
+    points = [(1.15, 2.6), (1.3, 2.9), (-3.0, 4.0)]
+    added = bends(turns, steps, 0.3, (1.0, 2.0), points, 30)
+    assert added == pytest.approx(
+        [
+            -0.025,
+            -0.021817,
+            -0.014727,
+            -0.005776,
+            -8e-05,
+            -0.000543,
+            -0.005357,
+            -0.00962,
+            0.004201,
+            0.009434,
+            0.014009,
+            0.0144,
+            0.010731,
+            0.006607,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+            -0.043333,
+        ],
+        abs=2e-6,
+    )
+
+
+@pytest.mark.parametrize(
+    ("length", "goal", "bend"),
+    [
+        # At 1 m/s, the circle of 1.2 * 1 m / 1.3 is free up to 0.15 m inside of it.
+        (0.05, (1.2 / 1.3 * 2 - 0.16, 0.0), 0.0),
+        (0.05, (1.2 / 1.3 * 2 - 0.14, 0.0), 1.3 / 20),
+        (0.05, (-1.2 / 1.3 * 2 + 0.14, 0.0), -1.3 / 20),
+        # At 0.4 m/s, the smallest radius of 0.7 m counts.
+        (0.02, (1.2 * 0.7 * 2 - 0.16, 0.0), 0.0),
+        (0.02, (1.2 * 0.7 * 2 - 0.14, 0.0), 0.02 / 0.7),
+        # Deviations decay within 0.4 seconds.
+        (0.05, (0.3, 3.0), math.atan(0.1) / (0.4 * 20)),
+    ],
+)
+def test_a_bend_leaves_room_for_a_circle_and_is_bounded_by_time_and_path(length, goal, bend):
+    assert waypoints._bend(0.0, length, (0.0, 0.0), goal, 20) == pytest.approx(bend, abs=1e-9)
+
+
+@pytest.mark.parametrize("variant", ["clean", "legacy"])
+def test_a_led_block_turns_by_its_bends_and_keeps_everything_else(variant):
+    representation = HumanML(variant=variant)
+    representation.std.uniform_(0.5, 2.0, generator=torch.Generator().manual_seed(1))
+    placement = Placement(torch.tensor([0.4]).double(), torch.tensor([[0.5, 0, -1.0]]).double())
+    points = [(2.0, 1.0)]
+    x = 0.02 * torch.randn(1, BLOCK, 263, generator=torch.Generator().manual_seed(0))
+    guide = RouteGuide(representation, placement, points)
+    led = guide.reach(x)
+    (before, steps), (after, _) = (
+        representation.root_steps(representation.denormalize(motion[0])) for motion in (x, led)
+    )
+    expected = bends(before.tolist(), steps.tolist(), 0.4, (0.5, -1.0), points, FPS)
+    assert max(map(abs, expected)) > 0.01
+    assert (after - before).tolist() == pytest.approx(expected, abs=1e-5)
+    assert torch.equal(led[..., 1:], x[..., 1:])
+    assert guide.steer(lambda y: y, x) is x
 
 
 def test_every_waypoint_is_reached_at_any_speed(subtests):

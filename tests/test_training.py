@@ -26,14 +26,18 @@ from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import _length_unit
 from flame_mdm.progress import ProgressBar
-from flame_mdm.runs import read_history
+from flame_mdm.reporting.page import number
+from flame_mdm.runs import HISTORY, read_history
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
 from flame_mdm.task import GeneratorTask, Task
-from flame_mdm.training import callbacks
+from flame_mdm.training import callbacks, provenance, start
 from flame_mdm.training.callbacks import Measurements, SampleMotions
 from flame_mdm.training.guards import BadLoss
+from flame_mdm.training.loggers import History
 
 STEPS = [
     "trainer.val_check_interval=4",
@@ -511,6 +515,153 @@ def test_a_loss_is_bad_above_a_thousand_times_the_median_of_the_interval_before(
     bad = json.loads((tmp_path / "bad_batch.json").read_text())
     assert (bad["step"], bad["usual_loss"], bad["batches"][0]["loss"]) == (9, "3.0", "3001.0")
     assert (bad["batches"][0]["batch"], bad["batches"][0]["ids"]) == (8, ["clip"])
+
+
+@pytest.mark.parametrize(("step", "kept"), [(4, [1, 3]), (3, [1]), (0, [])])
+def test_a_resumed_run_keeps_the_lines_of_the_steps_that_it_does_not_repeat(tmp_path, step, kept):
+    """Steps are counted from 0: four steps are 0, 1, 2 and 3."""
+    lines = [{"step": number, "train/loss": number + 0.5} for number in (1, 3, 4, 5)]
+    (tmp_path / HISTORY).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    history = History(tmp_path, step)
+    history.log_metrics({"train/loss": 9.0}, step + 1)
+    history.log_metrics({"train/loss": 8.0}, step + 3)
+    expected = {number: number + 0.5 for number in kept} | {step + 1: 9.0, step + 3: 8.0}
+    assert read_history(tmp_path)["train/loss"] == expected
+    assert len((tmp_path / HISTORY).read_text().splitlines()) == len(expected)
+
+
+def test_the_summary_counts_trained_weights_and_clips_of_all_processes(tmp_path, monkeypatch):
+    facts: list[dict[str, Any]] = []
+    lines: list[str] = []
+    monkeypatch.setattr(provenance, "say", lambda *texts: lines.extend(texts))
+    monkeypatch.setattr(provenance, "save", lambda *_, **__: None)
+    monkeypatch.setattr(provenance, "write_json", lambda _, content: facts.append(content))
+    task = Stub(generator=SimpleNamespace(describe=lambda: "Network"))
+    task.frozen = torch.nn.Linear(10, 10).requires_grad_(False)
+    task.trained = torch.nn.Linear(123, 1000)
+    task.facts = {"dataset": "synthetic", "vocabulary": ["walks"], "verbs": [], "captions": []}
+    trainer = running(3, is_global_zero=True, max_steps=50)
+    info = {"dataset": "synthetic", "representation": "humanml3d", "hours": 1.5}
+    trainer.datamodule.store = SimpleNamespace(info=info)
+    trainer.datamodule.counts = lambda store: []
+    config = {
+        "experiment": "mine",
+        "run": {"dir": str(tmp_path), "speed": "fast"},
+        "data": {"batch_size": 4},
+        "optimizer": {"lr": 0.1},
+    }
+    provenance.WriteProvenance(config).on_train_start(trainer, task)
+    (content,) = facts
+    assert (content["parameters"], content["data"]) == (124_000, {"dataset": "synthetic"})
+    assert lines[0] == "mine: Network, 0.12 M trainable parameters"
+    assert lines[1] == "data: synthetic as humanml3d; 1.5 hours"
+    assert lines[2].endswith(", 32-true, speed=fast")
+    # 24 clips in each of 50 steps are 20 times 60 clips.
+    assert lines[3:] == [
+        "batch: 24 clips = 4 x 3 processes x 2 accumulated; optimizer.lr=0.1 is not scaled with the batch size",
+        "steps: 3 to 50, 24 clips per step, 20 epochs",
+    ]
+
+
+def test_setup_collects_facts_and_encodes_captions_and_prompts_once(tmp_path):
+    facts: dict[str, Any] = {}
+    moved: list[Any] = []
+    store = SimpleNamespace(
+        info={"dataset": "synthetic"}, fingerprint="f00", licenses=lambda: ["CC-BY-4.0"]
+    )
+    data = SimpleNamespace(
+        store=store,
+        choose_device=lambda size: ("device", size),
+        crop=SimpleNamespace(longest=lambda: 60, max_frames=62),
+        captions=lambda: ["walks", "sits", "walks"],
+        folder=tmp_path / "data" / "synthetic-humanml3d",
+    )
+    encoder = SimpleNamespace(load_cache=lambda *_: 7, move_cache=moved.append)
+    prompts = SimpleNamespace(texts=["jumps", "sits"])
+    stub: Any = SimpleNamespace(
+        data=data,
+        trainer=SimpleNamespace(callbacks=[prompts, object()]),
+        encoder=lambda: encoder,
+        named_buffers=lambda: [("mean", None)],
+        add_facts=facts.update,
+    )
+    stub._captions = lambda: Task._captions(stub)
+    Task.setup(stub, "fit")
+    assert facts == {
+        "dataset": "synthetic",
+        "fingerprint": "f00",
+        "max_frames": 60,
+        "licenses": ["CC-BY-4.0"],
+    }
+    assert moved == [("device", 7)]
+    assert Task._captions(stub) == (["jumps", "sits", "walks"], tmp_path / "data" / "text")
+
+
+@pytest.mark.parametrize(("distance", "same"), [(0.009, True), (0.011, False)])
+def test_motions_are_the_same_if_no_joint_differs_by_a_centimeter(distance, same):
+    """Lengths may differ."""
+    motions = [Motion(np.zeros((frames, 22, 3)), 20.0) for frames in (8, 6, 7)]
+    motions[1].joints[3, 20, 1] = distance
+    motions[0].joints[6:] = 5.0
+    assert callbacks.are_same(motions) == same
+    assert not callbacks.are_same(motions[:1])
+
+
+def test_metrics_are_explained_beside_those_of_real_motions():
+    class Share(MeanMetric):
+        """Share of prompts that are followed.
+
+        Details.
+        """
+
+        higher_is_better = True
+
+    values = {"share/walk": 0.25, "share": 0.5, "shared": 3.0}
+    lines = callbacks.explain_metrics(values, {"share": 0.75}, {"share": Share(), "other": Share()})
+    assert lines == [
+        "share: Share of prompts that are followed. Higher is better.",
+        f"  share/walk: {number(0.25)}",
+        f"  share: {number(0.5)} (real motions: {number(0.75)})",
+    ]
+
+
+def test_lengths_of_training_are_multiples_of_the_unit_of_the_crop():
+    assert _length_unit({"data": {"crop": {"unit": 4}}}) == 4
+    assert [_length_unit(config) for config in ({}, {"data": {"crop": {}}})] == [1, 1]
+
+
+CHANGES = {
+    "seed": 1,
+    "optimizer.lr": 0.5,
+    "data.batch_size": 7,
+    "data.crop.max_frames": 40,
+    "ema.decay": 0.5,
+    "trainer.precision": "64-true",
+    "trainer.gradient_clip_val": 0.5,
+    "trainer.accumulate_grad_batches": 2,
+    "task.cond_drop_prob": 0.5,
+    "lr_decay": 0.1,
+}
+
+
+def test_a_run_resumes_with_other_machines_and_lengths_but_not_with_other_training(
+    tmp_path, monkeypatch, subtests
+):
+    saved = compose("quickstart")
+    monkeypatch.setattr(start, "read_saved", lambda _: saved)
+    start._check_same(tmp_path, saved)
+    for name in ("trainer.max_steps", "trainer.devices", "data.num_workers", "data.resident"):
+        with subtests.test(name=name):
+            start._check_same(tmp_path, with_value(saved, name, 3))
+    for name, value in CHANGES.items():
+        with subtests.test(name=name), pytest.raises(UserError, match=f"{name} .*{value} here"):
+            start._check_same(tmp_path, with_value(saved, name, value))
+
+
+def with_value(config: Any, name: str, value: Any) -> Any:
+    """A copy of a configuration with another value of a key, such as "trainer.max_steps"."""
+    first, _, rest = name.partition(".")
+    return config | {first: with_value(config.get(first) or {}, rest, value) if rest else value}
 
 
 def test_the_draws_of_a_step_depend_on_seed_batch_and_process(monkeypatch):

@@ -466,6 +466,65 @@ def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler, subtest
         assert (clipped[~keep] <= 1).all()
 
 
+@pytest.mark.parametrize(("build", "sampler"), EVERY)
+def test_estimates_of_a_run_contain_the_kept_part_and_no_padding(build, sampler):
+    if build().samplers[sampler].adaptive:
+        pytest.skip("cannot keep a part")
+    known, estimates = torch.full((2, 6, 3), -2.0), []
+    keep, mask = half_kept(known), length_mask(torch.tensor([6, 3]))
+    denoise = CountedDenoise(pulled)
+    how = {"sampler": sampler, "num_inference_steps": 4, "trajectory": estimates}
+    x = sample(build(), denoise, drawn((2, 6, 3)), mask, edit=Edit(known, keep), **how)
+    assert len(estimates) == denoise.calls
+    for estimate in [*estimates, x]:
+        assert (estimate[~mask] == 0).all()
+        assert torch.equal(estimate[mask & keep[..., 0]], known[mask & keep[..., 0]])
+        assert (estimate[mask & ~keep[..., 0]] > -2).all()
+
+
+class Shifting:
+    """A guide that moves noisy motions by 1 after it has looked at their estimates."""
+
+    def steer(self, clean, x_t):
+        clean(x_t)
+        return x_t + 1
+
+    def reach(self, x0_hat):
+        return x0_hat
+
+
+@pytest.mark.parametrize(
+    ("process", "sampler"),
+    [
+        (GaussianDiffusion(50, prediction="velocity"), "ddim"),
+        (GaussianDiffusion(50, prediction="x0"), "ancestral"),
+        (FlowMatching(prediction="velocity"), "euler"),
+        (FlowMatching(prediction="velocity"), "heun"),
+        (FlowMatching(prediction="x0"), "euler"),
+    ],
+    ids=lambda value: getattr(value, "prediction", value),
+)
+def test_a_guide_sees_estimates_at_the_time_of_the_step_and_steers_no_further_than_they(
+    process, sampler
+):
+    """The denoiser knows the motion, whatever it sees, so that the run ends in it."""
+    motion, times = torch.randn(2, 6, 3, dtype=torch.float64), []
+
+    def denoise(x_t, table_time, mask, cond):
+        times.append(table_time[0].item())
+        t = table_time / 1000 if isinstance(process, FlowMatching) else table_time
+        zero, one = torch.zeros_like(motion), torch.ones_like(motion)
+        signal, sigma = process.corrupt(one, zero, t), process.corrupt(zero, one, t)
+        return process.target(motion, (x_t - signal * motion) / sigma, t)
+
+    edit = Edit(motion, torch.zeros_like(motion, dtype=torch.bool), guide=Shifting())
+    noise = drawn((2, 6, 3), torch.float64)
+    x = sample(process, denoise, noise, edit=edit, sampler=sampler, num_inference_steps=5)
+    torch.testing.assert_close(x, motion, rtol=0, atol=1e-3)
+    assert times[::2] == times[1::2]
+    assert len({round(time, 3) for time in times}) == (6 if sampler == "heun" else 5)
+
+
 @pytest.mark.parametrize("sampler", ["ancestral", "ddim"])
 @pytest.mark.parametrize(
     ("blend", "resample"), [("after", 1), ("before", 1), ("after", 2), ("before", 2)]

@@ -215,6 +215,7 @@ def test_pages_escape_and_show_one_card_or_two(card, tmp_path, subtests):
     }
     page, text = write_card([card, card.model_copy(update=fewer)], tmp_path)
     assert "-and-x-none-40-" in page.name
+    assert "None" not in text.read_text(), "a card without an extractor names none"
     assert "| noise (mm) | 2 → 5 / not computed | 1 → – / 1 → – |" in text.read_text()
     assert page.read_text().count("<polyline") == 3
     content = card.model_dump_json()
@@ -233,6 +234,16 @@ def test_pages_escape_and_show_one_card_or_two(card, tmp_path, subtests):
         with subtests.test(path=path.name):
             assert "<img" not in path.read_text()
             assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
+
+
+def test_a_value_at_some_grades_is_not_shown_as_one_at_all_grades(card, tmp_path):
+    lacking = card.perturbations[0].model_dump()
+    lacking["grades"][1]["values"]["fid"] = [None] * 4
+    partial_card = card.model_copy(
+        update={"perturbations": [check_shape(lacking, AuditedPerturbation)]}
+    )
+    _, text = write_card([partial_card], tmp_path)
+    assert "| noise (mm) | not computed at 2 | 1 → – |" in text.read_text()
 
 
 def test_the_strongest_card_that_fits_is_cited_and_a_weaker_one_overwrites_nothing(

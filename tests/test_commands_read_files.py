@@ -11,6 +11,7 @@ from support.others import COLLECTED, walk
 
 from flame_mdm.__main__ import main
 from flame_mdm.formats.layouts import head_height
+from flame_mdm.formats.readers import read
 
 FILES = SHARED / "data" / "files-of-others"
 STANDS, LIES = "stands", "lies"
@@ -190,3 +191,42 @@ def test_folders_of_the_collection(name: str, tmp_path: Path, capsys):
         assert head_height(np.load(tmp_path / "out" / "a.npy")) == pytest.approx(1.57, abs=0.02)
     if name == "f07_one_frame":
         assert main(["prepare", "folder", *words]) == 1, "the same verdict as the check"
+
+
+WITHOUT_REST = "f06_reference_without.bvh"
+# File -> the file with the same joints.
+SAME = {
+    "f01_stageii.npz": "f01_reference_without_objects.npz",
+    "f12_body_only_66.npz": "f01_reference_without_objects.npz",
+}
+
+
+@pytest.mark.skipif(
+    not FILES.exists(), reason="the files of other programs are outside of the repository"
+)
+@pytest.mark.parametrize("name", SAME)
+def test_files_of_the_collection_have_the_joints_of_their_reference(name: str):
+    motion, reference = read(FILES / name), read(FILES / SAME[name])
+    np.testing.assert_allclose(motion.joints, reference.joints, atol=1e-4)
+    assert motion.fps == reference.fps
+
+
+@pytest.mark.skipif(
+    not FILES.exists(), reason="the files of other programs are outside of the repository"
+)
+def test_a_file_of_the_collection_has_the_motion_after_its_rest_pose():
+    motion, reference = read(FILES / "f06_tpose_first.bvh"), read(FILES / WITHOUT_REST)
+    assert len(motion.joints) == len(reference.joints) == 30
+    times = 30 / 31 * np.arange(1, 30)  # the motion lasts 31 frames with the rest pose, else 30
+    before, share = times.astype(int), (times % 1)[:, None, None]
+    expected = (1 - share) * reference.joints[before] + share * reference.joints[before + 1]
+    np.testing.assert_allclose(motion.joints[:-1], expected, atol=0.005)
+
+
+@pytest.mark.skipif(
+    not FILES.exists(), reason="the files of other programs are outside of the repository"
+)
+def test_every_file_of_the_collection_is_tested():
+    names = {path.name for path in FILES.iterdir()} - {"README.md"}
+    assert names == {*ROWS, *FOLDERS, *SAME.values(), WITHOUT_REST, "f11_meshopt.glb"}
+    assert len(names) == 26

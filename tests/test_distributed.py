@@ -285,6 +285,18 @@ def assert_lints(program: str, *words: str | Path) -> None:
     assert linted.returncode == 0, linted.stdout + linted.stderr
 
 
+def test_the_container_takes_torch_alone_from_its_index_and_any_base():
+    text = (ROOT / "Dockerfile").read_text()
+    installed = [line for line in text.splitlines() if line.startswith("RUN pip install")]
+    assert all("-c constraints.txt" in line for line in installed)
+    (torch_alone,) = [line for line in installed if "TORCH_INDEX" in line]
+    assert "--no-deps" in torch_alone
+    assert torch_alone.endswith(" torch")
+    assert "FROM $BASE\n" in text, "a digest can be passed"
+    assert "@sha256:" in text, "and the file says how"
+    assert "pip install -q --upgrade pip" in (ROOT / "Makefile").read_text()
+
+
 def test_the_container_file_is_clean_and_copies_what_is_there():
     assert_lints("hadolint", ROOT / "Dockerfile")
     lines = [

@@ -7,12 +7,14 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.asf import write_amc, write_asf
 from support.fixtures import SHARED
 from support.glb import changed
 from support.motions import posed, synthetic
@@ -23,8 +25,8 @@ from flame_mdm.data.adaptation import check_clips
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
-from flame_mdm.formats import glb
-from flame_mdm.formats.layouts import head_height
+from flame_mdm.formats import ENDINGS, SCENES, glb
+from flame_mdm.formats.layouts import Layout, head_height
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read, read_recording
 from flame_mdm.representations.humanml import HumanML
@@ -91,14 +93,20 @@ KEYS: dict[str, Any] = {
     "map": {joint: joint for joint in SMPL22.joints} | {"spine2": "spine1"},
     "fps": 7.0,
 }
-KINDS = ("bvh", "npz", "npy", "json", "kimodo", "amass")
+KINDS = ("bvh", "npy", "json", "amc", "glb", "npz", "kimodo", "amass")
+WITHOUT_RATE = ("npy", "amc")
 
 
 def write_kind(kind: str, folder: Path) -> Path:
-    """A file of a kind; it contains its frame rate, except `.npy`."""
-    joints, path = walk().joints, folder / f"a.{kind if kind in KINDS[:4] else 'npz'}"
+    """A file of a kind; it contains its frame rate, except `.npy` and `.amc`."""
+    joints, path = walk().joints, folder / f"a.{kind if kind in KINDS[:5] else 'npz'}"
     if kind == "bvh":
         write_bvh(path, walk())
+    elif kind == "amc":
+        write_asf(folder / "a.asf")
+        write_amc(path, 40)
+    elif kind == "glb":
+        walk().save(path, rig="mixamo")
     elif kind == "npz":
         np.savez(path, joints=joints, fps=20)
     elif kind == "npy":
@@ -123,10 +131,10 @@ def outcome(path: Path, **keys: Any) -> tuple[str, Motion | None]:
 @pytest.mark.parametrize(("key", "kind"), product(KEYS, KINDS))
 def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
     path = write_kind(kind, tmp_path)
-    rate: dict[str, Any] = {"fps": 20} if kind == "npy" else {}
+    rate: dict[str, Any] = {"fps": 20} if kind in WITHOUT_RATE else {}
     before = read(path, **rate)
     skeleton = {key: KEYS[key]}
-    if key == "map" and kind != "bvh" and kind != "amass":
+    if key == "map" and kind not in ("bvh", "amass", "amc", "glb"):
         skeleton["joints"] = list(SMPL22.joints)
     (tmp_path / "skeleton.yaml").write_text(json.dumps(skeleton))
     if key == "children":  # a permission, which acts on children
@@ -137,7 +145,7 @@ def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
             return
         if kind != "amass":
             return
-    if key == "fps" and kind == "npy":
+    if key == "fps" and kind in WITHOUT_RATE:
         assert read(path).fps == 7
         return
     if key == "fps":  # of files without a rate
@@ -153,6 +161,40 @@ def test_a_key_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
             after.joints.shape != before.joints.shape
             or np.abs(after.joints - before.joints).max() > 0.01
         )
+
+
+GIVEN: dict[str, Any] = {"fps": 7.0, "unit": 0.02, "up": "z", "animation": "Walk"}
+
+
+@pytest.mark.parametrize(("key", "kind"), product(GIVEN, KINDS))
+def test_a_key_of_a_command_acts_or_is_refused(key: str, kind: str, tmp_path: Path):
+    path = write_kind(kind, tmp_path)
+    rate: dict[str, Any] = {"fps": 20} if kind in WITHOUT_RATE else {}
+    before = read(path, **rate)
+    value = "y" if (key, kind) == ("up", "amass") else GIVEN[key]  # z is up in AMASS
+    message, after = outcome(path, **rate | {key: value})
+    if after is None:
+        assert any(word in message for word in (key, "unit", "legs")), message
+    elif key == "fps":
+        assert after.fps == 7
+    else:
+        assert key != "animation"
+        assert np.abs(after.joints - before.joints).max() > 0.01
+
+
+@pytest.mark.parametrize("key", GIVEN.keys() - {"fps"})
+def test_a_key_has_no_effect_on_files_of_this_project(key: str, tmp_path: Path):
+    walk().save(tmp_path / "a.npz")
+    with pytest.raises(UserError, match=f"{key}={GIVEN[key]} has no effect"):
+        read(tmp_path / "a.npz", **{key: GIVEN[key]})
+    (tmp_path / "skeleton.yaml").write_text(json.dumps({"up": "z"}))
+    assert "skeleton.yaml does not apply" in read(tmp_path / "a.npz").notes[0]
+
+
+def test_all_keys_and_all_kinds_of_files_are_tried():
+    assert KEYS.keys() == Layout.model_fields.keys()
+    assert GIVEN.keys() == signature(read).parameters.keys() - {"path", "resample_to"}
+    assert {f".{kind}" for kind in KINDS} | set(SCENES) >= set(ENDINGS)
 
 
 def test_up_of_commands_and_of_json_files_acts(tmp_path: Path, subtests):
@@ -347,7 +389,11 @@ def test_files_that_are_no_motions_are_left_out_of_folders(tmp_path: Path):
     [
         ("a.blend", "export BVH"),
         ("a.c3d", "markers"),
+        ("a.trc", "export BVH"),
+        ("a.gltf", "Save it as .glb"),
         ("a.pkl", "numpy.savez"),
+        ("a.pt", "numpy.savez"),
+        ("a.csv", "numpy.savez"),
         ("a.xyz", "neither a motion file (.npz"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import base64
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -194,3 +195,19 @@ def test_the_server_sends_blocks_within_the_rules_of_the_guard(model, subtests):
         assert client.get("/live.exe?stream=x").status_code == 404
         headers = {"Origin": "http://evil.example"}
         assert client.post("/live", json=call, headers=headers).status_code == 403
+
+
+@pytest.mark.parametrize(("hosts", "per_address"), [((), 32), (("motions.example",), 256)])
+def test_the_page_is_served_within_the_limits_on_connections(monkeypatch, hosts, per_address):
+    app = pytest.importorskip("flame_mdm.demo.app", reason="gradio is not installed")
+    served: list[Any] = []
+    server = SimpleNamespace(run=lambda sockets: None)
+    monkeypatch.setattr(app, "Server", lambda settings: served.append(settings) or server)
+    monkeypatch.setattr(app, "Studio", lambda *_: None)
+    monkeypatch.setattr(app, "web_app", lambda *_: None)
+    monkeypatch.setenv("GRADIO_TEMP_DIR", "")
+    app.serve([], port=0, device="cpu", hosts=hosts)
+    limits = served[0].http.keywords["limits"]
+    assert (limits.total, limits.per_address) == (256, per_address)
+    assert (limits.header_seconds, limits.idle_seconds, limits.stall_seconds) == (10, 5, 30)
+    assert served[0].timeout_keep_alive == 5

@@ -130,6 +130,12 @@ def test_published_settings_are_those_of_the_recipes(subtests):
                 assert all(key in settings(column) for column in part["recipes"].values())
 
 
+@pytest.mark.parametrize("name", ["mdm_1", "mdm_2"])
+def test_multimodality_has_the_arrow_that_the_paper_prints(name):
+    for part in SPECS[name]["parts"].values():
+        assert part["columns"]["Multimodality"]["better"] == "higher"
+
+
 def test_columns_are_what_protocols_measure_and_rows_what_processes_sample():
     wrong = []
     for name, part in MEASURED.items():

@@ -93,6 +93,19 @@ def test_a_training_that_ends_badly_stops_the_others(processes, tmp_path, code, 
     ]
 
 
+@pytest.mark.parametrize("kind", ["link", "hard link"])
+def test_outputs_of_trainings_are_written_to_no_file_elsewhere(processes, tmp_path, kind):
+    victim, logs = tmp_path / "victim", tmp_path / "logs"
+    victim.write_text("the only copy\n")
+    logs.mkdir()
+    log = logs / "1_extractor.log"
+    log.symlink_to(victim) if kind == "link" else log.hardlink_to(victim)
+    with pytest.raises(UserError, match=r"1_extractor\.log: a (link|file with a second name)"):
+        run_trainings(jobs(), 2, logs)
+    assert processes.started == []
+    assert victim.read_text() == "the only copy\n"
+
+
 def test_a_training_needs_the_earlier_ones_whose_runs_it_names():
     entries = read_yaml(EXPERIMENTS / "benchmark" / "few_steps.yaml")["train"]
     planned = plan(entries, "some/root")

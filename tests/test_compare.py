@@ -57,7 +57,12 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path, subtests):
         "each under its own name"
     )
     assert text.count("<h3>p version 3") == 2, "splits are not compared"
-    for words in ("7.5 ± 0.5", "Quick run — not for publication", "mine/one 0.001953"):
+    for words in (
+        "7.5 ± 0.5",
+        "replications x motions: 2 x 64",
+        "Quick run — not for publication",
+        "mine/one 0.001953",
+    ):
         with subtests.test(words=words):
             assert words in text, words
     assert page(three, tmp_path / "again.html") == text

@@ -306,6 +306,16 @@ def test_a_rest_pose_in_front_is_left_out_and_said(tmp_path: Path, capsys, subte
     )
 
 
+def test_a_rest_pose_in_front_of_an_animation_is_left_out(tmp_path: Path):
+    motion = walk(30)
+    joints = np.concatenate([posed(1).joints, motion.joints])
+    Motion(joints, motion.fps).save(tmp_path / "a.glb", rig="mixamo")
+    again = read(tmp_path / "a.glb")
+    assert again.notes == ("the first frame is a rest pose and is left out",)
+    poses = [joints - joints[:, :1] for joints in (again.joints, motion.joints)]
+    np.testing.assert_allclose(*poses, atol=0.01)
+
+
 def test_legs_that_flip_are_noticed(tmp_path: Path):
     motion = walk(40)
     angles = np.zeros((40, 3))
@@ -449,6 +459,15 @@ def test_two_people_and_rates_of_cmu_are_said(tmp_path: Path):
     assert read(tmp_path / "60_01.bvh", fps=120).fps == 120
 
 
+def test_the_pelvis_of_smpls_template_is_added_in_the_axes_of_the_file(tmp_path: Path):
+    """It is about (0, -0.223, 0.028) m in SMPL+H's model file, for any rotation of the root."""
+    turns = np.zeros((3, 72))
+    turns[:, 1] = [0.0, 0.5, 1.0]
+    np.savez(tmp_path / "a.npz", poses=turns, trans=np.full((3, 3), 0.5), mocap_framerate=20)
+    pelvis = read(tmp_path / "a.npz", up="y").joints[:, 0]
+    np.testing.assert_allclose(pelvis, [[0.5, 0.277, 0.528]] * 3, atol=0.005)
+
+
 def test_a_smaller_body_is_said_and_cubic_splines_resample_own_files_everywhere(tmp_path: Path):
     parts = amass(walk())
     np.savez(tmp_path / "a.npz", **(parts | {"trans": parts["trans"] - [0, 0, 0.09]}))
@@ -487,3 +506,6 @@ def test_the_collected_files_have_their_heights(name: str, keys: dict, head: flo
     motion = read(FILES / name, **keys)
     assert head_height(motion.joints) == pytest.approx(head, abs=0.02)
     assert note in " ".join(motion.notes)
+    if name == "f02_y_up.npz" and keys:
+        lowest = float(np.median(motion.joints[..., 1].min(1)))
+        assert lowest == pytest.approx(0, abs=0.02), "feet on the floor"

@@ -207,6 +207,7 @@ def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path, subtests)
             "0.125 ± 0.25",
             "not valid: real motions are off",
             "differs from the protocol: samples 64",
+            "replications x motions: 2 x 64",
         ),
         *(
             "not computed: kid: too few &lt;samples&gt;",
@@ -218,6 +219,15 @@ def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path, subtests)
         with subtests.test(words=words):
             assert words in text, words
     assert "<b>" not in text
+
+
+def test_a_single_replication_has_no_interval_in_a_report(tmp_path):
+    folder = a_run(tmp_path / "run")
+    put(folder, values={"fid": {"mean": 7.25, "ci": None, "replications": 1, "n": 64}})
+    text = write_report(folder).read_text()
+    assert "7.25" in text
+    assert "7.25 ±" not in text
+    assert "replications x motions: 1 x 64" in text
 
 
 def test_names_are_text_not_html(tmp_path):

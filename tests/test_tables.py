@@ -720,6 +720,24 @@ def test_a_result_is_outdated_when_the_motion_files_are_others_now(tmp_path):
     assert outdated(path, request)
 
 
+ORIGINS: dict[str, dict[str, Any]] = {
+    "checkpoint": {"checkpoint": {"sha256": "d" * 64}},
+    "extractor": {"extractor": {"sha256": "d" * 64}},
+    "data": {"data": {"fingerprint": "0" * 16}},
+    "protocol": {"protocol": {"sha256": "d" * 64}},
+    "split": {"split": "val"},
+    "seed": {"seed": 1},
+}
+
+
+@pytest.mark.parametrize("name", ORIGINS)
+def test_the_hash_of_a_row_changes_with_each_input_of_its_numbers(folder, name):
+    before = rows(folder)["measured: MDM"].facts["computed from"]
+    assert before == rows(folder)["measured: MDM"].facts["computed from"]
+    change(folder, "MDM", **ORIGINS[name])
+    assert rows(folder)["measured: MDM"].facts["computed from"] != before
+
+
 SEVERAL = """
 title: several
 parts:

@@ -312,8 +312,8 @@ def test_a_rest_pose_in_front_of_an_animation_is_left_out(tmp_path: Path):
     Motion(joints, motion.fps).save(tmp_path / "a.glb", rig="mixamo")
     again = read(tmp_path / "a.glb")
     assert again.notes == ("the first frame is a rest pose and is left out",)
-    poses = [joints - joints[:, :1] for joints in (again.joints, motion.joints)]
-    np.testing.assert_allclose(*poses, atol=0.01)
+    actual, expected = (moved.joints - moved.joints[:, :1] for moved in (again, motion))
+    np.testing.assert_allclose(actual, expected, atol=0.01)
 
 
 def test_legs_that_flip_are_noticed(tmp_path: Path):

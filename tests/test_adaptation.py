@@ -1,7 +1,8 @@
 """Clips of the user in an adaptation: every kind of file, for every representation."""
 
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Literal, cast
 
 import numpy as np
 import pytest
@@ -12,10 +13,10 @@ from support.runs import TINY
 
 from flame_mdm.config import compose, instantiate
 from flame_mdm.config.composition import compose_data
-from flame_mdm.data.adaptation import KEPT, Lesson, LessonData
-from flame_mdm.data.crops import Units
+from flame_mdm.data.adaptation import KEPT, Lesson, LessonData, fault_of, styled
+from flame_mdm.data.crops import Clips, Units
 from flame_mdm.data.folder import Folder
-from flame_mdm.data.store import write_store
+from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.training import adaptation
@@ -96,3 +97,58 @@ def test_an_adaptation_reads_rotations_for_models_of_rotations(
     model.config["data"] = {}  # such as of a data set whose source has no such option
     adapted = adaptation._recipe(model, ["a person walks"], "limp", tmp_path, [])
     assert adapted["data"]["source"]["motion"] == kind
+
+
+@pytest.mark.parametrize(("clips", "step", "count"), [(2000, 1, 2000), (2001, 2, 1001), (9, 1, 9)])
+def test_clips_of_the_prior_are_evenly_spaced(clips: int, step: int, count: int, tmp_path: Path):
+    lesson = Lesson(str(tmp_path), str(tmp_path))
+    entries = [Entry(f"{n}", n, 1, "train", "a", [], None) for n in range(clips)]
+    entries += [Entry(f"v{n}", n, 1, "val", "a", [], None) for n in range(65)]
+    lesson.store = cast(Store, SimpleNamespace(clips=entries))
+    kept = [entry.id for entry in lesson.kept()]
+    assert kept[:count] == [f"{n}" for n in range(0, clips, step)]
+    assert kept[count:] == [f"v{n}" for n in range(0, 65, 2)]
+
+
+@pytest.mark.parametrize(
+    ("rise", "fault"),
+    [
+        (0.049, ""),
+        (0.051, "drifts upward by 5 cm (limit 5)"),
+        (-0.2, "floats 20 cm above the floor (limit 10)"),
+    ],
+)
+def test_a_floor_that_rises_by_five_centimeters_is_a_fault(rise: float, fault: str):
+    joints = np.zeros((101, 22, 3))
+    joints[:, 1:, 1] = 1
+    joints[60:, :, 1] += rise
+    assert fault_of(joints, 10.0) == fault
+
+
+def test_a_body_that_jumps_is_no_fault_and_a_body_that_floats_is_one():
+    joints = np.zeros((100, 22, 3))
+    joints[20:29, :, 1] = 0.5
+    assert fault_of(joints, 10.0) == ""
+    joints[:] = 0
+    joints[20:, :, 1] = 0.11
+    joints[-15:, :, 1] = 0
+    assert fault_of(joints, 10.0) == "floats 11 cm above the floor (limit 10)"
+    joints[..., 1] *= 0.9
+    assert fault_of(joints, 10.0) == ""
+
+
+def test_captions_name_their_style_once_and_before_the_point():
+    assert styled("a person walks. ", "limp") == "a person walks in limp style"
+
+
+def test_an_odd_batch_has_one_more_clip_of_the_user(tmp_path: Path):
+    entries = [Entry(f"{KEPT}{n}", n, 1, "train", "a", [], None) for n in range(6)]
+    entries += [Entry(f"mine {n}", n, 1, "train", "a", [], None) for n in range(4)]
+    data = object.__new__(LessonData)
+    data.batch_size, data.crop = 5, Units()
+    data.train = cast(Clips, SimpleNamespace(clips=entries, lengths=np.arange(10)))
+    batches = iter(data.training_batches(seed=0, first=0, rank=0, world=1))
+    for _ in range(9):
+        batch = [index for index, _ in next(batches)]
+        assert [entries[index].id.startswith(KEPT) for index in batch] == [False] * 3 + [True] * 2
+        assert len(set(batch)) == 5

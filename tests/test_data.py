@@ -1,6 +1,8 @@
 """Stores, crops, and the batches of training and evaluation, also of data on the training device."""
 
+import hashlib
 import shutil
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -15,7 +17,7 @@ import torch
 from support.stores import OwnClips, clip
 
 from flame_mdm.batch import MotionBatch, collate
-from flame_mdm.data import datamodule, resident
+from flame_mdm.data import datamodule, hashed_split, resident, split_blocks, swap_sides
 from flame_mdm.data.crops import Crop, Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, MotionDataModule, TrainingBatches, evaluation_batches
 from flame_mdm.data.resident import ResidentLoader, free_memory
@@ -387,3 +389,160 @@ def test_captions_of_an_evaluation_follow_from_the_seed(store):
     assert first.captions.max() > 1
     np.testing.assert_array_equal(first.evaluated, again.evaluated)
     assert (first.evaluated != other.evaluated).any()
+
+
+def test_a_clip_of_the_minimum_length_is_used_and_no_sample_is_longer_than_the_maximum(store):
+    lengths = sorted(clip.length for clip in store.clips if clip.split == "train")
+    shortest, longest = lengths[5], lengths[-5] - 1
+    crop = Whole(shortest, longest)
+    clips = Clips(store, "train", representation=HumanML(), crop=crop, seed=0)
+    assert min(clip.length for clip in clips.clips) == shortest
+    assert clips.too_short == sum(length < shortest for length in lengths)
+    assert clips.lengths.max() == longest
+    assert sorted(clips.frames) == [length for length in lengths if length >= shortest]
+
+
+def test_a_clip_of_one_unit_is_never_shortened_to_nothing():
+    crop, generator = Units(4, 196, 4), np.random.default_rng(0)
+    assert {len(crop(frames, generator)) for frames in (4, 5, 7) for _ in range(50)} == {4}
+    assert {len(crop(8, generator)) for _ in range(50)} == {4, 8}
+
+
+def test_the_caption_of_an_evaluation_does_not_depend_on_other_clips(store):
+    short, long = (
+        Clips(store, "train", representation=HumanML(), crop=Whole(frames, 200), seed=0)
+        for frames in (1, 45)
+    )
+    assert 3 < len(long) < len(short)
+    captions = {clip.id: number for clip, number in zip(short.clips, short.evaluated, strict=True)}
+    assert [captions[clip.id] for clip in long.clips] == long.evaluated.tolist()
+
+
+def test_groups_of_sixteen_batches_are_sorted_by_length_and_shuffled():
+    lengths = np.random.default_rng(0).permutation(40 * 8)
+    sampler = TrainingBatches(lengths, 8, seed=5, first=0, rank=0, world=1)
+    batches = [lengths[[index for index, _ in batch]] for batch in islice(iter(sampler), 40)]
+    firsts = np.array([batch.min() for batch in batches])
+    assert (np.diff(firsts) < 0).any()
+
+    order = np.random.default_rng((5, 0)).permutation(320)
+    expected = []
+    for begin in (0, 128, 256):
+        expected += np.sort(lengths[order[begin : begin + 128]]).reshape(-1, 8).tolist()
+    assert sorted(sorted(batch.tolist()) for batch in batches) == sorted(expected)
+
+
+def test_each_pass_and_each_seed_has_another_order():
+    lengths = np.arange(64)
+
+    def order(seed: int, first: int) -> list[int]:
+        sampler = TrainingBatches(lengths, 8, seed=seed, first=first, rank=0, world=1)
+        return [index for batch in islice(iter(sampler), 8) for index, _ in batch]
+
+    orders = [order(0, 0), order(0, 8), order(0, 16), order(1, 0)]
+    assert len({tuple(clips) for clips in orders}) == 4
+    assert all(sorted(clips) == list(range(64)) for clips in orders)
+
+
+def test_few_clips_fill_a_batch_and_occur_equally_often():
+    sampler = TrainingBatches(np.arange(5), 13, seed=0, first=0, rank=0, world=1)
+    for batch in islice(iter(sampler), 20):
+        counts = Counter(index for index, _ in batch)
+        assert sorted(counts.values()) == [2, 2, 3, 3, 3]
+
+
+def test_an_evaluation_begins_with_the_longest_clips():
+    lengths = np.array([5, 9, 7, 9, 1])
+    batches = evaluation_batches(lengths, 2, rank=0, world=1)
+    assert batches == [[(1, -1), (3, -1)], [(2, -1), (0, -1)], [(4, -1)]]
+    assert evaluation_batches(lengths, 2, rank=1, world=2) == [[(3, -1), (0, -1)]]
+
+
+@pytest.mark.parametrize("resident", [True, False])
+def test_a_resumed_run_counts_the_batches_of_accumulated_steps(root, resident):
+    data = module(root, CROPS[0], resident=resident)
+    data.setup("fit")
+    data.trainer = SimpleNamespace(  # type: ignore[assignment]
+        global_step=5, accumulate_grad_batches=3, global_rank=1, world_size=2
+    )
+    first = next(iter(data.train_dataloader()))
+    stream = TrainingBatches(data.train.lengths, 4, seed=0, first=0, rank=1, world=2)
+    draws = next(islice(iter(stream), 15, None))
+    assert first.ids == [data.train.clips[index].id for index, _ in draws]
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "value"),
+    [
+        ("source", "name", "other"),
+        ("source", "version", 3),
+        ("source", "published_split", True),
+        ("representation", "fps", 30.0),
+    ],
+)
+def test_a_store_of_another_set_rate_or_version_is_refused(root, owner, name, value):
+    data = module(root, CROPS[0])
+    setattr(getattr(data, owner), name, value)
+    with pytest.raises(UserError, match=rf"the recipe has (dataset|{name})={value}"):
+        data.open()
+
+
+def test_a_store_of_other_options_is_refused(root):
+    data = module(root, CROPS[0])
+    data.source.options = {**data.source.options, "seed": 2}
+    with pytest.raises(UserError, match="prepared with seed=1, but the recipe has seed=2"):
+        data.open()
+
+
+def test_splits_by_name_are_shares_of_the_upper_bits_of_the_hash():
+    names = [f"take {number}" for number in range(2000)]
+    shares = [int(hashlib.sha1(name.encode()).hexdigest()[:8], 16) % 100 for name in names]
+    assert set(shares) == set(range(100))
+    expected = ["train" if n < 85 else "val" if n < 90 else "test" for n in shares]
+    assert [hashed_split(name, val=5, test=10) for name in names] == expected
+
+
+def test_blocks_of_clips_are_rounded_to_their_shares_and_each_split_has_one():
+    splits = split_blocks("jump", 96, 10, val=0.15, test=0.26)
+    ranked = sorted(range(10), key=lambda n: hashlib.sha1(f"jump_{n}".encode()).hexdigest())
+    expected = ["test"] * 3 + ["val"] * 2 + ["train"] * 5
+    assert splits == dict(zip(ranked, expected, strict=True))
+    assert Counter(split_blocks("jump", 21, 10, val=0.01, test=0.01).values()) == {
+        "train": 1,
+        "val": 1,
+        "test": 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "mirrored"),
+    [
+        ("Left, then the right-hand side", "Right, then the left-hand side"),
+        ("turns anticlockwise", "turns clockwise"),
+        ("Clockwise and counterclockwise", "Counterclockwise and clockwise"),
+        ("the brightest leftover", "the brightest leftover"),
+    ],
+)
+def test_words_for_sides_are_swapped(text, mirrored):
+    assert swap_sides(text) == mirrored
+
+
+def test_overlapping_cuts_and_other_splits_do_not_change_the_statistics(tmp_path):
+    features = np.random.default_rng(0).normal(size=(60, 263)).astype(np.float32)
+    windows = {"a": ("train", 0, 30), "b": ("train", 20, 15), "c": ("val", 30, 30)}
+    cuts = [
+        clip(name, split, motion=features, encoded=ENCODED, window=(first, length))
+        for name, (split, first, length) in windows.items()
+    ]
+    store = write_store(tmp_path / "store", OwnClips(*cuts), HumanML())
+    np.testing.assert_allclose(store.mean, features[:35].mean(0), atol=1e-6)
+    assert store.info["shape"] == [60, 263]
+    np.testing.assert_array_equal(store.motion(store.clips[1]), features[20:35])
+
+
+def test_hours_are_those_of_the_frames(tmp_path):
+    features = np.zeros((3600, 263), np.float32)
+    store = write_store(
+        tmp_path / "store", OwnClips(clip("a", motion=features, encoded=ENCODED)), HumanML(fps=12.5)
+    )
+    assert store.info["hours"] == 0.08

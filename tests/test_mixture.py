@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.stores import OwnClips, clip
 
 from flame_mdm.data.bandai import Bandai
 from flame_mdm.data.cmu import CMU
@@ -144,3 +145,52 @@ def test_the_version_of_a_mixture_follows_the_versions_of_its_parts():
     versions = Synthetic.version, Folder.version, CMU.version, Bandai.version
     message = "increase Mixture.version, then these numbers"
     assert (versions, Mixture.version) == ((1, 2, 2, 1), 1), message
+
+
+@pytest.mark.parametrize(("balance", "walks", "dances"), [(7, 8, 8), (9, 8, 8), (11, 12, 12)])
+def test_the_number_of_copies_is_rounded(people: Path, balance: int, walks: int, dances: int):
+    """Of two walks and a dance, each with its mirror image."""
+    source = Folder(str(people), mirror=True, balance=balance)
+    assert 4 * source.copies["one"] == 4 * source.copies["two"] == walks
+    assert 2 * source.copies["four"] == dances
+    assert source.copies["three"] == 1
+
+
+def test_a_mixture_gathers_what_its_parts_report(people: Path):
+    class Part(OwnClips):
+        verbs = ("walk", "jump")
+        failures = ("a.bvh: damaged",)
+
+        def clips(self, fps):
+            self.leave_out("too short", 2)
+            yield from super().clips(fps)
+
+        def findings(self):
+            return ["3 motions: a note"]
+
+        def changed(self, store):
+            return [f"{store} changed"]
+
+    parts = {name: Part(clip(name)) for name in ("one", "two")}
+    parts["two"].verbs = ("walk", "crawl")
+    source = Mixture(parts, use="research")
+    assert source.verbs == ("crawl", "jump", "walk")
+    assert [clip.id for clip in source.clips(20.0)] == ["one", "two"]
+    assert source.excluded == {"too short": 4}
+    assert source.failures == ["a.bvh: damaged"] * 2
+    assert source.failure_lines() == ["error: a.bvh: damaged"] * 2
+    assert source.findings() == ["one: 3 motions: a note", "two: 3 motions: a note"]
+    assert source.changed(people) == [f"{people} changed"] * 2
+
+
+def test_actions_of_a_mixture_are_matched_by_name(people: Path):
+    parts = {}
+    for name, actions in {"one": ("walk", "jump"), "two": ("crawl", "walk")}.items():
+        labels = [clip(f"{name}{k}", action=k) for k in range(2)]
+        parts[name] = OwnClips(*labels, clip(f"{name} without"))
+        parts[name].actions = actions
+    source = Mixture(parts, use="research")
+    labels = {clip.id: clip.action for clip in source.clips(20.0)}
+    assert source.actions == ("walk", "jump", "crawl")
+    assert [labels[f"{name}{k}"] for name in ("one", "two") for k in range(2)] == [0, 1, 2, 0]
+    assert labels["one without"] is None

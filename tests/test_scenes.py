@@ -1,21 +1,27 @@
 """FBX and GLB animations as motions: in commands, in data sets, and what is refused."""
 
+import json
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from support.fixtures import SHARED, needs_third_party
-from support.motions import synthetic
+from support.glb import Glb
+from support.motions import posed, synthetic
 from support.refusals import bounded
 
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
-from flame_mdm.formats import glb, glb_animation
+from flame_mdm.formats import fbx_scene, glb, glb_animation
+from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.body import mannequin
 
 FILES = SHARED / "data" / "files"
 MILLIMETER = 1e-3
@@ -206,3 +212,83 @@ def test_a_track_of_steps_holds_each_value_until_the_next_key():
     track = glb_animation.Track(times, values, "STEP", np.zeros((2, 3, 1)))
     moments = np.array([0.0, 0.4, 0.9, 1.0, 1.9, 2.0])
     assert track.at(moments)[:, 0].tolist() == [1, 1, 1, 5, 5, 7]
+
+
+def test_a_cubic_track_has_the_slopes_of_its_keys_per_second():
+    """The polynomial t^3 - 3 t, with keys at 1, 3 and 4 seconds."""
+    times = np.array([1.0, 3.0, 4.0])
+    slopes = np.tile((3 * times**2 - 3)[None, :, None], (2, 1, 1))
+    slopes[0, 0], slopes[1, 2] = 100, 100  # before the first key and after the last one
+    values = (times**3 - 3 * times)[:, None]
+    track = glb_animation.Track(times, values, "CUBICSPLINE", slopes)
+    moments = np.array([0.0, 1.0, 1.7, 2.9, 3.5, 4.0, 9.0])
+    inside = np.clip(moments, 1, 4)
+    np.testing.assert_allclose(track.at(moments)[:, 0], inside**3 - 3 * inside, atol=1e-9)
+
+
+def test_a_linear_track_of_rotations_turns_at_a_constant_rate_the_shorter_way():
+    half = np.radians([0, 50])
+    values = np.stack([np.sin(half), 0 * half, 0 * half, np.cos(half)], 1) * [[1], [-1]]
+    track = glb_animation.Track(np.array([0.0, 2.0]), values, "LINEAR", np.zeros((2, 2, 4)))
+    turned = track.at(np.array([0.0, 0.5, 1.0, 2.0]))
+    angles = np.degrees(2 * np.arctan2(turned[:, 0], turned[:, 3]))
+    np.testing.assert_allclose(angles[:3], [0, 25, 50], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gaps", "extras", "fps"),
+    [
+        ([1 / 30], None, 30.0),
+        ([0.0333, 0.0334], None, 30.0),
+        ([1 / 29.97], None, 30.0),
+        ([1 / 24], None, 24.0),
+        ([1 / 23.5], None, 30.0),
+        ([0.5, 1.0], None, 30.0),
+        ([1 / 60, 1 / 60, 0.5], None, 60.0),
+        ([1 / 30], {"fps": 12.5}, 12.5),
+        ([1 / 30], {"fps": 5000}, 30.0),
+    ],
+)
+def test_the_rate_of_a_glb_file_follows_from_its_keys(monkeypatch, gaps, extras, fps):
+    times = np.concatenate([[0], np.cumsum(gaps * 40)])[:, None]
+    monkeypatch.setattr(glb_animation.glb, "numbers", lambda file, accessor, kind: times)
+    file: Any = SimpleNamespace(document={"asset": {"extras": extras}})
+    item: Any = SimpleNamespace(samplers=[SimpleNamespace(input=0)])
+    assert glb_animation._rate(file, [item]) == fps
+
+
+def test_frame_rates_of_fbx_files_by_their_number():
+    """As in Autodesk's `FbxTime::EMode`."""
+    whole = {1: 120, 2: 100, 3: 60, 4: 50, 5: 48, 6: 30, 7: 30, 10: 25, 11: 24, 12: 1000}
+    assert {mode: fbx_scene.TIME_MODES[mode] for mode in whole} == whole
+    assert (fbx_scene.TIME_MODES[15], fbx_scene.TIME_MODES[16]) == (96, 72)
+    fractions = {8: 29.97, 9: 29.97, 13: 23.976, 17: 59.94, 18: 119.88}
+    for mode, rate in fractions.items():
+        assert fbx_scene.TIME_MODES[mode] == pytest.approx(rate, abs=1e-3)
+        assert fbx_scene.TIME_MODES[mode] * 1.001 == pytest.approx(round(rate), rel=1e-9)
+    assert len(fbx_scene.TIME_MODES) == 17
+    assert fbx_scene.TICKS == 46186158000
+    assert fbx_scene.ORDERS[:6] == ("xyz", "xzy", "yzx", "yxz", "zxy", "zyx")
+
+
+def test_colors_of_the_skin_are_linear(tmp_path: Path):
+    posed(2).save(tmp_path / "a.glb")
+    file = Glb(tmp_path / "a.glb")
+    attributes = file.document["meshes"][0]["primitives"][0]["attributes"]
+    colors = file.array(attributes["COLOR_0"]).astype(float) / 255
+    assert (colors[:, 3] == 1).all()
+    np.testing.assert_allclose(
+        colors[:, :3], (mannequin().colors / 255) ** 2.2, atol=0.5 / 255 + 1e-9
+    )
+
+
+@pytest.mark.parametrize("ending", [".fbx", ".glb"])
+def test_a_file_keeps_its_unit_if_the_folder_maps_its_joints(ending: str, tmp_path: Path):
+    motion = synthetic("kick")
+    motion.save(tmp_path / f"a{ending}", rig="mixamo")
+    mapped = {joint: f"mixamorig:{name}" for joint, name in LAYOUTS["Mixamo"].map.items()}
+    (tmp_path / "skeleton.yaml").write_text(json.dumps({"map": mapped}))
+    again = read(tmp_path / f"a{ending}")
+    assert np.abs(again.joints - motion.joints).max() < 0.04
+    with pytest.raises(UserError, match=r"people's are 0\.6 to 1\.2 m"):
+        read(tmp_path / f"a{ending}", unit=0.02 if ending == ".fbx" else 2.0)

@@ -284,7 +284,7 @@ def _of_scene(
     rate = scene.fps if rate is None else rate
     names = scenes.joint_names(scene)
     layout = find_layout(names, fields)
-    if "map" not in fields and "unit" not in fields:
+    if "unit" not in fields:
         layout = layout.model_copy(update={"unit": scene.unit})
     joints = layout.apply(scene.positions / scene.unit, names)
 

@@ -507,3 +507,12 @@ def test_recipes_build_the_sizes_of_their_data(subtests):
             mask = length_mask(torch.tensor([12, 7]))
             assert task.network.logits(joints, mask).shape == (2, 7)
             assert len(task(joints, mask)) == 2
+
+
+def test_actions_have_the_numbers_of_actors_code():
+    assert HumanAct12.actions == (
+        *("warm_up", "walk", "run", "jump", "drink", "lift_dumbbell"),
+        *("sit", "eat", "turn steering wheel", "phone", "boxing", "throw"),
+    )
+    assert len(TRAIN_SUBJECTS) == 51
+    assert sum(TRAIN_SUBJECTS) == 3081

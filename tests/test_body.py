@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from support.motions import degrees, frames_array, posed, sway
 
 from flame_mdm.errors import UserError
@@ -14,9 +15,11 @@ from flame_mdm.formats import body as body_module
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.people import HEADS, load_body
+from flame_mdm.formats.posture import _toes
 from flame_mdm.representations.skeleton import JOINT, KIT21, SMPL22
+from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize import player_page, render
-from flame_mdm.visualize.body import ANCHORS, mannequin, sides
+from flame_mdm.visualize.body import ANCHORS, largest_weights, mannequin, sides
 
 
 def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
@@ -264,3 +267,47 @@ def test_shapes_that_anny_cannot_have_are_refused(tmp_path, monkeypatch, subtest
         with subtests.test(name=name, message=message), pytest.raises(UserError, match=message):
             load_body(name)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("joint", "end", "share"),
+    [
+        ("right_hip", "right_knee", 0.4),
+        ("left_shoulder", "left_elbow", 0.4),
+        ("right_wrist", "right_wrist", 0.55),
+    ],
+)
+def test_helper_bones_take_their_share_of_a_twist(joint: str, end: str, share: float):
+    axis = np.array(ADULT[JOINT[end]]) / np.linalg.norm(ADULT[JOINT[end]])
+    angles = Rotation.from_rotvec(50 * axis, degrees=True).as_euler("xyz", degrees=True)
+    turned = fit_body(posed(**{joint: angles})).turns[0] @ fit_body(posed()).turns[0].mT
+    helper = ANCHORS.index(JOINT[joint.replace("wrist", "elbow")], 22)
+    vector = Rotation.from_matrix(turned[helper]).as_rotvec(degrees=True)
+    np.testing.assert_allclose(vector, 50 * share * axis, atol=1e-3)
+
+
+def test_weights_are_rounded_to_255_parts():
+    weights = np.array(
+        [[0.3, 0, 0.5, 0.2, 0], [0.001, 0.999, 0, 0, 0], [0.1, 0.15, 0.2, 0.25, 0.3]]
+    )
+    bones, parts = largest_weights(weights)
+    assert parts.sum(1).tolist() == [255] * 3
+    assert parts[:2].tolist() == [[127, 77, 51, 0], [255, 0, 0, 0]]
+    assert bones.tolist() == [[2, 0, 3, 0], [1, 0, 0, 0], [4, 3, 2, 1]]
+    assert parts[2].tolist() == [84, 71, 57, 43]
+
+
+def test_toes_bend_against_the_pitch_of_the_foot_until_it_leaves_the_floor():
+    cases = {
+        (40, 0.0): -40,
+        (40, 0.02): -40,
+        (40, 0.055): -20,
+        (40, 0.09): 0,
+        (80, 0.0): -60,
+        (-30, 0.0): 0,
+    }
+    pitches, heights = np.array(list(cases)).T
+    feet = Rotation.from_euler("x", pitches[:, None], degrees=True).as_matrix()
+    bends = Rotation.from_matrix(_toes(feet, heights)).as_rotvec(degrees=True)
+    np.testing.assert_allclose(bends[:, 0], list(cases.values()), atol=1e-9)
+    np.testing.assert_allclose(bends[:, 1:], 0, atol=1e-9)

@@ -19,7 +19,7 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError
 from flame_mdm.formats import asf, bvh
 from flame_mdm.formats.layouts import tree_layout
-from flame_mdm.formats.recordings import is_at_60
+from flame_mdm.formats.recordings import AT_60, is_at_60, known_rate
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
@@ -372,3 +372,58 @@ def test_the_archive(real, subtests):
     assert clips["kit02279"].captions == [
         "A person is doing sidewards punches like with paddle at ping-pong."
     ]
+
+
+@pytest.mark.parametrize(
+    ("trial", "is_slow"),
+    [
+        *((f"{subject}_01", True) for subject in (33, 34, 42, 60, 61, 62, 74, 75, 77, 79, 80)),
+        *((f"{subject}_01", True) for subject in (87, 88, 89)),
+        *(("136_19", True), ("136_18", False), ("02_01", False), ("133_01", False)),
+        *(("60_15", True), ("35_01", False), ("76_60", False)),
+    ],
+)
+def test_recordings_at_60_frames_per_second(trial: str, is_slow: bool):
+    assert len(AT_60) == 15
+    assert is_at_60(trial) == is_slow
+    assert known_rate(f"{trial}_poses", "CMU", 120.0) == (60.0 if is_slow else None)
+
+
+@pytest.mark.parametrize(
+    ("name", "skeleton", "fps", "rate"),
+    [
+        ("60_01", "CMU ASF", 120.0, 60.0),
+        ("60_01", "Daz without toes", 119.6, 60.0),
+        ("60_01", "Mixamo", 120.0, None),
+        ("60_01", "CMU", 60.0, None),
+        ("60_01", "CMU", 100.0, None),
+        ("60_01", "CMU", 30.0, None),
+        ("160_01", "CMU", 120.0, None),
+        ("walk", "CMU", 120.0, None),
+    ],
+)
+def test_a_rate_is_corrected_only_for_a_cmu_recording_that_states_120(name, skeleton, fps, rate):
+    assert known_rate(name, skeleton, fps) == rate
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "frames"),
+    [("0.53", "2.68", (11, 54)), ("", "2.52", (0, 50)), ("", "", (0, None))],
+)
+def test_times_of_a_part_are_rounded_to_frames(begin: str, end: str, frames: tuple):
+    part = cmu._part_in_table({"id": "02_01", "begin": begin, "end": end})
+    assert (part.start, part.end) == frames
+
+
+def test_the_pose_in_front_of_a_daz_file_and_the_frames_blended_with_it_are_removed():
+    parents = tuple([*DAZ].index(above) if above else -1 for above in DAZ.values())
+    turning = ("Zrotation", "Xrotation", "Yrotation")
+    channels = (("Xposition", "Yposition", "Zposition", *turning), *[turning] * (len(DAZ) - 1))
+    numbers = np.arange(10)[:, None] * np.ones(6 + 3 * (len(DAZ) - 1))
+    tree = bvh.Bvh(tuple(DAZ), parents, np.ones((len(DAZ), 3)), channels, numbers, 120)
+    standard, _ = cmu.standardize(tree)
+    assert standard.frames[:, 0].tolist() == [*range(1, 10)], "the path stays as it is"
+    assert standard.frames[:, 3].tolist() == [*range(1, 10)]
+    assert (standard.frames[:, 6:] == [[4]] * 4 + [[k] for k in range(5, 10)]).all()
+    moving = replace(tree, frames=numbers + 1)
+    assert len(cmu.standardize(moving)[0].frames) == 10

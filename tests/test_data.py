@@ -17,7 +17,14 @@ import torch
 from support.stores import OwnClips, clip
 
 from flame_mdm.batch import MotionBatch, collate
-from flame_mdm.data import datamodule, hashed_split, resident, split_blocks, swap_sides
+from flame_mdm.data import (
+    datamodule,
+    hashed_split,
+    mirrored,
+    resident,
+    split_blocks,
+    swap_sides,
+)
 from flame_mdm.data.crops import Crop, Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, MotionDataModule, TrainingBatches, evaluation_batches
 from flame_mdm.data.resident import ResidentLoader, free_memory
@@ -546,3 +553,16 @@ def test_hours_are_those_of_the_frames(tmp_path):
         tmp_path / "store", OwnClips(clip("a", motion=features, encoded=ENCODED)), HumanML(fps=12.5)
     )
     assert store.info["hours"] == 0.08
+
+
+def test_a_mirrored_clip_has_the_other_side_in_all_its_words():
+    facts = {"side": "left", "count": 2, "tokens": ["left/ADJ"]}
+    original = clip("a", source="take", action=1, attributes=facts)
+    original.captions = ["a person waves the left arm", "waves"]
+    actions = ("wave right", "wave left", "throw left")
+    image = mirrored(original, original.motion[:3], actions)
+    assert (image.id, image.source, image.split, image.action) == ("Ma", "take", "train", 0)
+    assert image.captions == ["a person waves the right arm", "waves"]
+    assert image.attributes == facts | {"side": "right"}
+    assert len(image.motion) == 3
+    assert mirrored(replace(original, action=2), original.motion, actions).action == 2

@@ -324,3 +324,12 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle, subtests):
     assert not list(tmp_path.iterdir())
     kit.save(tmp_path / "a.json")
     assert read(tmp_path / "a.json").skeleton == KIT21
+
+
+def test_the_twist_of_the_spine_is_shared_evenly():
+    made = posed(4, spine1=(0, 25, 0), spine2=(0, 20, 0), spine3=(0, 15, 0))
+    solved = solve(torch.from_numpy(made.joints), FPS)
+    for joint in (3, 6, 9):
+        vectors = rotation.matrix_to_axis_angle(solved.rotations[:, joint])
+        turned = torch.rad2deg(vectors[:, 1])
+        torch.testing.assert_close(turned, torch.full_like(turned, 20.0), rtol=0, atol=1.5)

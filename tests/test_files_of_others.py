@@ -25,8 +25,8 @@ from flame_mdm.data.adaptation import check_clips
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
-from flame_mdm.formats import ENDINGS, SCENES, glb
-from flame_mdm.formats.layouts import Layout, head_height
+from flame_mdm.formats import ENDINGS, SCENES, checks, glb
+from flame_mdm.formats.layouts import UP, Layout, head_height
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read, read_recording
 from flame_mdm.representations.humanml import HumanML
@@ -509,3 +509,135 @@ def test_the_collected_files_have_their_heights(name: str, keys: dict, head: flo
     if name == "f02_y_up.npz" and keys:
         lowest = float(np.median(motion.joints[..., 1].min(1)))
         assert lowest == pytest.approx(0, abs=0.02), "feet on the floor"
+
+
+def test_a_command_comes_before_the_file_and_the_file_before_the_folder(tmp_path: Path):
+    motion = walk()
+    turned = 100 * motion.joints @ np.array(TURNED["z"], float).T
+    content = {"joints": turned.tolist(), "fps": 20, "up": "z", "unit": "cm"}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    (tmp_path / "skeleton.yaml").write_text("up: -y\nunit: 0.0254\nfps: 50\n")
+    motion_read = read(tmp_path / "a.json")
+    np.testing.assert_allclose(motion_read.joints, motion.joints, atol=1e-4)
+    assert motion_read.fps == 20
+    assert read(tmp_path / "a.json", fps=25).fps == 25
+
+    (tmp_path / "a.json").write_text(json.dumps(content | {"up": "-y", "unit": "m"}))
+    again = read(tmp_path / "a.json", up="z", unit=0.01)
+    np.testing.assert_allclose(again.joints, motion.joints, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("unit", "meters"),
+    [
+        *(("m", 1), ("meter", 1), ("metre", 1), ("cm", 0.01), ("centimeter", 0.01)),
+        *(("Centimetre", 0.01), ("mm", 0.001), (0.0254, 0.0254)),
+    ],
+)
+def test_names_of_units_in_json_files(tmp_path: Path, unit: Any, meters: float):
+    joints = walk(4).joints / meters
+    content = {"joints": joints.tolist(), "fps": 20, "unit": unit}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    np.testing.assert_allclose(read(tmp_path / "a.json").joints, walk(4).joints, atol=1e-5)
+
+
+@pytest.mark.parametrize("up", TURNED)
+def test_each_axis_that_points_up_is_turned_to_y(tmp_path: Path, up: str):
+    joints = walk(4).joints.astype(float)
+    np.savez(tmp_path / "a.npz", joints=joints @ np.array(TURNED[up], float).T, fps=20)
+    np.testing.assert_allclose(read(tmp_path / "a.npz", up=up).joints, joints, atol=1e-5)
+    np.savez(tmp_path / "b.npz", **amass(walk(4), up))
+    np.testing.assert_allclose(
+        read(tmp_path / "b.npz", up=up).joints[:, 1:]
+        - read(tmp_path / "b.npz", up=up).joints[:, :1],
+        joints[:, 1:] - joints[:, :1],
+        atol=1e-5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("up", "pelvis"),
+    [("z", (0, 0.028, -0.223)), ("y", (0, -0.223, 0.028)), ("-y", (0, 0.223, -0.028))],
+)
+def test_a_body_without_translation_has_its_pelvis_where_smpls_template_has_it(
+    tmp_path: Path, up: str, pelvis: tuple
+):
+    parts = amass(walk(4), up)
+    np.savez(tmp_path / "a.npz", **(parts | {"trans": np.zeros((4, 3))}))
+    np.testing.assert_allclose(
+        read(tmp_path / "a.npz", up=up).joints[:, 0], np.tile(pelvis, (4, 1)), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0, 120.0])
+def test_speeds_that_no_person_has_are_noticed_at_any_rate(fps: float):
+    def moving(joint: str, speed: float) -> str:
+        joints = np.zeros((40, 22, 3))
+        moved = range(22) if joint == "pelvis" else [SMPL22.joints.index(joint)]
+        joints[:, moved, 0] = np.arange(40)[:, None] * speed / fps
+        return checks.jump(joints, fps)
+
+    assert moving("pelvis", 14.5) == ""
+    assert moving("pelvis", 15.6).startswith("the body jumps: it moves at 16 m/s")
+    assert moving("right_ankle", 29.5) == ""
+    assert moving("right_ankle", 30.6).startswith("a leg flips: it moves at 31 m/s")
+
+
+def test_a_pelvis_that_shakes_for_one_frame_does_not_jump():
+    joints = np.zeros((40, 22, 3))
+    joints[20, :, 0] = 0.2
+    assert checks.jump(joints, 60.0) == ""
+    joints[20:, :, 0] = 0.8
+    assert "the body jumps" in checks.jump(joints, 60.0)
+    joints = np.zeros((40, 22, 3))
+    joints[20:, SMPL22.joints.index("left_ankle"), 2] = 0.5
+    assert checks.jump(joints, 120.0).startswith("a leg flips: it moves at 60 m/s in frame 19")
+
+
+@pytest.mark.parametrize(("fps", "blended", "left_out"), [(60, 1, 2), (20, 0, 1), (60, 0, 1)])
+def test_frames_that_lead_from_a_rest_pose_to_the_motion_are_counted(fps, blended, left_out):
+    rest, stand = posed(1).joints[0], walk(1).joints[0]
+    steps = [rest + share * (stand - rest) for share in np.linspace(0, 1, blended + 2)]
+    joints = np.concatenate([steps, np.tile(stand, (12, 1, 1))])
+    assert checks.rest_frames(joints, fps) == left_out
+    assert checks.rest_frames(joints[left_out:], fps) == 0
+
+
+def test_files_of_kimodo_have_30_frames_per_second(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", posed_joints=walk(4).joints)
+    assert read(tmp_path / "a.npz").fps == 30
+    np.savez(tmp_path / "a.npz", posed_joints=walk(4).joints, fps=25)
+    assert read(tmp_path / "a.npz").fps == 25
+
+
+@pytest.mark.parametrize(
+    ("up", "trunk", "words"),
+    [
+        ("y", (0.95, 0.31, 0), ""),
+        ("y", (0.96, 0.29, 0), "the body is lying down"),
+        ("y", (0, 0.1, 0.99), "set up=z,"),
+        ("y", (0.7, 0.2, 0.69), "the body is lying down"),
+        ("y", (0.7, 0.1, 0.71), "set up=z,"),
+        ("y", (0, -1, 0), "set up=-y,"),
+        ("z", (0, 0, -1), "set up=y,"),
+        ("z", (0, 0, 1), "set up=-y,"),
+    ],
+)
+def test_a_body_that_lies_would_stand_with_the_axis_that_is_named(
+    up: str, trunk: tuple, words: str
+):
+    """The directions of the trunk have y up."""
+    joints = np.zeros((3, 22, 3))
+    joints[:, SMPL22.joints.index("neck")] = 0.5 * np.array(trunk)
+    message = checks.lying(joints, up, np.array(UP[up], float))
+    assert words in message
+    assert bool(message) == bool(words)
+    assert ("set up=" in message) == ("set up=" in words)
+
+
+def test_a_body_two_centimeters_below_the_floor_is_reported():
+    joints = np.ones((9, 22, 3))
+    joints[:, 10, 1] = -0.019
+    assert checks.below_floor(joints) == ""
+    joints[:5, 10, 1] = -0.026
+    assert checks.below_floor(joints).startswith("the feet are 3 cm below the floor")

@@ -18,7 +18,8 @@ from support.stores import write_amass
 
 from flame_mdm.__main__ import main
 from flame_mdm.config import compose_data, instantiate
-from flame_mdm.data import Clip, hashed_split
+from flame_mdm.data import Clip, hashed_split, name_hash
+from flame_mdm.data.captions import drawn_splits
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
@@ -588,3 +589,27 @@ def test_every_representation_is_prepared_from_every_kind_of_file(
                 == 1
             )
             assert "data.source.motion=smpl" in one_error(capsys)
+
+
+def test_missing_splits_are_filled_with_the_sources_of_the_highest_hashes():
+    names = [f"walk {number}" for number in range(200)]
+    training = [name for name in names if hashed_split(name, val=5, test=10) == "train"]
+    first, second, *_ = sorted(training[:10], key=name_hash, reverse=True)
+    splits = drawn_splits({name: name for name in training[:10]}, dict.fromkeys(training[:10]))
+    others = set(training[:10]) - {first, second}
+    assert splits == dict.fromkeys(others, "train") | {first: "val", second: "test"}
+    splits = drawn_splits({name: name for name in training[:9]}, dict.fromkeys(training[:9]))
+    assert set(splits.values()) == {"train"}
+
+
+def test_motions_of_one_source_are_used_for_training():
+    for source in ("walk 1", *(f"take {number}" for number in range(20))):
+        motions = [f"{number}" for number in range(12)]
+        splits = drawn_splits(dict.fromkeys(motions, source), dict.fromkeys(motions))
+        assert set(splits.values()) == {"train"}
+
+
+def test_a_stated_split_holds_for_all_motions_of_the_source():
+    sources = {"a": "one", "b": "one", "c": "two", "d": "three"}
+    splits = drawn_splits(sources, {"a": "test", "b": None, "c": "val", "d": None})
+    assert splits == {"a": "test", "b": "test", "c": "val", "d": "train"}

@@ -26,6 +26,7 @@ from flame_mdm.data.amass import Recording, key_of
 from flame_mdm.data.crops import Units
 from flame_mdm.data.humanml3d import HumanML3D, HumanML3DSMPL, IndexedClip
 from flame_mdm.data.store import write_store
+from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
@@ -572,3 +573,42 @@ def test_splits_and_motions_left_out_of_the_smpl_form(mine, tmp_path):
     (mine / "HumanML3D" / "HumanML3D" / "texts" / "000000.txt").unlink()
     with pytest.raises(FileNotFoundError, match="1 clips have no text, such as 000000"):
         smpl(mine).count()
+
+
+@pytest.mark.parametrize(
+    ("rate", "step"), [(20, 1), (39.9, 1), (59.94, 2), (60, 3), (120, 6), (100, 5), (250, 12)]
+)
+def test_the_step_between_frames_is_rounded_down(rate, step):
+    poses, path = np.arange(50)[:, None] * np.ones(156), np.arange(50)[:, None] * np.ones(3)
+    recording = Recording(poses, path, np.zeros(16), "male", rate).every(20)
+    assert recording.translation[:, 0].tolist() == list(range(0, 50, step))
+    np.testing.assert_array_equal(recording.poses[:, 155], recording.translation[:, 2])
+
+
+def test_a_recording_with_too_few_frames_per_second_is_refused():
+    recording = Recording(np.zeros((9, 156)), np.zeros((9, 3)), np.zeros(16), "male", 19.9)
+    with pytest.raises(UserError, match=r"19\.9 frames per second, fewer than the requested 20"):
+        recording.every(20)
+
+
+@pytest.mark.parametrize(("frames", "kept"), [(39, 0), (40, 1), (199, 1), (200, 0)])
+def test_motions_of_40_to_199_frames_are_kept(frames, kept):
+    whole = t2m.Description("a", [])
+    assert len(t2m.cuts("x", frames, [whole], 40)) == kept
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "cut"),
+    [
+        (0.29, 2.29, (5, 40)),
+        (0.3, 2.29, None),
+        (1.0, 99.0, (20, 130)),
+        (0.0, 2.0, (0, 40)),
+        (0.0, 1.99, None),
+    ],
+)
+def test_times_of_parts_are_rounded_down_and_end_with_the_motion(begin, end, cut):
+    part = t2m.Description("a", [], begin, end)
+    items = t2m.cuts("x", 150, [part], 40)
+    assert [(item.start, item.length) for item in items] == ([] if cut is None else [cut])
+    assert all(item.id == f"x@{begin:g}-{end:g}" for item in items)

@@ -193,3 +193,10 @@ def test_a_damaged_folder_is_named(mmm, tmp_path, damage, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
         write_store(tmp_path / "store", source(mmm), Rifke())
     assert "\n" not in str(error.value)
+
+
+def test_limits_of_the_length_are_included_and_do_not_apply_to_the_test_split(mmm):
+    kit = source(mmm)
+    kit.frames = {"a": 9, "b": 10, "c": 500, "d": 501, "e": 9, "f": 501}
+    kit.names = dict.fromkeys("abcd", "train") | dict.fromkeys("ef", "test")
+    assert [name for name in kit.frames if kit._fits(name)] == ["b", "c", "e", "f"]

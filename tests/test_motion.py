@@ -2,6 +2,8 @@
 
 import sys
 from dataclasses import replace
+from fractions import Fraction
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,8 +19,10 @@ import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
+from flame_mdm.formats import bvh
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
+from flame_mdm.formats.resampling import frame_pairs, frame_rate
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampling.editing import edit
@@ -189,3 +193,48 @@ def test_a_joint_far_from_constant_bone_lengths_is_named_with_its_frame(ending, 
     motion.joints[7, 21, 1] += 0.05
     line = motion.save(tmp_path / f"walk.{ending}")
     assert "right_wrist in frame 7, where a bone changes its length" in line
+
+
+def test_contacts_at_another_rate_are_those_of_the_nearest_frame(walk: Motion):
+    contacts = np.arange(len(walk.joints))[:, None] % 8 >= [4, 2, 6, 1]
+    motion = replace(walk, contacts=contacts)
+    resampled = motion.resampled(20.0)
+    nearest = np.floor(1.5 * np.arange(len(resampled.joints)) + 0.5).astype(int)
+    np.testing.assert_array_equal(resampled.contacts, contacts[nearest])
+    faster = motion.resampled(90.0)
+    nearest = (np.arange(len(faster.joints)) + 1) // 3
+    np.testing.assert_array_equal(faster.contacts, contacts[nearest])
+
+
+def test_tips_of_head_hands_and_toes_are_in_bvh_files(tmp_path: Path):
+    synthetic("walk").save(tmp_path / "a.bvh")
+    tree = bvh.read(tmp_path / "a.bvh")
+    tips = {
+        name: tree.offsets[tree.joints.index(f"{name}.end")].tolist()
+        for name in ("head", "left_foot", "right_foot", "left_wrist", "right_wrist")
+    }
+    assert tips == {
+        "head": [0, 18, 0],
+        "left_foot": [0, 0, 6],
+        "right_foot": [0, 0, 6],
+        "left_wrist": pytest.approx([8.5, -1, -1.5]),
+        "right_wrist": pytest.approx([-8.5, -1, -1.5]),
+    }
+
+
+def test_new_frames_are_at_exact_times_up_to_the_last_frame():
+    rates = (Fraction(25, 2), *map(Fraction, (20, 24, 25, 30, 50, 60, 100, 120)))
+    for rate, fps, frames in product(rates, rates, (1, 2, 4, 25, 121)):
+        before, after, share = frame_pairs(frames, float(rate), float(fps), 1)
+        times = [k * rate / fps for k in range(int((frames - 1) * fps / rate) + 1)]
+        assert len(before) == len(times)
+        np.testing.assert_allclose(before + share, [float(time) for time in times], atol=1e-9)
+        assert (after == np.minimum(before + 1, frames - 1)).all()
+        assert ((share > -1e-9) & (share < 1 + 1e-9)).all()
+
+
+def test_rates_from_one_frame_in_ten_seconds_to_a_thousand_per_second_are_read():
+    assert [frame_rate(rate) for rate in (0.1, 1000, np.array([30]))] == [0.1, 1000.0, 30.0]
+    for rate in (0.0999, 1000.1, True, [20, 20], "20"):
+        with pytest.raises(UserError, match=r"from 0\.1 to 1000"):
+            frame_rate(rate)

@@ -10,7 +10,14 @@ from support.motions import synthetic
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
-from flame_mdm.formats.layouts import LAYOUTS, _spelled, _variants, check_size, find_layout
+from flame_mdm.formats.layouts import (
+    LAYOUTS,
+    _spelled,
+    _variants,
+    check_size,
+    find_layout,
+    leg_length,
+)
 from flame_mdm.formats.names import best_match, spelled, spellings
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
@@ -207,3 +214,84 @@ def test_a_unit_is_proposed_for_figures_that_have_no_usual_one():
     check_size(figure * unit / 0.01, unit)
     with pytest.raises(UserError, match=r"The unit is wrong"):
         check_size(0 * joints, 0.01)
+
+
+METERS = ("SMPL", "VRoid", "Quaternius", "Rigify trunk of two", "SOMA", "SOMA 30")
+OTHER_UNITS = {"CMU": 0.0254 / 0.45, "CMU ASF": 0.0254 / 0.45, "MMM": 1 / 640}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_units_and_sides_of_known_skeletons(name: str):
+    expected = 1.0 if name in METERS else OTHER_UNITS.get(name, 0.01)
+    assert LAYOUTS[name].unit == pytest.approx(expected, rel=1e-9)
+    assert LAYOUTS[name].mirrored == (name == "MMM")
+    assert LAYOUTS[name].up == "y"
+
+
+BLENDS = {
+    "Xsens": {"spine3": (0.5, 0.5)},
+    "CMU": {"spine1": (0.5, 0.5), "left_collar": (0.5, 0.5)},
+    "Bandai-Namco": {"spine1": (0.6, 0.4)},
+    "MMM": {"spine1": (0.5, 0.5), "left_collar": (0.5, 0.5)},
+    "CMU ASF": {
+        "spine1": (0.12, 0.88),
+        "spine2": (0.13, 0.87),
+        "spine3": (0.73, 0.27),
+        "left_collar": (0.62, 0.38),
+    },
+    "Daz": {"pelvis": (0.48, 0.26, 0.26), "spine3": (0.82, 0.18), "left_collar": (0.5, 0.5)},
+    "Character Creator": {
+        "pelvis": (0.2, 0.8),
+        "spine1": (0.6, 0.4),
+        "spine2": (0.8, 0.2),
+        "spine3": (0.6, 0.4),
+        "left_collar": (0.85, 0.15),
+    },
+    "Rokoko": {"spine2": (0.5, 0.5)},
+    "mocapbank": {"spine2": (0.3, 0.7)},
+    "Biovision": {"spine2": (0.65, 0.35), "spine3": (0.5, 0.5)},
+    "Biovision limbs": {"spine2": (0.65, 0.35), "spine3": (0.5, 0.5)},
+    "Quaternius": {"spine2": (0.5, 0.5)},
+    "Rigify trunk of two": {
+        "spine1": (0.5, 0.5),
+        "spine3": (0.8, 0.2),
+        "head": (0.5, 0.5),
+        "left_collar": (0.5, 0.5),
+    },
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_joints_that_a_skeleton_lacks_lie_between_two_of_its_joints(name: str):
+    layout = LAYOUTS[name]
+    blends = {
+        joint: tuple(source.values())
+        for joint, source in layout.map.items()
+        if isinstance(source, dict) and not joint.startswith("right_")
+    }
+    assert blends == BLENDS.get(name, {})
+    for joint, source in layout.map.items():
+        if isinstance(source, dict):
+            assert sum(source.values()) == pytest.approx(1), joint
+            at = {number: k * 1.0 for k, number in enumerate(source)}
+            points = np.array([[[at.get(n, 0.0), 0, 0] for n in layout.used]])
+            mapped = layout.apply(points, list(layout.used))[0, SMPL22.joints.index(joint), 0]
+            expected = sum(k * share for k, share in enumerate(source.values()))
+            assert abs(mapped) == pytest.approx(layout.unit * expected, rel=1e-5), joint
+
+
+@pytest.mark.parametrize(
+    ("leg", "children", "fits"),
+    [
+        *((0.59, False, False), (0.61, False, True), (1.19, False, True), (1.21, False, False)),
+        *((0.24, True, False), (0.26, True, True), (0.5, True, True), (1.21, True, False)),
+    ],
+)
+def test_legs_of_adults_and_children_have_limits(leg: float, children: bool, fits: bool):
+    joints = synthetic("walk").joints[:3]
+    joints = joints * leg / leg_length(joints)
+    if fits:
+        check_size(joints, 1.0, children)
+        return
+    with pytest.raises(UserError, match=r"people's are (0\.25|0\.6) to 1\.2 m"):
+        check_size(joints, 1.0, children)

@@ -4,6 +4,8 @@ import json
 import re
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from support.stores import (
 
 from flame_mdm.__main__ import main
 from flame_mdm.config import EXPERIMENTS
+from flame_mdm.data import verify
 from flame_mdm.data.bandai import split_of
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
@@ -257,3 +260,39 @@ def test_every_set_from_raw_files_to_a_training_step(data: str, takes: Path, tmp
     ]
     assert main(["train", "quickstart", *recipe, f"run.dir={tmp_path / 'run'}"]) == 0
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_figures_are_compared_within_the_rounding_of_the_published_ones(monkeypatch):
+    published = {"set": {"clips": 9, "words": [12, 0.5], "hours": [3, 0.1], "takes": 7}}
+    monkeypatch.setattr(verify, "read_package_yaml", lambda path: published)
+    actions = {"train": (0, 0, 0, 1), "val": (1, 1), "test": (1, 1, 1)}
+    clips = [
+        SimpleNamespace(action=action, split=split)
+        for split, numbers in actions.items()
+        for action in numbers
+    ]
+    splits = {split: len(numbers) for split, numbers in actions.items()}
+    store: Any = SimpleNamespace(
+        clips=clips,
+        info={
+            "dataset": "set",
+            "clips": splits,
+            "counts": {"words": 12.5, "hours": 3.11, "val": 8},
+        },
+    )
+    figures = verify._figures(store)
+    assert {
+        name: figure["state"] for name, figure in figures.items() if name in published["set"]
+    } == {
+        "clips": "ok",
+        "words": "ok",
+        "hours": "differs",
+        "takes": "not counted",
+    }
+    counted = {name: figure["found"] for name, figure in figures.items()}
+    assert counted == {
+        **{"clips": 9, "words": 12.5, "hours": 3.11, "takes": None, "actions": 2},
+        **{"train": 4, "val": 8, "val of the store": 2, "test": 3},
+        **{"fewest clips per action": 3, "most clips per action": 6},
+        **{"fewest training clips per action": 3, "most training clips per action": 3},
+    }

@@ -23,8 +23,9 @@ from support.motions import posed
 from torch import Tensor
 from torch.nn import functional
 
+from flame_mdm.data.standing import standing
 from flame_mdm.errors import UserError
-from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations import Representation, grouped_statistics, rotation
 from flame_mdm.representations.essential import Essential
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.motion272 import Motion272, face_forward
@@ -34,10 +35,11 @@ from flame_mdm.representations.rotation import is_degenerate
 from flame_mdm.representations.skeleton import (
     SKELETONS,
     SMPL22,
+    SMPL24,
     forward_kinematics,
     global_rotations,
 )
-from flame_mdm.representations.smpl import SMPL
+from flame_mdm.representations.smpl import ADULT, SMPL
 
 STEMS = ["hml263", "kit251"]
 STEMS += [
@@ -265,6 +267,99 @@ def test_headings_are_smoothed_over_the_same_seconds_at_any_rate():
     assert turned[0].abs().max() > 0.1
     # The ends differ: the last frames are not at the same time
     close(turned[0], turned[1][: len(turned[0])], 0.06)
+
+
+def test_smoothing_of_the_heading_is_a_gaussian_of_one_second():
+    """It damps a swing of one radian per second by exp(-1/2)."""
+    seconds = np.arange(400) / 20
+    joints = posed(400, heading=0.5 * np.sin(seconds)).joints
+    heading = HumanML().encode(torch.from_numpy(joints))[:, 0].cumsum(0)[100:300]
+    swing = (heading.max() - heading.min()).item()
+    assert swing == pytest.approx(math.exp(-0.5), rel=0.01)
+
+
+def test_a_steady_turn_stays_steady_to_the_first_and_last_frame():
+    joints = posed(60, heading=0.1 * np.arange(60)).joints
+    turn = HumanML().encode(torch.from_numpy(joints))[:, 0]
+    close(turn, torch.full((59,), 0.1), 1e-4)
+
+
+@pytest.mark.parametrize("variant", ["clean", "legacy"])
+@pytest.mark.parametrize("units", [1.0, 640.0])
+def test_steps_of_the_root_are_meters_to_the_left_and_ahead(variant, units):
+    representation = HumanML(variant=variant, units_per_metre=units)
+    path = np.arange(40)[:, None] * [0.02, 0.0, 0.05] + [0, 0.95, 0]
+    features = representation.encode(torch.from_numpy(posed(40, root=path).joints))
+    turn, step = representation.root_steps(features)
+    close(turn, torch.zeros(39), 1e-4)
+    close(step, torch.tensor([[0.02, 0.05]]).expand(39, 2), 1e-4)
+
+    joints = posed(200, heading=0.02 * np.arange(200) - 2).joints
+    turn, _ = representation.root_steps(representation.encode(torch.from_numpy(joints)))
+    close(turn[90:110], torch.full((20,), 0.02), 2e-3)
+
+
+def test_features_of_a_joint_are_its_columns():
+    expected = {
+        "humanml": [*range(13, 16), *range(67 + 18, 67 + 24), *range(193 + 12, 193 + 15)],
+        "rifke": [10, 11, 12],
+        "rot6d": [*range(24, 30)],
+        "smpl": [*range(27, 33)],
+    }
+    for representation, (name, columns) in zip(
+        (HumanML(), Rifke(), Rot6D(), SMPL()), expected.items(), strict=True
+    ):
+        assert representation.joint_features([4]).nonzero()[:, 0].tolist() == columns, name
+    feet = [HumanML().joint_features([joint])[259:].tolist() for joint in SMPL22.feet]
+    assert feet == torch.eye(4).bool().tolist()
+    root = Rifke().joint_features([0]).nonzero()[:, 0].tolist()
+    assert root == [0, 61, 62, 63]
+
+
+def test_a_small_deviation_is_kept_and_a_smaller_one_counts_as_rounding():
+    signs = torch.tensor([1.0, -1.0]).repeat(50)[:, None]
+    features = signs * torch.tensor([1.1e-4, 0.9e-4, 3.0, 1.0])
+    groups = [slice(0, 1), slice(1, 2), slice(2, 4)]
+    _, std = grouped_statistics(features, groups)
+    close(std, torch.tensor([1.1e-4, 1.0, 2.0, 2.0]), 1e-6)
+
+
+def test_motion272_shows_the_body_of_smpl_from_another_side():
+    """Up to a turn about the vertical axis and a shift, without a reflection."""
+    generator = torch.Generator().manual_seed(0)
+    turns = 0.5 * torch.randn(24, 3, generator=generator) * torch.linspace(0, 1, 9)[:, None, None]
+    turns[:, 0] += torch.tensor([math.pi / 2, 0, 0])
+    path = torch.linspace(0, 1, 9)[:, None] * torch.tensor([1.0, 2.0, 0.1])
+    raw = torch.cat([path, turns.flatten(1)], 1).double()
+    ours = Motion272().decode(Motion272().encode(raw).double())
+    expected = SMPL().decode(SMPL().encode(raw).double())[:, :22]
+    ours, expected = (joints - joints[:1, :1] for joints in (ours, expected))
+    across, apart = ours[0, 2] - ours[0, 1], expected[0, 2] - expected[0, 1]
+    angle = torch.atan2(across[0], across[2]) - torch.atan2(apart[0], apart[2])
+    close(rotation.rotate_y(expected, angle), ours, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "fps", "facts"),
+    [
+        ("essential67", 20, {"legacy": False, "units_per_metre": 1.0, "bone_lengths": None}),
+        ("humanml_clean", 20, {"legacy": False, "units_per_metre": 1.0, "bone_lengths": None}),
+        (
+            "humanml_legacy",
+            20,
+            {"legacy": True, "units_per_metre": 1.0, "contact_threshold": 0.002},
+        ),
+        ("kit_legacy", 12.5, {"legacy": True, "units_per_metre": 640, "contact_threshold": 0.05}),
+        ("motion272", 30, {}),
+        ("rifke", 12.5, {"units_per_metre": 640}),
+        ("rot6d", 20, {"offsets": ADULT}),
+        ("smpl", 20, {"offsets": ADULT}),
+    ],
+)
+def test_recipes_have_the_published_rates_and_units(name, fps, facts):
+    representation = instantiate(OmegaConf.load(ROOT / f"experiments/representation/{name}.yaml"))
+    assert representation.fps == fps
+    assert {key: getattr(representation, key) for key in facts} == facts
 
 
 def test_many_motions_at_once_are_encoded_as_one_by_one(subtests):
@@ -508,3 +603,28 @@ def test_cuts_of_motion272_start_like_whole_motions():
         torch.cdist(points, points) for points in (joints.flatten(0, 1), whole.flatten(0, 1))
     )
     close(distances, expected, 1e-4)
+
+
+@pytest.mark.parametrize("representation", [HumanML(), Rifke(), Essential("kit21", fps=12.5)])
+def test_a_person_who_stands_has_the_requested_number_of_equal_frames(representation):
+    still = standing(representation, 7)
+    assert still.features.shape == (7, representation.features)
+    assert (still.fps, still.representation) == (representation.fps, representation.name)
+    assert still.skeleton is representation.skeleton
+    np.testing.assert_allclose(still.joints, still.joints[:1].repeat(7, 0), atol=1e-5)
+    assert 1.2 < np.ptp(still.joints[0, :, 1]) < 1.7
+
+
+@pytest.mark.golden
+def test_bone_lengths_of_the_published_features_are_those_of_the_reference_clip():
+    recipe = OmegaConf.load(ROOT / "experiments/representation/humanml_legacy.yaml")
+    _, lengths = legacy("hml263")
+    close(torch.tensor(list(recipe.bone_lengths)), lengths, 1e-7)
+
+
+def test_the_adult_body_is_symmetric_and_does_not_change():
+    adult = np.array(ADULT)
+    np.testing.assert_array_equal(adult[list(SMPL24.mirrored)] * [-1, 1, 1], adult)
+    np.testing.assert_allclose(adult.sum(0), [0, -1, 0], atol=1e-12)
+    weighted = (np.arange(24) + 1) @ np.abs(adult)
+    np.testing.assert_allclose(weighted, [33.391, 25.785, 8.775], atol=1e-9)

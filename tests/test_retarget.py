@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.fixtures import blender
 from support.glb import Glb, changed, odd_character, skinned, write_names
-from support.motions import largest_step, synthetic
+from support.motions import largest_step, posed, synthetic
 
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
@@ -22,6 +22,7 @@ from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import preset, presets, retarget
 from flame_mdm.formats.rig import LIMBS, SIDES
 from flame_mdm.representations.skeleton import JOINT, SMPL22
+from flame_mdm.representations.smpl import ADULT
 
 BLENDED = {"cmu": ("spine1", "left_collar", "right_collar"), "100style": ("spine3",)}
 """Joints that the reader of these skeletons places between two of the file's."""
@@ -454,3 +455,85 @@ def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: 
                 np.testing.assert_allclose(
                     position, expected, atol=1e-4, err_msg=f"{rig.joints[joint]}, frame {frame}"
                 )
+
+
+AXES = {
+    "lafan1": {
+        "Hips": ("up", "forward"),
+        "Arm": ("along", "back"),
+        "Hand": ("along", "back"),
+        "UpLeg": ("along", "forward"),
+        "Foot": ("along", "up"),
+        "Toe": ("forward", "up"),
+    },
+    "soma": {
+        "Chest": ("up", "forward"),
+        "Arm": ("along", "up"),
+        "Hand": ("along", "up"),
+        "Leg": ("along", "back"),
+        "Shin": ("along", "back"),
+        "Foot": ("along", "down"),
+        "ToeBase": ("forward", "down"),
+    },
+}
+TOWARD = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)}
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_the_first_two_axes_of_each_joint_have_the_directions_of_the_program(name, subtests):
+    rig = preset(name, posed().posed())
+    for joint, directions in AXES[name].items():
+        middle = joint in ("Hips", "Chest")
+        for side, mirror in (("", 1),) if middle else (("Left", 1), ("Right", -1)):
+            with subtests.test(joint=side + joint):
+                number = rig.joints.index(side + joint)
+                source = rig.sources[number]
+                end = SMPL22.parents.index(source) if source in SMPL22.parents else source
+                for axis, direction in enumerate(directions):
+                    toward = ADULT[end] if direction == "along" else TOWARD[direction]
+                    expected = np.array(toward, float) * [
+                        1 if direction == "along" else mirror,
+                        1,
+                        1,
+                    ]
+                    expected *= -1 if name == "soma" and mirror < 0 else 1
+                    cosine = rig.neutral[number][:, axis] @ expected / np.linalg.norm(expected)
+                    assert cosine > (0.995 if axis == 0 else 0.85)
+
+
+def test_unreals_arms_hang_by_45_degrees_more_than_smpls():
+    rig = preset("unreal", posed().posed())
+    for side, sign in (("l", 1), ("r", -1)):
+        shoulder, elbow, wrist = (
+            rig.positions[rig.joints.index(f"{name}_{side}")]
+            for name in ("upperarm", "lowerarm", "hand")
+        )
+        for bone, name in ((elbow - shoulder, "left_elbow"), (wrist - elbow, "left_wrist")):
+            x, y, _ = ADULT[JOINT[name]]
+            slope = np.degrees(np.arctan2(-bone[1], sign * bone[0]))
+            assert slope == pytest.approx(45 + np.degrees(np.arctan2(-y, x)), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "before", "after", "share"),
+    [
+        ("rigify", "spine.005", "spine.004", "spine.006", 0.5),
+        ("soma", "Neck2", "Neck1", "Head", 0.5),
+        ("cmu", "Neck", "Spine1", "Neck1", 0.0),
+        ("cmu", "LeftHipJoint", "Hips", "LeftUpLeg", 0.0),
+        ("100style", "Chest", "Hips", "Chest2", 0.5),
+    ],
+)
+def test_a_joint_without_a_counterpart_lies_between_its_neighbors(
+    name, joint, before, after, share
+):
+    rig = preset(name, posed().posed())
+    at = dict(zip(rig.joints, rig.positions, strict=True))
+    expected = (1 - share) * at[before] + share * at[after]
+    np.testing.assert_allclose(at[joint], expected, atol=1e-9)
+
+
+def test_units_of_files_of_known_skeletons():
+    units = {name: preset(name, posed().posed()).unit for name in presets()}
+    assert units.pop("cmu") == pytest.approx(0.0254 / 0.45)
+    assert set(units.values()) == {0.01}

@@ -11,7 +11,7 @@ from evaluators.metrics.attributes import UNDECIDED, read_all, right_attributes
 from evaluators.metrics.checks import CHECKED, View, check
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data import Clip
-from flame_mdm.data.synthetic import Synthetic, content, draw_captions, example
+from flame_mdm.data.synthetic import Synthetic, _joints, content, draw_captions, example
 from flame_mdm.data.synthetic_actions import ACTIONS, BASES, CORE, CYCLES, GESTURES, MORE
 from flame_mdm.data.synthetic_motions.body import Attributes
 from flame_mdm.data.synthetic_sequences import SyntheticSequences
@@ -83,6 +83,56 @@ def test_a_share_of_the_clips_shows_the_actions_that_are_drawn_often(source):
 def test_wrong_options_of_actions_drawn_often_are_refused(options, message):
     with pytest.raises(UserError, match=message):
         Synthetic(1, actions="all", **options)
+
+
+SUMS = """
+walk 694.9474; run 2182.9832; turn 294.2088; jump 330.4702; wave 315.4375;
+raise 364.6921; kick 298.6419; punch 297.8807; squat 284.5109; bow 294.3306;
+stand 307.9865; sit 63.7301; rise 465.4892; dance 309.1385; leap 676.3503; pick 251.8870;
+throw 375.6851; crawl 585.9189; lie -216.0183; clap 288.8193; salute 300.7209;
+nod 287.5747; idle 309.0147; look around 302.0157; stretch 339.7485;
+stretch sideways 296.2981; lean 299.7373; point 311.9223; beckon 323.0090;
+shrug 298.6464; celebrate 336.4035; pray 333.7008; cry 348.2612; laugh 304.7646;
+drink 315.1783; phone 332.9912; type 235.9698; wipe 335.0915; knock 289.8237;
+guitar 319.4168; cross arms 314.9105; hands on hips 270.5160; touch head 312.1845;
+touch face 313.3460; talk 298.9330; seated 240.3100; lift 247.7773; kneel 149.6109;
+jumping jacks 299.0084; push-ups 109.9745; hop 303.9326; sneak 686.6454;
+crouch walk 920.1135; limp 719.8525; stagger 735.4091; march 935.1229;
+march in place 311.5594; run in place 315.9729; carry 969.5341; push 700.2988;
+pull -38.2968; climb ladder 692.4225; climb stairs 972.7562; stumble 1163.2157;
+strafe -130.4843; skip 1301.5856; spin 307.0643; waltz 292.9597; dodge 136.7342;
+fighting stance 303.7076; duck 287.7922; hit 243.2389; block 252.2706; slash 339.4636;
+fall -226.4744; get up 398.7616
+"""
+"""Weighted sum of the joints of an example of each action. Models were trained on these motions."""
+
+
+def weighted(motion: np.ndarray) -> float:
+    values = np.asarray(motion, np.float64).ravel()
+    return float(values @ np.linspace(-1, 2, len(values)))
+
+
+def test_the_motion_of_each_action_does_not_change(subtests):
+    sums = dict(line.strip().rsplit(" ", 1) for line in SUMS.split(";"))
+    assert sums.keys() == ACTIONS.keys()
+    for number, (name, expected) in enumerate(sums.items()):
+        with subtests.test(action=name):
+            rng = np.random.default_rng((1, number))
+            attributes = ACTIONS[name].draw(rng, name)
+            motion = _joints(rng, np.arange(29) / 10, attributes)
+            assert weighted(motion) == pytest.approx(float(expected), abs=3e-4)
+
+
+def test_the_clips_of_all_actions_do_not_change():
+    source = Synthetic(1, seed=3, workers=1, actions="all")
+    few = [source.clip(number, 10) for number in range(12)]
+    said = json.dumps(
+        [[clip.id, clip.captions, clip.split, clip.action, clip.attributes] for clip in few]
+    )
+    assert hashlib.sha256(said.encode()).hexdigest()[:16] == "68eae1c562ecb599"
+    expected = [716.0245, 294.9818, 426.0702, 916.7584, 222.7227, 1464.9527]
+    expected += [-29.8436, 259.8482, 262.5928, 368.0685, 260.4666, 268.8342]
+    np.testing.assert_allclose([weighted(clip.motion) for clip in few], expected, atol=3e-4)
 
 
 def test_a_share_of_the_clips_shows_actions_of_the_core():

@@ -1,4 +1,5 @@
 import base64
+import io
 import sys
 import warnings
 from pathlib import Path
@@ -6,16 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image, ImageSequence
+from PIL import Image, ImageDraw, ImageSequence
+from scipy.spatial.transform import Rotation
 from support.browser import CHROMIUM, browser
 from support.motions import HOSTILE, Page, frames_array, posed, sway, unpacked
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import WRITTEN
 from flame_mdm.formats.motion import Motion
-from flame_mdm.representations.skeleton import KIT21, SKELETONS
-from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
-from flame_mdm.visualize.body import Figure
+from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22
+from flame_mdm.visualize import contact_sheet, render, write_gif, write_mp4, write_player
+from flame_mdm.visualize.body import Figure, radii
+from flame_mdm.visualize.player import packed_motion
 from flame_mdm.visualize.render import SIDE_COLORS
 
 try:
@@ -163,7 +166,10 @@ def test_player_runs_in_a_browser(tmp_path):
 
 
 def test_gif_keeps_frames_and_time_and_holds_a_motion_that_ended(tmp_path, subtests):
-    for fps, frames, shown in ((20, 30, 30), (30, 30, 30), (12.5, 10, 10), (120, 120, 40)):
+    for fps, frames, shown in (
+        *((20, 30, 30), (30, 30, 30), (12.5, 10, 10), (120, 120, 40)),
+        *((50, 4, 4), (60, 4, 2), (100, 4, 2)),
+    ):
         with subtests.test(fps=fps):
             write_gif(tmp_path / "m.gif", [sway(frames, fps, text="walks")], size=64)
             with Image.open(tmp_path / "m.gif") as image:
@@ -180,6 +186,136 @@ def test_gif_keeps_frames_and_time_and_holds_a_motion_that_ended(tmp_path, subte
     assert len(frames) == 16
     np.testing.assert_array_equal(frames[8][:, :64], frames[15][:, :64])
     assert (frames[8][:, 64:] != frames[15][:, 64:]).any()
+
+
+def test_motions_of_different_rates_show_the_frame_of_each_time(monkeypatch):
+    shown: list[tuple[str, int]] = []
+
+    def draw(motion: Figure, body: Any, frame: int, size: int) -> Image.Image:
+        shown.append((motion.id, frame))
+        return Image.new("RGB", (size, size))
+
+    monkeypatch.setattr(render, "_figure", draw)
+    motions = [sway(6, 30, id="fast"), sway(3, 20, id="slow"), sway(1, 10, id="still")]
+    assert len(list(render._video(motions, 30, 32, None))) == 6
+    frames = {name: [k for id, k in shown if id == name] for name in ("fast", "slow", "still")}
+    assert frames == {"fast": [0, 1, 2, 3, 4, 5], "slow": [0, 0, 1, 2, 2, 2], "still": [0] * 6}
+    assert len(list(render._video([sway(3, 20)], 30, 32, None))) == 5, "0.15 s are 4.5 images"
+
+
+@pytest.mark.parametrize(
+    ("count", "columns", "rows"),
+    [(1, 1, 1), (3, 3, 1), (4, 2, 2), (5, 3, 2), (9, 3, 3), (10, 4, 3), (17, 4, 5)],
+)
+def test_panels_stand_in_at_most_four_columns(monkeypatch, count, columns, rows):
+    monkeypatch.setattr(
+        render, "_figure", lambda motion, body, frame, size: Image.new("RGB", (size, size))
+    )
+    figure = Figure(sway(1).joints, 20, text="a")
+    (image,) = render._video([figure] * count, 20, 32, None)
+    assert image.width == 32 * columns
+    assert image.height // rows >= 32
+    assert (image.height - 3) % rows == 0
+
+
+def test_the_camera_follows_the_mean_root_of_a_second(monkeypatch):
+    centers, original = [], render._camera
+
+    def camera(center: np.ndarray, side: int) -> Any:
+        centers.append(center.tolist())
+        return original(center, side)
+
+    monkeypatch.setattr(render, "_camera", camera)
+    joints = sway(40).joints * 0
+    joints[..., 0] += np.arange(40)[:, None]
+    joints[..., 1] += 2.0
+    for frame in (0, 20, 38):
+        render._figure(Figure(joints, 20), None, frame, 16)
+    render._figure(Figure(joints * [1, 0.45, 1], 20), None, 20, 16)
+    np.testing.assert_allclose(
+        centers, [[5, 1.75, 0], [20, 1.75, 0], [33.5, 1.75, 0], [20, 0.85, 0]]
+    )
+
+
+def test_a_foot_is_marked_in_the_frames_of_its_contact():
+    joints = sway(3).joints
+
+    def green(foot: int, frame: int) -> np.ndarray:
+        contacts = np.zeros((3, 4), bool)
+        contacts[1, foot] = True
+        image = np.asarray(render._figure(Figure(joints, 20, contacts=contacts), None, frame, 128))
+        red, green, blue = image.astype(int).transpose(2, 0, 1)
+        return np.nonzero((green > red + 60) & (green > blue + 20))[1]
+
+    assert [len(green(1, frame)) > 0 for frame in range(3)] == [False, True, False]
+    assert green(1, 1).mean() > green(3, 1).mean(), "the left foot is on the right of the picture"
+
+
+def test_a_thumbnail_shows_the_pose_farthest_from_the_first(monkeypatch):
+    motion, shown, original = sway(5), [], render._figure
+    motion.joints[:] = motion.joints[0]
+    motion.joints[:, :, 0] += np.arange(5)[:, None]
+    motion.joints[2, 20] += 0.5
+    motion.joints[3, 20:22] += 0.3
+
+    def draw(motion: Figure, body: Any, frame: int, size: int) -> Image.Image:
+        shown.append(frame)
+        return original(motion, body, frame, size)
+
+    monkeypatch.setattr(render, "_figure", draw)
+    image = Image.open(io.BytesIO(render.thumbnail(motion, 60)))
+    assert shown == [3]
+    assert (image.format, image.size) == ("WEBP", (42, 60))
+
+
+def test_poses_of_a_contact_sheet_are_labeled_with_their_seconds(tmp_path, monkeypatch):
+    texts, original = [], ImageDraw.ImageDraw.text
+
+    def write(pen: Any, at: Any, text: str, *args: Any) -> None:
+        texts.append(text)
+        original(pen, at, text, *args)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", write)
+    contact_sheet(tmp_path / "sheet.png", [sway(30, 12.5, text="walks")], frames=3, size=96)
+    assert texts[:3] == ["0.00 s", "1.12 s", "2.32 s"]
+
+
+def test_radii_grow_with_the_number_of_joints_below():
+    at = dict(zip(SMPL22.joints, radii(SMPL22), strict=True))
+    names = ("head", "right_foot", "left_ankle", "left_hip", "spine3", "pelvis")
+    expected = [0.024 + 0.011 * below**0.5 for below in (0, 0, 1, 3, 10, 21)]
+    assert [at[name] for name in names] == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_player_that_starts_later_has_the_same_frames():
+    motion = posed(12, heading=np.linspace(0, 2, 12), left_elbow=(0, -80, 0))
+    motion.contacts = np.arange(48).reshape(12, 4) % 3 == 0
+    whole, late = (packed_motion(motion, begin) for begin in (0, 5))
+    assert (whole["frames"], late["frames"]) == (12, 7)
+    parts = ((whole["joints"], late["joints"]), (whole["contacts"], late["contacts"]))
+    for complete, part in (*parts, (whole["body"]["turns"], late["body"]["turns"])):
+        all_bytes, last_bytes = map(base64.b64decode, (complete, part))
+        assert all_bytes[len(all_bytes) * 5 // 12 :] == last_bytes
+    for name in ("center", "step", "fps", "feet"):
+        assert whole[name] == late[name], name
+
+
+def test_packed_rotations_are_exact_to_a_tenth_of_a_degree():
+    rng = np.random.default_rng(0)
+    motion = posed(30, heading=rng.uniform(-3, 3, 30), left_hip=rng.normal(0, 40, (30, 3)))
+    fitted, _ = motion.try_fit()
+    assert fitted is not None
+    values = np.frombuffer(base64.b64decode(packed_motion(motion)["body"]["turns"]), "<u4")
+    largest, parts = values >> 30, np.stack([values >> 20, values >> 10, values], 1) & 1023
+    parts = (parts / 1023 - 0.5) * 2**0.5
+    quaternions = np.empty((len(values), 4))
+    quaternions[np.arange(4) != largest[:, None]] = parts.ravel()
+    rest = np.sqrt(1 - (parts**2).sum(1))
+    quaternions[np.arange(len(values)), largest] = rest
+    turned = Rotation.from_matrix(fitted.turns.reshape(-1, 3, 3))
+    off = np.degrees((Rotation.from_quat(quaternions) * turned.inv()).magnitude())
+    assert off.max() < 0.2
+    assert set(largest.tolist()) == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize(
@@ -290,3 +426,34 @@ def test_bad_motions_are_refused_by_name(subtests):
     ):
         with subtests.test(change=change, message=message), pytest.raises(UserError, match=message):
             Motion(**{**good, **change})
+
+
+def test_the_camera_stands_in_front_of_the_body_to_its_left_and_above():
+    center = np.array([1.0, 0.9, 2.0])
+    project = render._camera(center, 200)
+    np.testing.assert_allclose(project(center[None]), [[100, 100, 82, 5]], atol=1e-9)
+    steps = 0.2 * np.eye(3)
+    left, up, ahead = project(center + steps)
+    assert left[0] > 100 + 10
+    assert up[1] < 100 - 10
+    assert abs(up[0] - 100) < 1e-9
+    assert ahead[0] < 100
+    assert min(left[3], up[3], ahead[3]) > 4.7
+    assert max(left[3], up[3], ahead[3]) < 5
+    behind = project(center + 9 * render.TOWARD[None])
+    assert behind[0, 3] == 0.3, "never closer than this"
+
+
+def test_surfaces_are_lit_from_the_upper_left_of_the_camera():
+    normals = np.array([-render.RIGHT, render.RIGHT, [0, 1, 0], [0, -1, 0], render.TOWARD])
+    left, right, above, below, ahead = render._shaded(normals, np.full((5, 3), 100.0))[:, 0]
+    assert above > ahead > left > right > below
+    assert (right, below) == pytest.approx((50, 38))
+    assert render._shaded(normals, np.full((5, 3), 255.0)).max() == 255
+
+
+def test_a_caption_has_at_most_three_lines():
+    lines = render._lines(sway(text="a person walks " * 9), posed().try_fit()[0], 192, 192)
+    assert len(lines) == 3
+    assert lines[2].endswith(" …")
+    assert render._lines(sway(text="walks"), None, 192, 192) == ["walks", "(no body fits)"]

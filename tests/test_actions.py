@@ -516,3 +516,4 @@ def test_actions_have_the_numbers_of_actors_code():
     )
     assert len(TRAIN_SUBJECTS) == 51
     assert sum(TRAIN_SUBJECTS) == 3081
+    assert (uestc.ROOT, uestc.MIN_FRAMES) == (8, 45)

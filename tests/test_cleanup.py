@@ -16,6 +16,7 @@ from flame_mdm.formats.cleanup import (
     _constant_bones,
     _contacts,
     _follow_feet,
+    _least_squares,
     _push_out,
     _smooth,
     bend,
@@ -336,3 +337,31 @@ def test_what_no_longer_fits_is_dropped(tmp_path):
     assert not after.features.size
     after.save(tmp_path / "a.npz")
     assert np.load(tmp_path / "a.npz")["cleanup"]
+
+
+def test_least_squares_are_those_of_the_dense_matrices():
+    rng = np.random.default_rng(0)
+    rows, values, terms = [], [], []
+    for order in (0, 1, 2, 3):
+        weight, target = rng.uniform(0.1, 2, 12 - order), rng.normal(size=(12 - order, 2))
+        terms.append((order, weight, target))
+        rows.append(np.sqrt(weight)[:, None] * np.diff(np.eye(12), n=order, axis=0))
+        values.append(np.sqrt(weight)[:, None] * target)
+    expected = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0]
+    np.testing.assert_allclose(_least_squares(12, *terms), expected, atol=1e-9)
+
+
+def test_a_bent_leg_moves_its_foot_by_the_shift_and_keeps_its_bones():
+    joints = posed(5, left_hip=(-30, 0, 0), left_knee=(60, 0, 0)).joints.astype(float)
+    moved, leg = joints.copy(), [1, 4, 7, 10]
+    shift = np.linspace(0, 1, 5)[:, None] * [0.05, 0.1, -0.04]
+    bend(moved, leg, shift)
+    np.testing.assert_allclose(moved[:, [7, 10]], joints[:, [7, 10]] + shift[:, None], atol=1e-9)
+    for parent, joint in ((1, 4), (4, 7), (7, 10)):
+        before, after = (
+            np.linalg.norm(of[:, joint] - of[:, parent], axis=1) for of in (joints, moved)
+        )
+        np.testing.assert_allclose(after, before, atol=1e-9)
+    others = [joint for joint in range(22) if joint not in leg[1:]]
+    np.testing.assert_array_equal(moved[:, others], joints[:, others])
+    assert (moved[:, 4, 2] > joints[:, 7, 2]).all(), "the knee stays in front"

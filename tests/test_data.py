@@ -14,10 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from support.fixtures import ROOT
 from support.stores import OwnClips, clip
 
 from flame_mdm.batch import MotionBatch, collate
 from flame_mdm.data import (
+    Split,
     datamodule,
     hashed_split,
     mirrored,
@@ -536,7 +540,11 @@ def test_words_for_sides_are_swapped(text, mirrored):
 
 def test_overlapping_cuts_and_other_splits_do_not_change_the_statistics(tmp_path):
     features = np.random.default_rng(0).normal(size=(60, 263)).astype(np.float32)
-    windows = {"a": ("train", 0, 30), "b": ("train", 20, 15), "c": ("val", 30, 30)}
+    windows: dict[str, tuple[Split, int, int]] = {
+        "a": ("train", 0, 30),
+        "b": ("train", 20, 15),
+        "c": ("val", 30, 30),
+    }
     cuts = [
         clip(name, split, motion=features, encoded=ENCODED, window=(first, length))
         for name, (split, first, length) in windows.items()
@@ -566,3 +574,64 @@ def test_a_mirrored_clip_has_the_other_side_in_all_its_words():
     assert image.attributes == facts | {"side": "right"}
     assert len(image.motion) == 3
     assert mirrored(replace(original, action=2), original.motion, actions).action == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "crop"),
+    [
+        ("humanml3d", Units(40, 196, 4)),
+        ("kit", Units(24, 196, 4)),
+        ("bandai", Units(24, 196, 4)),
+        ("humanml3d_smpl", Whole(1, 471)),
+        ("kit_temos", Whole(1, 1400)),
+        ("babel", Whole(1, 128)),
+        ("humanact12", Fixed(60)),
+        ("uestc", Fixed(60)),
+    ],
+)
+def test_recipes_of_published_sets_have_their_crops_and_sound_splits(name: str, crop: Crop):
+    recipe: Any = OmegaConf.load(ROOT / "experiments" / "data" / f"{name}.yaml")
+    assert instantiate(recipe.crop) == crop
+    assert not recipe.source.get("published_split", False)
+
+
+@pytest.mark.parametrize("resident", [True, False])
+def test_processes_share_the_validation_unless_there_are_more_processes_than_clips(root, resident):
+    data = module(root, CROPS[0], resident=resident)
+    data.setup("fit")
+    count = len(data.val)
+
+    def validated(rank: int, world: int) -> list[str]:
+        batches = loader(data, "val", rank=rank, world=world)
+        return [id for batch in batches for id in batch.ids]
+
+    everything = sorted(clip.id for clip in data.val.clips)
+    assert sorted(id for rank in range(count) for id in validated(rank, count)) == everything
+    assert all(len(validated(rank, count)) == 1 for rank in range(count))
+    assert all(sorted(validated(rank, count + 1)) == everything for rank in range(count + 1))
+
+
+def test_clips_that_are_too_short_are_counted_by_split(root):
+    data = module(root, Units(24, 60, 4))
+    lengths = {"train": (24, 23, 60), "val": (20, 21), "test": ()}
+    clips = [
+        SimpleNamespace(split=split, length=length, captions=[])
+        for split, numbers in lengths.items()
+        for length in numbers
+    ]
+    info = {
+        "clips": {split: len(numbers) for split, numbers in lengths.items()},
+        "actions": [],
+        "published_split": False,
+    }
+    store: Any = SimpleNamespace(clips=clips, info=info)
+    first, *advice = data.counts(store)
+    assert first == (
+        "clips: 2 of 3 (1 shorter than 24 frames) train, "
+        "0 of 2 (2 shorter than 24 frames) val, 0 test"
+    )
+    assert advice[0] == "all val clips are too short. Lower data.crop.min_frames"
+    assert advice[1] == "no test clips."
+    assert advice[2].startswith("no captions. ")
+    info["published_split"] = True
+    assert data.counts(store) == [first]

@@ -327,8 +327,8 @@ def test_what_does_not_fit_a_file_is_refused(tmp_path, circle, subtests):
 
 
 def test_the_twist_of_the_spine_is_shared_evenly():
-    made = posed(4, spine1=(0, 25, 0), spine2=(0, 20, 0), spine3=(0, 15, 0))
-    solved = solve(torch.from_numpy(made.joints), FPS)
+    twisted = posed(4, spine1=(0, 25, 0), spine2=(0, 20, 0), spine3=(0, 15, 0))
+    solved = solve(torch.from_numpy(twisted.joints), FPS)
     for joint in (3, 6, 9):
         vectors = rotation.matrix_to_axis_angle(solved.rotations[:, joint])
         turned = torch.rad2deg(vectors[:, 1])

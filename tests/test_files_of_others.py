@@ -562,8 +562,8 @@ def test_each_axis_that_points_up_is_turned_to_y(tmp_path: Path, up: str):
 def test_a_body_without_translation_has_its_pelvis_where_smpls_template_has_it(
     tmp_path: Path, up: str, pelvis: tuple
 ):
-    parts = amass(walk(4), up)
-    np.savez(tmp_path / "a.npz", **(parts | {"trans": np.zeros((4, 3))}))
+    parts: dict[str, Any] = amass(walk(4), up) | {"trans": np.zeros((4, 3))}
+    np.savez(tmp_path / "a.npz", **parts)
     np.testing.assert_allclose(
         read(tmp_path / "a.npz", up=up).joints[:, 0], np.tile(pelvis, (4, 1)), atol=1e-6
     )
@@ -638,6 +638,7 @@ def test_a_body_that_lies_would_stand_with_the_axis_that_is_named(
 def test_a_body_two_centimeters_below_the_floor_is_reported():
     joints = np.ones((9, 22, 3))
     joints[:, 10, 1] = -0.019
+    joints[:4, 10, 1] = -0.5  # a stumble
     assert checks.below_floor(joints) == ""
-    joints[:5, 10, 1] = -0.026
+    joints[:5, 10, 1] = [-0.5] * 4 + [-0.026]
     assert checks.below_floor(joints).startswith("the feet are 3 cm below the floor")

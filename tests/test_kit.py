@@ -12,6 +12,7 @@ from support.stores import kit_walk, line, published, write_folder, write_mmm
 
 from evaluators.metrics.reconstruction import PARTS, temos_parts
 from flame_mdm.__main__ import main
+from flame_mdm.data import Split
 from flame_mdm.data.kit import KIT, KITTemos, read_joints
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.representations.humanml import HumanML
@@ -198,5 +199,6 @@ def test_a_damaged_folder_is_named(mmm, tmp_path, damage, message):
 def test_limits_of_the_length_are_included_and_do_not_apply_to_the_test_split(mmm):
     kit = source(mmm)
     kit.frames = {"a": 9, "b": 10, "c": 500, "d": 501, "e": 9, "f": 501}
-    kit.names = dict.fromkeys("abcd", "train") | dict.fromkeys("ef", "test")
+    names: dict[str, Split] = {name: "train" if name < "e" else "test" for name in kit.frames}
+    kit.names = names
     assert [name for name in kit.frames if kit._fits(name)] == ["b", "c", "e", "f"]

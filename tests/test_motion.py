@@ -238,3 +238,13 @@ def test_rates_from_one_frame_in_ten_seconds_to_a_thousand_per_second_are_read()
     for rate in (0.0999, 1000.1, True, [20, 20], "20"):
         with pytest.raises(UserError, match=r"from 0\.1 to 1000"):
             frame_rate(rate)
+
+
+def test_angles_of_a_bvh_file_have_orders_far_from_gimbal_lock(tmp_path: Path):
+    synthetic("walk").save(tmp_path / "a.bvh")
+    tree = bvh.read(tmp_path / "a.bvh")
+    for joint, channels in zip(tree.joints, tree.channels, strict=True):
+        order = "".join(name[0] for name in channels if name.endswith("rotation"))
+        if channels:
+            assert order == ("YXZ" if joint.endswith("shoulder") else "YZX"), joint
+    assert tree.channels[0][:3] == ("Xposition", "Yposition", "Zposition")

@@ -1,5 +1,7 @@
 """What surrounds the code: version, changelog, citation, workflows, and old names that still work."""
 
+import hashlib
+import json
 import re
 import tomllib
 
@@ -8,7 +10,9 @@ import yaml
 from support.fixtures import ROOT
 
 import flame_mdm
+from flame_mdm.data.mixture import known_licenses
 from flame_mdm.errors import renamed_names
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training import distillation
 
@@ -90,3 +94,31 @@ def test_the_modules_still_have_their_old_names():
         assert task.MotionGeneration is GeneratorTask
     with pytest.warns(DeprecationWarning, match="DistillationTask"):
         assert distillation.ConsistencyDistillation is distillation.DistillationTask
+
+
+@pytest.mark.parametrize(
+    ("name", "digest"),
+    [
+        ("data/amass", "eb69a76e9733471d"),
+        ("data/bandai", "be2db24dfbe55768"),
+        ("data/cmu", "c912be610f6b8c6f"),
+        ("data/published", "0e1b47ee3d6e05a1"),
+        ("data/synthetic", "a891a9df1200c9ea"),
+        ("data/synthetic_more", "116f19aa4b8a05db"),
+        ("formats/layouts", "c9cc2a1eeed72df0"),
+        ("formats/rigs", "967abdb9cff59ec3"),
+    ],
+)
+def test_names_and_numbers_of_others_and_captions_do_not_change(name: str, digest: str):
+    """Prepared stores and models depend on them. After an intended change, update the digest."""
+    content = read_package_yaml(ROOT / "flame_mdm" / f"{name}.yaml")
+    text = json.dumps(content, sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == digest
+
+
+def test_licenses_and_the_uses_that_they_permit():
+    uses = {name: license["use"] for name, license in known_licenses().items()}
+    assert uses == {
+        **dict.fromkeys(("MIT", "CC0", "CC-BY-4.0", "CMU"), "any"),
+        "CC-BY-NC-4.0": "research",
+    }

@@ -16,7 +16,8 @@ from support.refusals import bounded
 
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
-from flame_mdm.formats import fbx_scene, glb, glb_animation
+from flame_mdm.formats import fbx_scene, glb, glb_animation, scenes
+from flame_mdm.formats.animated import AnimatedNodes
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
@@ -292,3 +293,46 @@ def test_a_file_keeps_its_unit_if_the_folder_maps_its_joints(ending: str, tmp_pa
     assert np.abs(again.joints - motion.joints).max() < 0.04
     with pytest.raises(UserError, match=r"people's are 0\.6 to 1\.2 m"):
         read(tmp_path / f"a{ending}", unit=0.02 if ending == ".fbx" else 2.0)
+
+
+def test_successive_rotations_in_glb_files_have_no_sign_flips(tmp_path: Path):
+    turning = posed(60, heading=np.linspace(0, 4 * np.pi, 60))
+    turning.save(tmp_path / "a.glb")
+    for (_, name), values in Glb(tmp_path / "a.glb").curves().items():
+        if name == "rotation":
+            assert ((values[1:] * values[:-1]).sum(1) > 0).all()
+            np.testing.assert_allclose(np.linalg.norm(values, axis=1), 1, atol=1e-6)
+
+
+def test_bones_of_a_vrm_humanoid_are_smpls_joints():
+    expected = {"hips": "pelvis", "spine": "spine1", "chest": "spine2", "upperChest": "spine3"}
+    expected |= {"neck": "neck", "head": "head"}
+    for side in ("left", "right"):
+        expected |= {f"{side}Shoulder": f"{side}_collar", f"{side}UpperArm": f"{side}_shoulder"}
+        expected |= {f"{side}LowerArm": f"{side}_elbow", f"{side}Hand": f"{side}_wrist"}
+        expected |= {f"{side}UpperLeg": f"{side}_hip", f"{side}LowerLeg": f"{side}_knee"}
+        expected |= {f"{side}Foot": f"{side}_ankle", f"{side}Toes": f"{side}_foot"}
+    assert expected == glb_animation.HUMANOID
+
+
+def test_nodes_at_the_tips_of_bones_are_end_sites():
+    nodes = AnimatedNodes(
+        (
+            "Hips",
+            "Foot",
+            "Foot_End",
+            "Head",
+            "HeadTip",
+            "Hand End",
+            "Toe.nub",
+            "End",
+            "a",
+        ),
+        (-1, 0, 1, 0, 3, 0, 1, 0, 7),
+        np.zeros((1, 9, 3)),
+        20.0,
+        "walk",
+        {},
+    )
+    names = ("Hips", "Foot", "Foot.end", "Head", "Head.end", "Hips.end", "Foot.end")
+    assert scenes.joint_names(nodes) == (*names, "End", "a")

@@ -113,14 +113,17 @@ def weighted(motion: np.ndarray) -> float:
 
 
 def test_the_motion_of_each_action_does_not_change(subtests):
-    sums = dict(line.strip().rsplit(" ", 1) for line in SUMS.split(";"))
+    sums: dict[str, float] = {}
+    for line in SUMS.split(";"):
+        name, _, number = line.strip().rpartition(" ")
+        sums[name] = float(number)
     assert sums.keys() == ACTIONS.keys()
     for number, (name, expected) in enumerate(sums.items()):
         with subtests.test(action=name):
             rng = np.random.default_rng((1, number))
             attributes = ACTIONS[name].draw(rng, name)
             motion = _joints(rng, np.arange(29) / 10, attributes)
-            assert weighted(motion) == pytest.approx(float(expected), abs=3e-4)
+            assert weighted(motion) == pytest.approx(expected, abs=3e-4)
 
 
 def test_the_clips_of_all_actions_do_not_change():

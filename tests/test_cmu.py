@@ -427,3 +427,14 @@ def test_the_pose_in_front_of_a_daz_file_and_the_frames_blended_with_it_are_remo
     assert (standard.frames[:, 6:] == [[4]] * 4 + [[k] for k in range(5, 10)]).all()
     moving = replace(tree, frames=numbers + 1)
     assert len(cmu.standardize(moving)[0].frames) == 10
+
+
+def test_original_files_come_first_and_daz_conversions_last():
+    names = ("daz/02_01.bvh", "02_01.bvh", "02_01.AMC", "Daz-friendly/a/02_01.bvh")
+    assert [cmu._rank(Path(name)) for name in names] == [2, 1, 0, 2]
+
+
+def test_bad_recordings_are_whole_subjects_or_single_ones():
+    names = ("18_01", "19_15", "106_03", "143_21", "143_20", "118_01", "02_18")
+    bad = [cmu._is_in("bad", name) for name in names]
+    assert bad == [True, True, True, True, False, False, False]

@@ -26,6 +26,7 @@ from flame_mdm.data import (
     hashed_split,
     mirrored,
     resident,
+    some,
     split_blocks,
     swap_sides,
 )
@@ -602,8 +603,8 @@ def test_processes_share_the_validation_unless_there_are_more_processes_than_cli
     count = len(data.val)
 
     def validated(rank: int, world: int) -> list[str]:
-        batches = loader(data, "val", rank=rank, world=world)
-        return [id for batch in batches for id in batch.ids]
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=world)  # type: ignore[assignment]
+        return [id for batch in data.val_dataloader() for id in batch.ids]
 
     everything = sorted(clip.id for clip in data.val.clips)
     assert sorted(id for rank in range(count) for id in validated(rank, count)) == everything
@@ -635,3 +636,9 @@ def test_clips_that_are_too_short_are_counted_by_split(root):
     assert advice[2].startswith("no captions. ")
     info["published_split"] = True
     assert data.counts(store) == [first]
+
+
+def test_at_most_five_names_are_listed():
+    assert some("edcba") == "a, b, c, d, e"
+    assert some("gfedcba") == "a, b, c, d, e and 2 more"
+    assert some([]) == ""

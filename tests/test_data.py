@@ -600,7 +600,9 @@ def test_recipes_of_published_sets_have_their_crops_and_sound_splits(name: str, 
 def test_processes_share_the_validation_unless_there_are_more_processes_than_clips(root, resident):
     data = module(root, CROPS[0], resident=resident)
     data.setup("fit")
-    count = len(data.val)
+    data.val = data.train
+    data.val.clips = data.val.clips[:4]
+    data.val.lengths, count = data.val.lengths[:4], 4
 
     def validated(rank: int, world: int) -> list[str]:
         data.trainer = SimpleNamespace(global_rank=rank, world_size=world)  # type: ignore[assignment]

@@ -90,6 +90,16 @@ def test_copies_are_counted():
     assert metric.compute() == {"joints": pytest.approx(0.3), "features": None, "copies": 0.4}
 
 
+def test_a_copy_is_closer_than_99_percent_of_real_motions_and_features_have_their_own_median():
+    metric = NearestTraining()
+    real = torch.linspace(0, 1, 101, dtype=torch.float64)[:, None]  # 0.01 at the 1st percentile
+    joints = torch.tensor([0.009] + [0.01] * 2 + [0.011] * 98, dtype=torch.float64)
+    nearest = torch.stack([joints, torch.linspace(3, 5, 101, dtype=torch.float64)], 1)
+    metric.update(keys=torch.arange(101), nearest=nearest, real_nearest=real)
+    expected = {"joints": 0.011, "features": 4.0, "copies": 1 / 101}
+    assert metric.compute() == pytest.approx(expected)
+
+
 def raised(side: str, turn: float) -> np.ndarray:
     """Returns a body that raises a hand, turns by `turn` degrees to the left and walks to its left if turn > 0."""
     body = np.zeros((40, 22, 3))

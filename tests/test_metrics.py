@@ -685,3 +685,146 @@ def test_spread_of_the_kernel_distance_is_that_of_its_subsets():
     first, second = (polynomial_mmd2(*pair).item() for pair in pairs)
     assert values["mean"] == pytest.approx((first + second) / 2)
     assert values["std"] == pytest.approx(abs(first - second) / 2)
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+@pytest.mark.parametrize(
+    ("speed", "height", "slides"),
+    [(0.51, 0.0, True), (0.49, 0.0, False), (0.51, 0.049, True), (0.51, 0.051, False)],
+)
+def test_a_foot_slides_from_half_a_meter_per_second_below_five_centimeters(
+    fps: float, speed: float, height: float, slides: bool
+):
+    motion = torch.full((4, 22, 3), 0.5, dtype=torch.float64)
+    motion[:, 10, 0], motion[:, 10, 1] = torch.arange(4) * speed / fps, height
+    assert physics.FootSkating(fps).measure(motion).tolist() == [slides] * 3
+
+
+def test_a_foot_that_tips_up_and_down_does_not_slide_and_each_foot_has_its_own_contact():
+    motion = torch.full((3, 22, 3), 0.5, dtype=torch.float64)
+    motion[:, 10, 1] = torch.tensor([0.0, 0.045, 0.0])  # 0.9 m/s upward
+    motion[:, 11, 0] = torch.arange(3.0)  # fast, and in the air
+    assert physics.FootSkating(20.0).measure(motion).tolist() == [False, False]
+
+
+@pytest.mark.parametrize("metric", [physics.Penetration, physics.Floating])
+def test_distances_from_the_floor_count_above_half_a_centimeter(metric: Any):
+    heights = metric.side * torch.tensor([0.0049, 0.0051, 0.02], dtype=torch.float64)
+    motion = (heights + metric.side * 0.3)[:, None, None].repeat(1, 22, 3)
+    motion[:, 3, 1] = heights  # the lowest joint
+    if metric.side < 0:
+        motion[:, :, 1] = heights[:, None]
+    assert metric().measure(motion).tolist() == pytest.approx([0, 0.0051, 0.02])
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+def test_a_motion_is_static_below_three_centimeters_per_second_on_average(fps: float):
+    for speed, static in ((0.029, True), (0.031, False)):
+        motion = torch.zeros(5, 2, 3, dtype=torch.float64)
+        motion[:, 0, 0] = 2 * speed * torch.arange(5) / fps  # the other joint stands
+        assert physics.StaticShare(fps).measure(motion).tolist() == [static]
+    assert physics.StaticShare(fps).measure(motion[:1]).tolist() == []
+
+
+def features_of(count: int, seed: int = 0) -> dict[str, Tensor]:
+    """Random features of motions and texts, of unequal lengths, with one caption per motion."""
+    generator = torch.Generator().manual_seed(seed)
+    text, noise = torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    lengths = torch.linspace(1, 5, count, dtype=torch.float64)[:, None]
+    ids = torch.arange(count)
+    return {"generated": lengths * (text + noise), "text": text, "text_keys": ids, "keys": ids}
+
+
+SEEDED: dict[str, Any] = {
+    "texts": lambda seed: TextsForMotion(pool=4, seed=seed),
+    "motions": lambda seed: MotionsForText(pool=4, seed=seed),
+    "diversity": lambda seed: diversity.Diversity(pairs=5, replace=False, seed=seed),
+    "diversity with repetition": lambda seed: diversity.Diversity(5, replace=True, seed=seed),
+    "text multimodality": lambda seed: diversity.TextMultimodality(20, 5, seed),
+    "action multimodality": lambda seed: diversity.ActionMultimodality(5, seed),
+    "kernel distance": lambda seed: KernelMotionDistance(3, 5, seed=seed),
+}
+
+
+@pytest.mark.parametrize("name", SEEDED)
+def test_random_draws_are_those_of_the_seed(name: str):
+    inputs: dict[str, Any] = features_of(40)
+    inputs |= {"groups": torch.arange(40) // 20, "labels": torch.arange(40) // 20}
+    inputs |= {"real": features_of(40, 1)["generated"], "real_keys": inputs["keys"]}
+
+    def values(seed: int) -> Any:
+        metric = SEEDED[name](seed)
+        update_metrics({name: metric}, **inputs)
+        return metric.compute()
+
+    assert values(3) == values(3)
+    assert len({str(values(seed)) for seed in range(8)}) > 4
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_values_of_individual_pairs_average_to_the_value_of_the_set(normalize: bool):
+    rows = features_of(12)
+    weights = np.ones((1, 12), int)
+    metrics: list[Any] = [
+        MultimodalDistance(normalize),
+        MotionsForText(pool=12, normalize=normalize),
+        TextsForMotion(pool=12),
+        alignment.MotionCLIPScore(),
+    ]
+    for metric in metrics:
+        update_metrics({"": metric}, **rows)
+        value = metric.compute()
+        resampled = metric.weighted(rows, weights)
+        expected = value if isinstance(value, dict) else {"": value}
+        assert {name: x.item() for name, x in resampled.items()} == pytest.approx(expected)
+
+
+def test_half_of_the_candidates_at_an_equal_distance_count_as_closer():
+    # 2 of the 4 others count as closer; a pool has 2 others, none of them closer in 1 of 6 pools
+    values = TextsForMotion(pool=3).in_random_pools(torch.ones(1, 5), torch.tensor([2]))
+    assert [x[0, 0].item() for x in values.values()] == pytest.approx([1 / 6, 5 / 6, 1])
+    with pytest.raises(UserError, match="a pool needs 6 candidates, but there are only 5"):
+        TextsForMotion(pool=6).in_random_pools(torch.ones(1, 5), torch.tensor([2]))
+    TextsForMotion(pool=5).in_random_pools(torch.ones(1, 5), torch.tensor([2]))
+
+
+def test_resamples_repeat_motions_as_often_as_they_are_drawn():
+    weights = np.random.default_rng(0).multinomial(12, np.full(12, 1 / 12), 3)
+    rows = {"generated": features_of(12)["generated"], "real": features_of(12, 1)["generated"]}
+    fid = FrechetMotionDistance().weighted(rows, weights)[""]
+    spread = diversity.Diversity(pairs=5, replace=True).weighted(rows, weights)[""]
+    for row, times in enumerate(weights):
+        generated, real = (x[np.repeat(np.arange(12), times)] for x in rows.values())
+        assert fid[row] == pytest.approx(frechet_distance(generated, real).item())
+        pairs = (generated[:, None] - generated).norm(dim=-1)
+        assert spread[row] == pytest.approx(pairs.mean().item())
+
+
+@pytest.mark.parametrize(("count", "enough"), [(6, False), (7, True)])
+def test_mid_needs_more_motions_than_features(count: int, enough: bool):
+    rows: dict[str, Any] = features_of(count)
+    real = features_of(count, 1)["generated"]
+    metric = alignment.MutualInformationDivergence()
+    paired = {"paired": real, "paired_text": rows["text"]}
+    if enough:
+        (terms,) = metric.per_sample(rows | paired).values()
+        value = metric.value(rows["generated"], rows["text"], real)
+        assert terms[:, 0].mean().item() == pytest.approx(value)
+        return
+    with pytest.raises(UserError, match=r"got 6 samples .*, but needs at least 7"):
+        metric.value(rows["generated"], rows["text"], real)
+    with pytest.raises(UserError, match="6 motions are too few"):
+        metric.per_sample(rows | paired)
+
+
+def test_precision_and_recall_compare_sets_of_the_same_size():
+    generator = torch.Generator().manual_seed(0)
+    real, generated = (
+        torch.randn(n, 2, generator=generator, dtype=torch.float64) for n in (60, 20)
+    )
+    values, cut = (PrecisionRecall().value(generated, x) for x in (real, real[:20]))
+    assert values == cut
+    assert PrecisionRecall().value(real, generated) == PrecisionRecall().value(real[:20], generated)
+    with pytest.raises(UserError, match="got 3 motions in the smaller set, but needs at least 4"):
+        PrecisionRecall().value(generated[:3], real)
+    PrecisionRecall().value(generated[:4], real)

@@ -2,13 +2,22 @@
 
 import hashlib
 import json
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from evaluators.metrics.attributes import UNDECIDED, read_all, right_attributes
-from evaluators.metrics.checks import CHECKED, View, check
+from evaluators.metrics.attributes import (
+    UNDECIDED,
+    _kick,
+    _locomotion,
+    read_all,
+    read_attributes,
+    right_attributes,
+)
+from evaluators.metrics.checks import CHECKED, View, check, count_rises
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data import Clip
 from flame_mdm.data.synthetic import Synthetic, _joints, content, draw_captions, example
@@ -334,3 +343,215 @@ def test_only_what_rules_decide_is_scored():
     assert {"pray", "idle", "sneak"} <= UNDECIDED
     assert right_attributes(seen, {"action": "pray"}) == {}
     assert right_attributes(seen, {"action": "walk", "while": "wave", "side": "left"}) == {}
+
+
+def standing_view(frames: int = 20, turned: float = 0.0, **changes: Any) -> View:
+    """A body that stands with hanging arms and faces +z, with the paths (F, 3) or (3,) of some joints changed."""
+    body = np.zeros((frames, 22, 3))
+    heights = {"pelvis": 0.95, "neck": 1.45, "head": 1.6, "ankle": 0.08, "foot": 0.0}
+    heights |= {"shoulder": 1.4, "elbow": 1.1, "wrist": 0.85}
+    for joint, name in enumerate(SMPL22.joints):
+        side, _, part = name.rpartition("_")
+        body[:, joint, 0] = {"left": 0.2, "right": -0.2}.get(side, 0.0)
+        body[:, joint, 1] = heights.get(part, 1.0)
+    for name, path in changes.items():
+        body[:, SMPL22.joints.index(name)] = path
+    forward, left = np.tile([0.0, 1.0], (frames, 1)), np.tile([1.0, 0.0], (frames, 1))
+    return View(body, 20.0, forward, left, turned, 0.0)
+
+
+def during(frames: int, there: Sequence[float], otherwise: Sequence[float]) -> np.ndarray:
+    """A path (20, 3) that is at one point in the first frames and at another point afterwards."""
+    return np.where(np.arange(20)[:, None] < frames, there, otherwise)
+
+
+HANG, AHEAD = (0.2, 0.85, 0.0), (0.2, 1.2, 0.16)
+LEFT, RIGHT = {"side": "left"}, {"side": "right"}
+TO_LEFT, TO_RIGHT = {"direction": "left"}, {"direction": "right"}
+
+
+def shifted(x: float, z: float, quick: float = 1.0) -> dict[str, Any]:
+    """A pelvis that moves by (x, z) and then rests, within one frame or slower."""
+    share = np.clip(np.arange(20) * quick, 0, 1)[:, None]
+    return {"pelvis": [0.0, 0.95, 0.0] + share * [x, 0.0, z]}
+
+
+def level_arm(frames: int) -> dict[str, Any]:
+    """An arm that is level in the first frames and hangs afterwards."""
+    elbow = during(frames, (0.2, 1.4, 0.3), (0.2, 1.1, 0.0))
+    return {"left_elbow": elbow, "left_wrist": during(frames, (0.2, 1.4, 0.6), (0.2, 0.8, 0.0))}
+
+
+LIMITS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
+    ("touch head", {"left_wrist": during(8, (0.0, 1.6, 0.269), HANG)}, LEFT),
+    ("touch head", {"left_wrist": during(8, (0.0, 1.6, 0.271), HANG)}, {}),
+    ("touch head", {"left_wrist": during(7, (0.0, 1.6, 0.269), HANG)}, {}),
+    ("beckon", {"left_wrist": during(9, AHEAD, HANG)}, LEFT),
+    ("beckon", {"left_wrist": during(8, AHEAD, HANG)}, {}),
+    ("beckon", {"left_wrist": during(9, (0.2, 1.2, 0.14), HANG)}, {}),
+    ("beckon", {"right_wrist": (-0.2, 1.11, 0.2)}, RIGHT),
+    ("beckon", {"right_wrist": (-0.2, 1.09, 0.2)}, {}),
+    ("point", level_arm(9), LEFT),
+    ("point", level_arm(8), {}),
+    ("point", {"left_elbow": (0.2, 1.4, 0.3), "left_wrist": (0.2, 1.552, 0.559)}, LEFT),
+    ("point", {"left_elbow": (0.45, 1.566, 0.0), "left_wrist": (0.7, 1.735, 0.0)}, LEFT),
+    ("point", {"left_elbow": (0.44, 1.58, 0.0), "left_wrist": (0.68, 1.76, 0.0)}, {}),
+    ("point", {"left_elbow": (0.2, 1.2, 0.223), "left_wrist": (0.2, 1.4, 0.446)}, {}),
+    ("spin", {"turned": 271.0}, TO_LEFT),
+    ("spin", {"turned": -271.0}, TO_RIGHT),
+    ("spin", {"turned": 269.0}, {}),
+    ("lean", {"head": (0.131, 1.6, 0.0)}, TO_LEFT),
+    ("lean", {"head": (-0.131, 1.6, 0.0)}, TO_RIGHT),
+    ("lean", {"head": (0.129, 1.6, 0.5)}, {}),
+    ("stretch sideways", {"head": (0.14, 1.6, 0.0)}, {}),
+    ("strafe", shifted(0.34, 0.16), TO_LEFT),
+    ("strafe", shifted(-0.34, 0.16), TO_RIGHT),
+    ("strafe", shifted(0.32, 0.0), {}),
+    ("strafe", shifted(0.34, 0.18), {}),
+    ("dodge", shifted(0.26, 0.1), TO_LEFT),
+    ("dodge", shifted(0.0, -0.26), {"direction": "backward"}),
+    ("dodge", shifted(0.0, 0.26), {}),
+    ("dodge", shifted(0.24, 0.0), {}),
+    ("dodge", shifted(0.31, 0.0, 0.1), TO_LEFT),
+    ("dodge", shifted(0.29, 0.0, 0.1), {}),
+    ("hop", {"right_foot": during(8, (0, 0.13, 0), (0, 0, 0))}, {**LEFT, "count": 0}),
+    ("hop", {"right_foot": during(7, (0, 0.13, 0), (0, 0, 0))}, {}),
+    ("hop", {"right_foot": (0, 0.119, 0)}, {}),
+    ("hop", {"right_foot": (0, 0.3, 0), "left_foot": during(9, (0, 0, 0), (0, 0.051, 0))}, {**LEFT, "count": 1}),
+    ("hop", {"right_foot": (0, 0.3, 0), "left_foot": during(9, (0, 0, 0), (0, 0.049, 0))}, {**LEFT, "count": 0}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "changes", "shown"), LIMITS)
+def test_checks_have_the_limits_that_their_docstrings_state(
+    name: str, changes: dict[str, Any], shown: dict[str, Any]
+):
+    expected = {"action": name, **shown} if shown else {}
+    assert check(name, standing_view(**changes)) == expected
+
+
+@pytest.mark.parametrize(("apart", "high", "count"), [(0.46, 0.11, 1), (0.44, 0.11, 0), (0.46, 0.09, 0)])  # fmt: skip
+def test_jumping_jacks_spread_the_feet_while_the_hands_rise(apart: float, high: float, count: int):
+    feet = {"left_ankle": during(10, (0.05, 0.08, 0), (apart - 0.05, 0.08, 0))}
+    feet |= {"right_ankle": (-0.05, 0.08, 0.0)}
+    hands = {f"{side}_wrist": (0.2, 1.4 + high, 0.0) for side in ("left", "right")}
+    shown = check("jumping jacks", standing_view(**feet, **hands))
+    assert shown.get("count", 0) == count
+
+
+@pytest.mark.parametrize(("sinks", "height", "count"), [(0.131, 0.83, 1), (0.129, 0.83, 0), (0.2, 0.85, 0)])  # fmt: skip
+def test_push_ups_sink_by_13_centimeters_with_a_level_trunk(
+    sinks: float, height: float, count: int
+):
+    neck = during(12, (0.0, 0.95 + height, 1.0), (0.0, 0.95 + height - sinks, 1.0))
+    assert check("push-ups", standing_view(neck=neck)).get("count", 0) == count
+
+
+@pytest.mark.parametrize(("above", "inward", "frames", "slashes"), [
+    (0.21, 0.16, 9, True), (0.19, 0.16, 9, False), (0.21, 0.14, 9, False), (0.21, 0.16, 10, False)
+])  # fmt: skip
+@pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
+def test_a_slash_goes_down_and_inward_within_half_a_second(
+    above: float, inward: float, frames: int, slashes: bool, side: str, sign: int
+):
+    wrist = np.tile([sign * 0.2, 1.5, 0.0], (20, 1))
+    wrist[2, 1] = 1.4 + above
+    wrist[2 + frames :] = sign * (0.2 - inward), 1.39, 0.0
+    expected = {"action": "slash", "side": side} if slashes else {}
+    assert check("slash", standing_view(**{f"{side}_wrist": wrist})) == expected
+
+
+def test_a_rise_counts_after_the_signal_was_low():
+    assert count_rises(np.array([5.0, 1, 3, 5, 3, 5, 2, 4.1, 0]), 4.0, 2.0) == 1
+    assert count_rises(np.array([1.0, 4.0, 1.9, 4.1, 4.2, 1.9, 9]), 4.0, 2.0) == 2
+
+
+@pytest.mark.parametrize(("speed", "action", "pace"), [
+    (0.84, "walk", "slow"), (0.86, "walk", "normal"), (1.39, "walk", "normal"), (1.41, "walk", "fast"),
+    (2.09, "walk", "fast"), (2.11, "run", None),
+])  # fmt: skip
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+def test_the_pace_of_a_walk_is_its_speed_in_the_middle(
+    speed: float, action: str, pace: str | None, fps: float
+):
+    view = standing_view(60)
+    path = np.arange(60)[:, None, None] * [0.0, 0.0, speed / fps]
+    smooth = view.smooth + path
+    smooth[:, (7, 8), 1] += 0.05 * (np.arange(60) % 10 < 5)[:, None]
+    shown = _locomotion(smooth, view.forward, view.left, 0.0, fps)
+    expected = {"action": action, "direction": "forward"} | ({"speed": pace} if pace else {})
+    assert shown == expected
+    back = _locomotion(smooth, -view.forward, -view.left, 0.0, fps)
+    assert back["direction"] == "backward"
+    aside = _locomotion(smooth, view.left, -view.forward, 0.0, fps)
+    assert aside["direction"] == "right"
+    for turned, direction in ((91.0, "counterclockwise"), (-91.0, "clockwise"), (89.0, "forward")):
+        shown = _locomotion(smooth, view.forward, view.left, turned, fps)
+        assert shown["direction"] == direction
+
+
+@pytest.mark.parametrize(
+    ("lift", "distance", "walks"),
+    [(0.041, 0.36, True), (0.039, 0.36, False), (0.041, 0.32, False)],
+)
+def test_a_walk_lifts_both_feet_and_leaves_its_place(lift: float, distance: float, walks: bool):
+    view = standing_view(60)
+    smooth = view.smooth + np.clip(np.arange(60) / 20 - 1, 0, 1)[:, None, None] * [0, 0, distance]
+    smooth[:, (7, 8), 1] += lift * (np.arange(60) % 10 < 5)[:, None]
+    smooth[:, 7, 1] += 0.2 * (np.arange(60) % 10 < 5)
+    assert bool(_locomotion(smooth, view.forward, view.left, 0.0, 20.0)) == walks
+
+
+@pytest.mark.parametrize(("reach", "height", "count"), [(0.36, 0.32, 2), (0.34, 0.32, 0), (0.36, 0.30, 0)])  # fmt: skip
+def test_a_kick_is_far_in_front_and_high_and_each_one_counts(
+    reach: float, height: float, count: int
+):
+    ankle = np.tile([-0.2, 0.08, 0.0], (20, 1))
+    ankle[[5, 12]] = -0.2, height, reach
+    view = standing_view(right_ankle=ankle)
+    expected = {"action": "kick", "side": "right", "count": count} if count else {}
+    assert _kick(view.smooth, 0.0, view.forward) == expected
+
+
+@pytest.mark.parametrize(("degrees", "shown"), [
+    (44, {}), (46, {"direction": "left", "amount": "quarter"}),
+    (-46, {"direction": "right", "amount": "quarter"}), (134, {"direction": "left", "amount": "quarter"}),
+    (136, {"direction": "left", "amount": "half"}),
+])  # fmt: skip
+def test_a_turn_is_a_quarter_or_a_half(degrees: float, shown: dict[str, Any]):
+    still = example({"action": "stand"}, FPS)[:1].astype(np.float64)
+    angle = np.radians(degrees) * np.clip((np.arange(80) - 20) / 40, 0, 1)[:, None]
+    x, z = np.moveaxis(still[..., [0, 2]] - still[:, :1, [0, 2]], -1, 0)
+    turning = np.repeat(still, 80, axis=0)
+    turning[..., 0] = np.cos(angle) * x + np.sin(angle) * z
+    turning[..., 2] = np.cos(angle) * z - np.sin(angle) * x
+    seen = read_attributes(turning, FPS)
+    assert {name: seen[name] for name in ("direction", "amount") if name in seen} == shown
+    assert (seen.get("action") == "turn") == bool(shown)
+
+
+@pytest.mark.parametrize(("degrees", "bows"), [(27, False), (29, True)])
+def test_a_bow_tilts_the_trunk(degrees: float, bows: bool):
+    still = np.repeat(example({"action": "stand"}, FPS)[:1].astype(np.float64), 60, axis=0)
+    upper = [3, 6, 9, *range(12, 22)]
+    trunk = still[0, 12] - still[0, 0]
+    tilt = np.radians(degrees) - np.arctan2(trunk[2], trunk[1])
+    y, z = np.moveaxis(still[:, upper][..., 1:] - still[:, :1, 1:], -1, 0)
+    bowed = still.copy()
+    bowed[:, upper, 1] = still[:, :1, 1] + np.cos(tilt) * y - np.sin(tilt) * z
+    bowed[:, upper, 2] = still[:, :1, 2] + np.cos(tilt) * z + np.sin(tilt) * y
+    assert (read_attributes(bowed, FPS).get("action") == "bow") == bows
+
+
+@pytest.mark.parametrize(("height", "jumps"), [(0.075, 2), (0.065, 0)])
+def test_jumps_are_counted_from_seven_centimeters_on(height: float, jumps: int):
+    up = np.repeat(example({"action": "stand"}, FPS)[:1].astype(np.float64), 80, axis=0)
+    up[[*range(20, 32), *range(50, 62)], :, 1] += height
+    assert read_attributes(up, FPS).get("count", 0) == jumps
+
+
+def test_a_clip_shorter_than_a_second_has_no_attributes():
+    still = example({"action": "stand"}, FPS)
+    assert read_attributes(still[:20], 20.0)["action"] == "stand"
+    assert read_attributes(still[:19], 20.0) == {}
+    assert "checks" not in read_all(still[:19], 20.0)

@@ -65,6 +65,54 @@ def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_t
     assert [key for key, _ in parse_qsl(EDITED.query())] == keys
 
 
+MOST: dict[str, tuple[Any, Any]] = {
+    "text": ("x" * 300, "x" * 301),
+    "seconds": (30, 30.1),
+    "samples": (4, 5),
+    "seed": (2**31 - 1, 2**31),
+    "num_inference_steps": (1000, 1001),
+    "sampler": ("s" * 40, "s" * 41),
+    "path": (((20.0, -20.0),) * 16, ((0.0, 0.0),) * 17),
+    "edits": ((DemoEdit(motion=3),) * 8, (DemoEdit(),) * 9),
+}
+LEAST: dict[str, tuple[Any, Any]] = {
+    "seconds": (0.001, 0),
+    "samples": (1, 0),
+    "seed": (0, -1),
+    "num_inference_steps": (1, 0),
+    "path": (((-20.0, 20.0),), ((0.0, 20.1),)),
+    "edits": ((DemoEdit(),), ({"motion": 4},)),
+}
+
+
+@pytest.mark.parametrize("bounds", [MOST, LEAST], ids=["most", "least"])
+@pytest.mark.parametrize("name", MOST)
+def test_a_request_is_accepted_up_to_its_limits(name: str, bounds: dict[str, tuple[Any, Any]]):
+    accepted, refused = bounds.get(name, MOST[name])
+    assert getattr(DemoRequest(**{name: accepted}), name) == accepted
+    with pytest.raises(ValueError, match="1 validation error"):
+        DemoRequest(**{name: refused})
+
+
+def test_a_variation_of_a_motion_keeps_its_text_and_path_and_the_last_step_is_cleaned_up():
+    variation = DemoEdit(motion=1, strength=0.5, seed=3)
+    part = DemoEdit(motion=2, region_seconds=(0.5, 1.0), strength=0.5)
+    request = DemoRequest(text="walks", samples=3, seed=9, split=False, edits=(variation, part))
+    first = {"texts": "walks", "split": False, "samples": 3, "seed": 9}
+    steps = request.steps("text")
+    assert steps[0] == (None, first)
+    assert steps[1] == (1, {"texts": "walks", "strength": 0.5, "samples": 1, "seed": 3})
+    region = {"region_seconds": [0.5, 1.0], "strength": 0.5, "samples": 1, "seed": 0}
+    assert steps[2] == (2, {**region, "cleanup": True})
+    led = DemoRequest(text="walks", path=((0.0, 1.0),), edits=(variation,)).steps("text")
+    assert led[1][1]["targets"] == led[0][1]["targets"]
+    assert "cleanup" not in led[1][1]
+    assert led[0][1]["seconds"] == 3
+    assert "cleanup" not in DemoRequest(text="walks", cleanup=False).steps("text")[0][1]
+    assert "texts" not in DemoRequest(text="walks").steps("none")[0][1]
+    assert DemoRequest(text="walks").steps("action")[0][1]["actions"] == "walks"
+
+
 def test_waypoints_are_reached_at_a_constant_speed_just_before_the_end():
     request = DemoRequest(
         text="a person walks @4 | a person waves", seconds=1.2, path=((0.0, 3.0), (1.0, 3.0))

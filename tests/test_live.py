@@ -211,3 +211,45 @@ def test_the_page_is_served_within_the_limits_on_connections(monkeypatch, hosts,
     assert (limits.total, limits.per_address) == (256, per_address)
     assert (limits.header_seconds, limits.idle_seconds, limits.stall_seconds) == (10, 5, 30)
     assert served[0].timeout_keep_alive == 5
+
+
+def test_an_idle_stream_may_compute_eight_blocks_at_once_and_no_more(model):
+    clock = Clock()
+    live = LiveStreams(model, clock)
+    name = live.block("", WALK, 0)["stream"]
+    clock.time = 100.0  # enough for 200 blocks
+    for begin in range(30, 270, 30):
+        live.block(name, WALK, begin)
+    with pytest.raises(UserError, match="too many changes"):
+        live.block(name, WALK, 270)
+    clock.time = 100.4  # two blocks per second, one of which was refused at 0.0
+    with pytest.raises(UserError, match="too many changes"):
+        live.block(name, WALK, 270)
+    clock.time = 100.6
+    assert live.block(name, WALK, 270)["from"] == 270
+
+
+def test_a_stream_ends_after_two_minutes_without_a_request_and_after_an_hour(model):
+    clock = Clock()
+    live = LiveStreams(model, clock)
+    name = live.block("", WALK, 0)["stream"]
+    clock.time = 120.0
+    assert live.block(name, WALK, 30)["from"] == 30
+    clock.time = 240.1
+    with pytest.raises(UserError, match="this stream has ended"):
+        live.block(name, WALK, 60)
+    name = live.block("", WALK, 0)["stream"]
+    stream = live._streams[name].stream
+
+    class Late:
+        """A stream that has run for a long time."""
+
+        frames = 72_001  # one frame more than an hour at 20 frames per second
+
+    live._streams[name].stream = Late()  # type: ignore[assignment]
+    with pytest.raises(UserError, match="the limit of one hour"):
+        live.block(name, WALK, 72_001)
+    Late.frames = 72_000
+    with pytest.raises(AttributeError):  # it goes on
+        live.block(name, WALK, 72_000)
+    live._streams[name].stream = stream

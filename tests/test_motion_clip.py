@@ -4,6 +4,7 @@ import json
 import math
 import re
 from itertools import islice
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,7 +26,7 @@ from evaluators.extractors.motion_clip_calibrated import (
     noisy_copies,
 )
 from flame_mdm.__main__ import main
-from flame_mdm.batch import length_mask
+from flame_mdm.batch import MotionBatch, length_mask
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
@@ -416,3 +417,56 @@ def test_near_misses_change_with_step_and_attribute(subtests):
             assert sorted(text == "twice" for text in texts) == [False, True]
     assert {task.near_miss("a", 0, step) for step in range(20)} == {"left", "l", "twice"}
     assert task.near_miss("b", 0, 0) == ""
+
+
+def test_half_of_the_motions_have_copies_of_mostly_weak_noise_and_errors_count_fivefold(
+    monkeypatch,
+):
+    """The contrast is 2 and the error is 3; a batch of 5 has 3 copies, and two near misses for each motion."""
+    strengths: list[torch.Tensor] = []
+    texts: list[list[str]] = []
+    meanings: list[torch.Tensor] = []
+
+    def noisy(
+        _: Any, x: torch.Tensor, lengths: torch.Tensor, strength: torch.Tensor
+    ) -> torch.Tensor:
+        strengths.append(strength)
+        assert len(x) == len(lengths) == len(strength)
+        return x
+
+    def contrast(motion: Any, text: Any, scale: Any, meaning: Any, wrong: Any) -> torch.Tensor:
+        meanings.append(meaning)
+        assert (len(motion), wrong.shape) == (len(text), (len(text), 2, 4))
+        return torch.tensor(2.0)
+
+    def encoded(batch: Any) -> torch.Tensor:
+        texts.append(batch.text)
+        return torch.zeros(len(batch.text), 4)
+
+    module = "evaluators.extractors.motion_clip_calibrated"
+    monkeypatch.setattr(f"{module}.noisy_copies", noisy)
+    monkeypatch.setattr(f"{module}.info_nce", contrast)
+    monkeypatch.setattr(f"{module}.calibration_error", lambda *_: torch.tensor(3.0))
+    names = [f"clip {number}" for number in range(5)]
+    net = torch.nn.Bilinear(1, 1, 4)
+    net.forward = lambda x, mask: torch.zeros(len(x), 4)  # type: ignore[method-assign]
+    net.logit_scale = torch.tensor(0.0)  # type: ignore[assignment]
+    task: Any = SimpleNamespace(
+        seed_step=torch.manual_seed, near_miss=lambda name, number, step: f"{name} {number} {step}",
+        text_features=encoded, meanings={name: [1, 2] for name in names}, representation=None,
+        device="cpu", network=net, report=lambda _: None,
+    )  # fmt: skip
+    mask = torch.ones(5, 6, dtype=torch.bool)
+    batch = MotionBatch(torch.randn(5, 6, 7), mask, names, text=[f"says {name}" for name in names])
+    for step in range(200):
+        assert CalibratedMotionCLIPTask.training_step(task, batch, step) == 2 + 5 * 3
+    assert {len(strength) for strength in strengths} == {3}
+    drawn = torch.cat(strengths)
+    assert drawn.mean().item() == pytest.approx(1 / 3, abs=0.05)  # of a square of a uniform number
+    assert drawn.median().item() == pytest.approx(1 / 4, abs=0.06)
+    assert texts[7] == [
+        *(f"says {name}" for name in names),
+        *(f"{name} {number} 7" for name in names for number in range(2)),
+    ]
+    assert meanings[0][:, :2].tolist() == [[1, 2]] * 5
+    assert len(meanings[0][:, 2].unique()) == 5

@@ -33,7 +33,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats import fbx_scene
 from flame_mdm.formats.poses import solve
 from flame_mdm.formats.readers import read
-from flame_mdm.generator import MotionGenerator
+from flame_mdm.generator import MotionGenerator, joined
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import rotation
@@ -148,6 +148,71 @@ def test_noise_and_words_of_the_runner_are_those_of_the_package(subtests) -> Non
     assert all(
         runner.hashed(word, 97) == vocabulary.hashed(word, 97) for word in runner.words(text)
     )
+
+
+def test_forms_of_words_of_the_runner_are_those_of_the_package() -> None:
+    stems = ("walk", "wave", "hop", "kick", "punch", "dance", "carry", "two", "is", "agree", "stop")
+    endings = ("", "e", "s", "es", "ing", "ed", "d", "ping", "ped", "ning")
+    spoken = sorted({stem + ending for stem in stems for ending in endings} | runner.NUMBERS)
+    for seen in (
+        {"walks", "wave", "hops", "two", "kicked"},
+        {"waving", "hopping", "twos", "eights"},
+    ):
+        for word in spoken:
+            assert runner.known_form(word, seen) == vocabulary.known_form(word, seen), word
+    assert frozenset(vocabulary.NUMBERS) == runner.NUMBERS
+
+
+@pytest.mark.parametrize("fade", [1, 4, 9])
+def test_blocks_of_the_runner_are_joined_as_those_of_the_package(fade: int) -> None:
+    before, x = torch.randn(5, 6, generator=torch.Generator().manual_seed(fade)).split([2, 3])
+    expected = joined(before[None], x[None], fade)[0].numpy()
+    ours = runner.joined(before.numpy(), x.numpy(), {"frames": fade, "begin": 2, "end": 5})
+    np.testing.assert_allclose(ours[:, 2:5], expected[:, 2:5], atol=1e-6)
+    np.testing.assert_array_equal(ours[:, [0, 1, 5]], x.numpy()[:, [0, 1, 5]])
+    np.testing.assert_array_equal(runner.joined(before.numpy(), x.numpy(), None), x.numpy())
+
+
+def sampler_without_graphs(**content: Any) -> runner.Sampler:
+    """A runner whose denoiser predicts 0, for 10 features at 20 frames per second."""
+    sampler = object.__new__(runner.Sampler)
+    sampler.content = {
+        "reads": "none", "fps": 20, "features": 10, "max_frames": 200, "padded_frames": 0,
+        "clip_x0": False, "steps": [[0, 0, 0, 1, 0, 0, 0]], **content,
+    }  # fmt: skip
+    sampler._run = lambda name, inputs, shapes: [np.zeros(shapes[0], np.float32)]  # type: ignore[method-assign]
+    return sampler
+
+
+@pytest.mark.parametrize(("seconds", "frames"), [
+    (None, 60), (1.24, 25), (1.26, 25), (1.28, 26), (0.1, 2), (10.0, 200)
+])  # fmt: skip
+def test_the_runner_rounds_seconds_to_frames(seconds: float | None, frames: int) -> None:
+    assert len(sampler_without_graphs().generate(seconds=seconds)) == frames
+    padded = sampler_without_graphs(padded_frames=200, max_frames=200)
+    assert len(padded.generate(seconds=seconds)) == frames
+
+
+def test_the_runner_states_the_shortest_and_the_longest_motion() -> None:
+    for seconds in (0.05, 10.1, -1.0, float("inf")):
+        with pytest.raises(ValueError, match=r"give 0\.1 to 10 seconds"):
+            sampler_without_graphs().generate(seconds=seconds)
+    assert len(sampler_without_graphs(max_frames=40).generate()) == 40
+    start = {"start": [[0.0] * 10] * 20, "max_frames": 60}
+    with pytest.raises(ValueError, match=r"give 0\.1 to 600 seconds"):
+        sampler_without_graphs(**start).generate(seconds=600.1)
+    assert len(sampler_without_graphs(**start).generate(seconds=4.5)) == 90
+
+
+def test_noise_of_the_runner_depends_on_prompt_sample_and_seed() -> None:
+    passes = {"steps": [[0, 0, 0, 1, 0, 0, 0]]}  # the last step keeps the noise
+    first = sampler_without_graphs(**passes).generate("a")
+    np.testing.assert_array_equal(sampler_without_graphs(**passes).generate("a"), first)
+    for others in ({"prompt": "b"}, {"sample": 1}, {"seed": 1}):
+        other = sampler_without_graphs(**passes).generate(**{"prompt": "a"} | others)
+        assert np.abs(other - first).max() > 0.5, others
+    expected = seeded_noise(["a#0"], 60, 10, seed=0, replication=0, like=torch.zeros(1))(0)
+    np.testing.assert_allclose(first, expected[0].numpy(), atol=2e-6)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -11,16 +11,18 @@ from typing import Any
 
 import pytest
 import torch
-from support.pages import a_run, put
+from support.pages import a_run, put, result
 from support.runs import TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wandb import Run
 
 from flame_mdm.__main__ import main
-from flame_mdm.reporting.page import number, page
-from flame_mdm.reporting.plots import chart
-from flame_mdm.reporting.report import write_report
+from flame_mdm.records import Result
+from flame_mdm.reporting.page import filled, interval, number, page, short
+from flame_mdm.reporting.plots import Histogram, Panel, _linear_axis, _log_axis, _tick, chart, svg
+from flame_mdm.reporting.report import charted, write_report
 from flame_mdm.runs import read_history, read_run
+from flame_mdm.schemas import check_shape
 from flame_mdm.training import callbacks
 
 pytestmark = pytest.mark.slow
@@ -297,3 +299,147 @@ def test_a_chart_draws_what_it_is_given():
         min(y for _, y in thin)
         == points(chart("x", {"a": {0: 0.0, 7777: 9.0, 19_999: -1.0}}))[1][1]
     ), "extremes"
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "–"), (0.0, "0"), (3, "3"), (0.00099, "9.90e-04"), (-0.00012345, "-1.23e-04"), (0.001, "0.001"),
+    (1.23456, "1.235"), (9999.4, "9999"), (10_000.0, "10,000"), (-12_345.6, "-12,346"), (float("nan"), "nan"),
+])  # fmt: skip
+def test_numbers_of_pages_have_four_digits(value: float | None, text: str):
+    assert number(value) == text
+
+
+def test_intervals_have_two_digits_and_steps_are_short():
+    assert [interval(*pair) for pair in ((1.5, 0.0456), (1.5, None), (None, 0.1))] == [
+        "1.5 ± 0.046",
+        "1.5",
+        "–",
+    ]
+    steps = (0, 999, 1000, 1500, 999_999, 1_000_000, 2_500_000, -1500)
+    assert [short(step) for step in steps] == [
+        "0", "999", "1k", "1.5k", "1000k", "1M", "2.5M", "-1.5k",
+    ]  # fmt: skip
+
+
+def test_columns_and_rows_without_a_value_are_left_out():
+    head = ("run", "steps", "device", "data")
+    rows = [["a", "5", "–", "x"], ["b", "–", "", "–"], ["c", "–", "–", "y"]]
+    assert filled(head, rows) == (["run", "steps", "data"], [["a", "5", "x"], ["c", "–", "y"]])
+
+
+def test_curves_of_one_name_share_a_chart_below_losses_if_they_are_trained():
+    names = ["train/loss", "val/loss", "val/fid", "val/fid/ci", "val/fid/real", "samples/skating"]
+    names += ["train/lr", "val/lr", "train/epochs", "train/grad_norm"]
+    assert charted(names) == {
+        "Losses": {"loss": ["train", "val"]},
+        "Validation": {"fid": ["val"], "lr": ["val"]},
+        "Samples for the fixed prompts": {"skating": ["samples"]},
+        "Training curves": {"grad_norm": ["train"], "lr": ["train"]},
+    }
+
+
+@pytest.mark.parametrize(("low", "high", "to_ticks", "ends", "ticks"), [
+    (0.3, 9.7, True, (0, 10), [0, 5, 10]), (0.0, 4.0, True, (0, 4), [0, 1, 2, 3, 4]),
+    (-1.2, 0.9, True, (-2, 1), [-2, -1, 0, 1]), (0, 2999, False, (0, 2999), [0, 1000, 2000, 3000]),
+    (0, 2900, False, (0, 2900), [0, 1000, 2000]), (5.0, 5.0, True, (4.5, 5.5), [4.5, 5.0, 5.5]),
+    (0.0, 0.0, True, (-0.1, 0.1), [-0.1, -0.05, 0.0, 0.05, 0.1]),
+])  # fmt: skip
+def test_ticks_of_an_axis_are_round_numbers(
+    low: float, high: float, to_ticks: bool, ends: tuple[float, float], ticks: list[float]
+):
+    axis = _linear_axis(low, high, to_ticks)
+    assert (axis.low, axis.high) == pytest.approx(ends)
+    assert list(axis.ticks) == pytest.approx(ticks)
+    assert axis.share(axis.low - 1) == 0
+    assert axis.share((axis.low + axis.high) / 2) == pytest.approx(0.5)
+
+
+def test_ticks_of_a_logarithmic_axis_are_powers_of_ten_and_their_double_and_fivefold():
+    assert _log_axis(1.0, 60.0).ticks == [1, 2, 5, 10, 20, 50]
+    assert _log_axis(1.0, 9e5).ticks == [1, 100, 10_000]
+    assert _log_axis(1.0, 100.0).share(10.0) == pytest.approx(0.5)
+    axis = _log_axis(2.0, 50.0)
+    assert (axis.low, axis.high) == pytest.approx((2 / 1.15, 50 * 1.15))
+    texts = [_tick(value) for value in (0.0, 1e-13, 0.0005, 0.001, 1500.0, 0.30000000000000004)]
+    assert texts == ["0", "0", "5e-4", "0.001", "1.5k", "0.3"]
+
+
+@pytest.mark.parametrize(("most", "logarithmic"), [(15.0, False), (15.1, True)])
+def test_losses_that_span_a_factor_of_fifteen_have_a_logarithmic_axis(
+    most: float, logarithmic: bool
+):
+    line = points(chart("x", {"a": {0: 1.0, 5: (1 + most) / 2, 10: most}}))
+    middle = (line[0][1] + line[2][1]) / 2
+    assert (abs(line[1][1] - middle) > 5) == logarithmic
+
+
+def test_bars_of_a_histogram_are_as_high_as_their_counts():
+    plot = svg("lengths", [Panel(Histogram(5, [3, 0, 6]), "frames")])
+    bars = [
+        [float(x) for x in re.findall(r'(?:x|y|width|height)="([\d.-]+)"', bar)]
+        for bar in re.findall(r"<rect[^>]*>", str(plot))
+        if "bar" in bar or "c0" in bar
+    ]
+    titles = re.findall(r"\d+ to \d+ frames: \d+ motions", str(plot))
+    assert titles == [f"{k} to {k + 5} frames: {n} motions" for k, n in ((0, 3), (5, 0), (10, 6))]
+    heights = [bar[3] for bar in bars]
+    assert heights[0] == pytest.approx(heights[2] / 2, abs=0.2)
+    assert heights[1] == 0
+    assert bars[1][0] - bars[0][0] == pytest.approx(bars[0][2] + 1, abs=0.2)
+
+
+def test_a_spread_reaches_to_both_sides_of_its_points_and_beyond_the_curve():
+    curve = {0: 1.0, 1: 2.0, 2: 3.0}
+    plain, wide = (
+        points(chart("x", {"a": curve}, bands)) for bands in (None, {"a": {0: 1.0, 2: -5.0}})
+    )
+    assert plain[2][1] < wide[2][1] < wide[0][1] < plain[0][1], "the axis has room for the band"
+
+
+def test_the_newest_samples_and_the_number_of_steps_are_those_of_the_run(tmp_path):
+    folder = a_run(tmp_path / "run", name="two")
+    for step in (2, 10):
+        motions = folder / "samples" / f"step_{step:07d}"
+        motions.mkdir(parents=True)
+        (motions / "motion_000.npz").write_bytes(b"")
+    (folder / "samples" / "step_x").mkdir()
+    run = read_run(folder)
+    assert run.samples == folder / "samples" / "step_0000010"
+    assert (run.steps, run.label) == (10, "mine/two")
+    (folder / "metrics.jsonl").write_text(
+        '{"step": 30, "val/fid": 1.0}\n{"step": 7, "train/x": 1}\n'
+    )
+    assert read_run(folder).steps == 8, "of steps that were trained"
+    assert read_run(a_run(tmp_path / "other")).label == "mine"
+
+
+ORIGINS: dict[str, dict[str, Any]] = {
+    "the checkpoint": {"checkpoint": result()["checkpoint"] | {"sha256": "9" * 64}},
+    "the motions of others": {"checkpoint": None, "samples_sha256": "9" * 64},
+    "another baseline": {"checkpoint": None, "baseline": "noisy"},
+    "the extractor": {"extractor": {"sha256": "e" * 64}},
+    "the data": {"data": {"dataset": "synthetic", "fingerprint": "other"}},
+    "the protocol": {"protocol": {"name": "p", "version": 3, "sha256": "5" * 64}},
+    "the split": {"split": "val"},
+    "the seed": {"seed": 1},
+}
+
+
+@pytest.mark.parametrize("name", ORIGINS)
+def test_results_of_other_inputs_have_other_origins(name: str):
+    assert (
+        check_shape(result(**ORIGINS[name]), Result).origin != check_shape(result(), Result).origin
+    )
+
+
+def test_a_page_names_the_number_of_motions_of_most_values():
+    values = {
+        "none": {"mean": None, "ci": None, "replications": 2, "n": 0},
+        "a": {"mean": 1.0, "ci": 0.1, "replications": 2, "n": 64},
+        "b": {"mean": 1.0, "ci": 0.1, "replications": 2, "n": 64},
+        "c": {"mean": 1.0, "ci": 0.1, "replications": 5, "n": 600},
+    }
+    assert check_shape(result(values=values), Result).counts == "2 x 64"
+    uneven = {"mean": 1.0, "ci": 0.1, "replications": 2, "n": None, "n_per_replication": [64, 5]}
+    assert check_shape(result(values={"a": uneven}), Result).counts == "64 + 5"
+    assert check_shape(result(values={"none": values["none"]}), Result).counts == ""

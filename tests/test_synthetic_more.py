@@ -439,7 +439,9 @@ def test_jumping_jacks_spread_the_feet_while_the_hands_rise(apart: float, high: 
     assert shown.get("count", 0) == count
 
 
-@pytest.mark.parametrize(("sinks", "height", "count"), [(0.131, 0.83, 1), (0.129, 0.83, 0), (0.2, 0.85, 0)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("sinks", "height", "count"), [(0.131, 0.83, 1), (0.129, 0.83, 0), (0.2, 0.85, 0)]
+)
 def test_push_ups_sink_by_13_centimeters_with_a_level_trunk(
     sinks: float, height: float, count: int
 ):

@@ -3,6 +3,8 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from support.stores import line, write_folder, write_words
 
 from evaluators.extractors import OwnT2MExtractor
 from evaluators.extractors.t2m import LearnedWords
-from evaluators.extractors.t2m_training import matching_loss
+from evaluators.extractors.t2m_training import T2MTask, matching_loss, reconstruction_terms
 from flame_mdm.__main__ import main
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.errors import UserError
@@ -202,6 +204,50 @@ def test_the_loss_is_the_published_one_and_a_motion_that_a_text_describes_is_no_
     torch.testing.assert_close(matching_loss(motion, text, 3.0, fits), expected)
     nothing_wrong = torch.ones(5, 5, dtype=torch.bool)
     torch.testing.assert_close(matching_loss(motion, text, 3.0, nothing_wrong), near.mean())
+
+
+class Quarter(torch.nn.Module):
+    """A movement encoder whose vectors are every fourth frame."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x[:, ::4]
+
+
+def batch_of(x: torch.Tensor, lengths: list[int]) -> Any:
+    mask = torch.arange(x.shape[1]) < torch.tensor(lengths)[:, None]
+    return SimpleNamespace(x=x, mask=mask)
+
+
+def test_terms_of_the_movements_are_means_over_real_frames_and_whole_units():
+    x = torch.randn(2, 14, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    network: Any = SimpleNamespace(used=3, movement_encoder=Quarter())
+    terms = reconstruction_terms(
+        network, lambda latents: latents.repeat_interleave(4, 1), batch_of(x, [14, 7])
+    )
+    for row, frames, units in ((0, 12, 3), (1, 7, 1)):
+        real = x[row, :, :3]
+        latents = real[: 4 * units : 4]
+        rebuilt = real[:12:4].repeat_interleave(4, 0)[:frames]
+        assert terms["reconstruction"][row] == pytest.approx(
+            (rebuilt - real[:frames]).abs().mean().item()
+        )
+        assert terms["sparsity"][row] == pytest.approx(latents.abs().mean().item())
+        changes = latents.diff(dim=0).abs().mean().item() if units > 1 else 0.0
+        assert terms["smoothness"][row] == pytest.approx(changes)
+
+
+def test_the_loss_of_movements_weights_its_terms(monkeypatch):
+    terms = {"reconstruction": [1.0, 3.0], "sparsity": [10.0, 10.0], "smoothness": [0.0, 100.0]}
+    values = {name: torch.tensor(x) for name, x in terms.items()}
+    monkeypatch.setattr(
+        "evaluators.extractors.t2m_training.reconstruction_terms", lambda *_: values
+    )
+    task: Any = SimpleNamespace(
+        network=SimpleNamespace(movement_encoder=torch.nn.Identity()),
+        decoder=None, sparsity=0.1, smoothness=0.01, _learns_movement=True,
+        seed_step=lambda _: None, report=lambda _: None, _idle=list,
+    )  # fmt: skip
+    assert float(T2MTask.training_step(task, cast(Any, None), 0)) == pytest.approx(2 + 1 + 0.5)
 
 
 @pytest.mark.slow

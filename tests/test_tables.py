@@ -1,6 +1,8 @@
 """Tables: from results alone, the same bytes each time, and no comparison of what cannot be compared."""
 
+import csv
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -20,8 +22,23 @@ from flame_mdm.config import compose
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
-from flame_mdm.reporting.tables.format import Cell, Line, Table, ranks, rendered
-from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
+from flame_mdm.reporting.tables.format import (
+    Cell,
+    Line,
+    Part,
+    Table,
+    _series,
+    comma_separated,
+    ranks,
+    rendered,
+)
+from flame_mdm.reporting.tables.specs import (
+    Evaluation,
+    Figure,
+    evaluations,
+    load_spec,
+    spec_names,
+)
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import write_json
 from flame_mdm.training.start import recipe_changes
@@ -820,3 +837,91 @@ def test_figure_4_of_mdm_shows_the_ratings_of_a_user_study_beside_the_reported_o
         "42.3%",
     )
     assert '<td class="number">66.7% [30.0%, 90.3%]</td>' in rendered(table, "html")
+
+
+def test_lengths_of_a_data_set_are_counted_in_frames_and_hours(tmp_path):
+    lengths = {"fingerprint": "f", "fps": 20.0, "lengths": [90, 40, 200, 41, 60]}
+    (tmp_path / "lengths").mkdir()
+    (tmp_path / "lengths" / "mine.json").write_text(
+        json.dumps(lengths | {"lengths": lengths["lengths"] * 1000})
+    )
+    spec = {"title": "Lengths", "parts": {"All": {"lengths": ["mine", "absent"]}}}
+    (part,) = build("x", spec, tmp_path).parts
+    mine, absent = part.lines
+    texts = dict(zip(part.columns, [cell and cell.text for cell in mine.cells], strict=True))
+    assert texts == {
+        "motions": "5,000",
+        "hours": "5.99",
+        "shortest": "40",
+        "median": "60",
+        "mean": "86.2",
+        "longest": "200",
+    }
+    assert (absent.state, absent.cells) == ("not prepared", [None] * 6)
+    histogram = part.histograms["mine"]
+    assert (histogram.step, len(histogram.counts), sum(histogram.counts)) == (5, 41, 5000)
+    assert [histogram.counts[k] for k in (7, 8, 12, 18, 40)] == [0, 2000, 1000, 1000, 1000]
+
+
+@pytest.mark.parametrize(("text", "number"), [
+    ("0.544 ±.044", 0.544), ("1,000", 1000.0), ("-.5", -0.5), ("+2.5e-3 s", 0.0025), (" 7 ", 7.0), ("n/a", None),
+    ("66.7% [30]", 66.7),
+])  # fmt: skip
+def test_a_printed_value_begins_with_its_number(text: str, number: float | None):
+    assert builder._leading(text) == number
+
+
+def test_csv_has_the_number_the_print_the_interval_and_the_place_of_each_cell():
+    facts = {"seed": "3"}
+    lines = [
+        Line("a", "measured", [Cell("1.0", 1.04, 0.2, 1), None], "a", "QUICK", facts=facts),
+        Line("=b", "reported", [None, Cell("-2", -2.0)]),
+    ]
+    table = Table("t", "T", [Part("P", {"X": "lower", "Y": "none"}, lines)])
+    head, first, second = csv.reader(io.StringIO(comma_separated(table)))
+    row = dict(zip(head, first, strict=True))
+    assert row == {
+        **{
+            "part": "P",
+            "row": "a",
+            "kind": "measured",
+            "state": "QUICK",
+            "marks": "a",
+            "seed": "3",
+        },
+        **{"X": "1.04", "X: printed": "1.0", "X: 95 % interval, half": "0.2", "X: place": "1"},
+        **dict.fromkeys(("Y", "Y: printed", "Y: 95 % interval, half", "Y: place"), ""),
+    }
+    row = dict(zip(head, second, strict=True))
+    assert (row["row"], row["Y"], row["Y: printed"], row["Y: place"]) == ("'=b", "-2.0", "-2", "")
+
+
+def test_figures_draw_points_in_order_without_incomplete_rows():
+    def line(label: str, x: float, y: float, kind: str = "measured", state: str = "") -> Line:
+        return Line(label, kind, [Cell("", y, 0.1 if x == 5 else None)], "", state, {"eta": x})
+
+    lines = [line("a", 5, 1), line("a", 2, 3), line("b", 1, 9, state="QUICK")]
+    lines += [line("c", 4, 7, "reported"), line("Real", 0, 0.5, "real")]
+    part = Part("P", {"FID": "real"}, lines)
+    series, levels = _series(part, Figure(part="P", x="eta", y=["FID"]), "FID")
+    assert [(s.name, list(s.points), dict(s.spread), s.kind) for s in series] == [
+        ("a", [(2, 3), (5, 1)], {5: 0.1}, "line"),
+        ("c, reported", [(4, 7)], {}, "dashed"),
+    ]
+    assert levels == [0.5]
+    lower = Part("P", {"FID": "lower"}, lines)
+    assert _series(lower, Figure(part="P", x="eta", y=["FID"]), "FID")[1] == []
+    dots, _ = _series(part, Figure(part="P", x="eta", y=["FID"], points=True), "FID")
+    assert [s.kind for s in dots] == ["dots", "dots"]
+
+
+@pytest.mark.parametrize(("numbers", "texts"), [
+    ([9.99, 0.5], ["9.990", "0.500"]), ([10.0, 3.25], ["10.0", "3.2"]), ([100.2, 3.26], ["100.2", "3.3"]),
+    ([0.1, 0.05], ["0.100", "0.050"]), ([0.099, 0.05], ["0.0990", "0.0500"]), ([0.0012, 2e-9], ["0.00120", "2.0e-09"]),
+])  # fmt: skip
+def test_the_largest_number_of_a_column_has_three_digits(numbers: list[float], texts: list[str]):
+    lines = [Line("", "measured", [Cell("", value, None)]) for value in numbers]
+    builder._print_cells(lines, 1)
+    printed = [cell.text for line in lines if (cell := line.cells[0])]
+    assert printed[0] == texts[0]
+    assert float(printed[1]) == pytest.approx(float(texts[1]))

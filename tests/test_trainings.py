@@ -9,10 +9,11 @@ from support.runs import TINY
 
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import trainings
-from flame_mdm.commands.benchmark import BenchmarkSettings, main
+from flame_mdm.commands.benchmark import BenchmarkSettings, check, main
 from flame_mdm.commands.trainings import Training, plan, run_trainings
 from flame_mdm.config import EXPERIMENTS
 from flame_mdm.errors import UserError
+from flame_mdm.reporting.tables.format import Cell, Line, Part, Table
 from flame_mdm.safe_io import read_yaml
 
 
@@ -135,3 +136,19 @@ def test_trainings_side_by_side_give_the_same_weights(data_root, tmp_path, monke
         states.append([read_checkpoint(path)["state_dict"] for path in paths])
     for alone, beside in zip(*states, strict=True):
         assert all(torch.equal(value, beside[name]) for name, value in alone.items())
+
+
+@pytest.mark.parametrize(("value", "right"), [
+    (0.1, True), (0.3, True), (0.2, True), (0.0999, False), (0.3001, False), (None, False)
+])  # fmt: skip
+def test_values_of_a_benchmark_are_within_their_ranges(value: float | None, right: bool):
+    cells = [Cell("", 5.0), None if value is None else Cell("", value)]
+    lines = [Line("MDM", "reported", [Cell("", 0.2)] * 2), Line("MDM", "measured", cells)]
+    lines.append(Line("MFM", "measured", [Cell("", 0.2)] * 2, state="no checkpoint"))
+    table = Table("t", "T", [Part("P", {"Top 1": "higher", "FID": "lower"}, lines)])
+    ranges = {"FID": (0.1, 0.3)}
+    (of_mdm, is_within), (of_mfm, unmeasured) = check(table, {"P": {"MDM": ranges, "MFM": ranges}})
+    measured = "not measured" if value is None else f"{value:.3g}"
+    assert of_mdm == f"MDM: FID {measured}, expected 0.1 to 0.3"
+    assert of_mfm == "MFM: FID not measured, expected 0.1 to 0.3"
+    assert (is_within, unmeasured) == (right, False)

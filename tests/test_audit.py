@@ -2,10 +2,11 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,9 +20,10 @@ from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
 from evaluators.metrics.samples import SampleMetric
 from evaluators.perturbations import BASE, PERTURBATIONS, REAL
-from evaluators.protocol import load_protocol
-from evaluators.scene import Text
+from evaluators.protocol import DrawnClip, load_protocol
+from evaluators.scene import Scene, Text, text_of
 from flame_mdm.__main__ import main
+from flame_mdm.data.store import Entry
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.records import AuditCard, AuditedPerturbation
 from flame_mdm.reporting.audit_cards import (
@@ -415,3 +417,166 @@ def test_committed_cards_are_listed_complete_and_small(path, tmp_path, subtests)
             }
             assert "fid" not in noticed
             assert bool(noticed) == any(fact.sees_meaning for fact in card.facts.values())
+
+
+def scene_of(count: int = 40) -> Scene:
+    """Motions of ten actions, whose captions name the action and, for the first five, a side."""
+    rows = []
+    for number in range(count):
+        action, side = number % 10, ("left", "right")[number // 10 % 2]
+        attributes: dict[str, Any] = {"action": f"action {action}"}
+        if action < 5:
+            attributes["side"] = side
+        captions = [" ".join(map(str, attributes.values()))]
+        entry = Entry(f"clip {number}", 0, 40, "test", "", captions, action, attributes)
+        rows.append(DrawnClip(entry.id, entry, np.arange(40), 0, entry.id))
+    features = [np.full((40, 2), number, np.float32) for number in range(count)]
+    return Scene(cast(Any, None), rows, features, cast(Any, SimpleNamespace(fps=20.0)), 0)
+
+
+def listed(name: str) -> Any:
+    return next(perturbation for perturbation in PERTURBATIONS if perturbation.name == name)
+
+
+def numbered(scene: Scene) -> dict[str, Any]:
+    """Sets of motions whose numbers are the index of the motion, negative in the perturbed set."""
+    numbers = np.arange(len(scene))[:, None] + np.zeros((1, 3))
+    return {BASE: {"x": numbers}, "mirrored": {"x": -1 - numbers}}
+
+
+def test_a_share_of_the_motions_is_replaced_and_larger_shares_contain_smaller_ones():
+    scene = scene_of(39)
+    texts = [text_of(row, row.text) for row in scene.rows]
+    before: set[int] = set()
+    for grade, count in ((5, 2), (10, 4), (20, 8), (50, 20), (100, 39)):
+        inputs, same = listed("mirrored").apply(scene, grade, numbered(scene), texts)
+        replaced = {int(-1 - x) for x in inputs["x"][:, 0] if x < 0}
+        assert (len(replaced), before <= replaced, same is texts) == (count, True, True)
+        kept = [int(x) for x in inputs["x"][:, 0] if x >= 0]
+        assert sorted({*kept, *replaced}) == list(range(39))
+        before = replaced
+
+
+def test_captions_are_replaced_up_to_the_share_of_motions_that_have_wrong_ones():
+    scene = scene_of()
+    texts = [text_of(row, row.text) for row in scene.rows]
+    (near,) = listed("near misses").offered(scene, True)
+    assert near.grades == [1, 2, 5, 10, 20, 50.0]
+    (everything,) = listed("wrong captions").offered(scene, True)
+    assert everything.grades == [1, 2, 5, 10, 20, 50, 100.0]
+    assert listed("near misses").offered(scene, False) == []
+    for perturbation, grade, count in ((near, 20, 8), (near, 50, 20), (everything, 5, 2)):
+        inputs, changed = perturbation.apply(scene, grade, numbered(scene), texts)
+        assert inputs is not None
+        assert (inputs["x"][:, 0] == np.arange(40)).all()
+        wrong = [i for i in range(40) if changed[i] != texts[i]]
+        assert len(wrong) == count
+        for i in wrong:
+            assert changed[i].caption not in scene.rows[i].clip.captions
+            same_action = changed[i].requested["action"] == texts[i].requested["action"]
+            assert same_action == (perturbation is near)
+
+
+def test_dropped_actions_never_appear_and_the_others_are_repeated_with_their_texts():
+    scene = scene_of()
+    texts = [text_of(row, row.text) for row in scene.rows]
+    before: set[int] = set()
+    for grade, count in ((1, 1), (25, 2), (50, 5), (75, 8)):
+        inputs, kept = listed("missing actions").apply(scene, grade, numbered(scene), texts)
+        motions = inputs["x"][:, 0].astype(int).tolist()
+        gone = set(range(10)) - {scene.actions[i] for i in motions}
+        assert (len(gone), before <= gone, len(motions)) == (count, True, 40)
+        assert [text.caption for text in kept] == [texts[i].caption for i in motions]
+        stay = [i for i in range(40) if scene.actions[i] not in gone]
+        assert all(motions[i] == i for i in stay)
+        assert max(motions.count(i) for i in stay) <= 2 + 40 // len(stay)
+        before = gone
+    one = replace(scene, rows=scene.rows[:1])
+    assert listed("missing actions").offered(one, True) == []
+
+
+def test_fewer_motions_are_the_first_ones():
+    scene = scene_of(100)
+    texts = [text_of(row, row.text) for row in scene.rows]
+    (fewer,) = listed("fewer").offered(scene, True)
+    assert fewer.grades == [64]
+    inputs, kept = fewer.apply(scene, 64, numbered(scene), texts)
+    assert (inputs["x"][:, 0].tolist(), kept) == (list(range(64)), texts[:64])
+    assert listed("fewer").offered(scene_of(64), True) == []
+
+
+def test_changes_of_joints_have_the_draws_of_the_motion_and_the_sign_of_their_grade(monkeypatch):
+    seen: list[tuple[float, float, Any]] = []
+
+    def change(joints: Any, grade: float, draws: np.random.Generator, fps: float) -> Any:
+        seen.append((grade, draws.uniform(), fps))
+        return joints
+
+    monkeypatch.setattr(perturbations, "encode", lambda representation, motions: motions)
+    scene = scene_of(3)
+    scene.__dict__["joints"] = [np.zeros((4, 22, 3))] * 3
+    changed = perturbations.ChangedJoints(
+        "x", "joints", "", "cm", (1, 2.5), change, ["draws", "fps"], sign=-1
+    )
+    sets = changed.motions(scene)
+    assert list(sets) == ["x 1", "x 2.5"]
+    for make in sets.values():
+        make()
+    grades, draws, rates = zip(*seen, strict=True)
+    assert grades == (-1, -1, -1, -2.5, -2.5, -2.5)
+    assert draws[:3] == draws[3:]
+    assert len(set(draws)) == 3
+    assert set(rates) == {20.0}
+
+
+def test_the_grades_of_an_audit_are_those_that_its_page_states():
+    signs = {p.name: p.sign for p in PERTURBATIONS if isinstance(p, perturbations.ChangedJoints)}
+    assert {name for name, sign in signs.items() if sign < 0} == {"sinking", "shorter bones"}
+    grades = {p.name: (p.unit, tuple(p.grades)) for p in PERTURBATIONS}
+    lengths = (1, 2, 5, 10, 20)
+    shares = ("% of motions", (5, 10, 20, 50, 100))
+    expected: dict[str, tuple[str, tuple[float, ...]]] = {
+        **{"jitter": ("mm", lengths), "wobble": ("mm", (5, 10, 20, 50))},
+        **{"skating": ("x", (1.05, 1.1, 1.25, 1.5, 2)), "arms inside": ("cm", (10, 20, 30))},
+        **dict.fromkeys(("floating", "sinking"), ("cm", (1, 2, 5, 10))),
+        **dict.fromkeys(("longer bones", "shorter bones"), ("%", lengths)),
+        **dict.fromkeys(("pop", "last-frame pop"), ("cm", lengths)),
+        **dict.fromkeys(
+            ("mirrored", "reversed", "other half", "memorized", "dropped repetition"), shares
+        ),
+        **{"slower": ("x", (0.9, 0.75, 0.5)), "faster": ("x", (1.1, 1.25, 1.5, 2))},
+        **{"frozen": ("% of time", (10, 25, 50, 75, 100)), "cropped": ("% of time", (10, 25, 50))},
+        **{"frame rate": ("fps", (30, 15, 10)), "fewer": ("motions", (256, 128, 64))},
+        "missing actions": ("% of actions", (10, 25, 50, 75)),
+    }
+    assert {name: grades[name] for name in expected} == expected
+
+
+def test_a_difference_is_seen_if_it_exceeds_its_interval_and_rounding(card):
+    metrics = ("fid", "jitter")
+
+    def response(*grades: tuple[float, float]) -> Seen | None:
+        values = [
+            {"grade": float(n), "values": {m: [1.0 + d, 0.3, d, half] for m in metrics}}
+            for n, (d, half) in enumerate(grades, 1)
+        ]
+        facts = {"name": "n", "group": "joints", "about": "", "unit": ""}
+        return seen(card, check_shape(facts | {"grades": values}, AuditedPerturbation), "fid")
+
+    for grades, grade, outside in (
+        ([(0.1, 0.1), (0.2, 0.1)], 2.0, None),  # the first difference is as large as its interval
+        ([(2e-6, 0.0)], 1.0, None),
+        ([(0.9e-6, 0.0)], None, None),
+        ([(0.9, 0.1)], 1.0, None),  # as wide as the interval of real motions, 0.9
+        ([(0.91, 0.1)], 1.0, 1.0),
+        ([(0.5, 0.1), (0.0, 0.1), (0.5, 0.1)], 3.0, None),
+    ):
+        reaction = response(*grades)
+        assert reaction is not None
+        assert (reaction.grade, reaction.outside) == (grade, outside), grades
+    falling = response((0.5, 0.1), (0.39, 0.1))
+    assert falling is not None
+    assert not falling.monotone
+    level = response((0.5, 0.1), (0.41, 0.1))
+    assert level is not None
+    assert level.monotone

@@ -2,6 +2,8 @@
 
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,8 +17,10 @@ from flame_mdm.__main__ import main
 from flame_mdm.data import Clip
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.formats.readers import read
-from flame_mdm.reporting.browse import choose, describe, find, write_page
+from flame_mdm.reporting import browse
+from flame_mdm.reporting.browse import choose, describe, find, motion, write_clips, write_page
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SMPL22
 
 
 def entry(name: str, split: str = "train", *captions: str) -> Entry:
@@ -177,3 +181,70 @@ def test_a_page_narrows_down_in_a_browser(store, tmp_path, subtests):
         assert tab.run("element('each').checked")
         columns = tab.run("motions.map((m) => +m.figure.style.gridColumnStart)")
         assert columns[4] == columns[3] + 1  # a copy beside its original
+
+
+class Raw:
+    """A representation whose features are the joint positions."""
+
+    fps, skeleton, name = 20.0, SMPL22, "raw"
+
+    def decode(self, x: torch.Tensor) -> torch.Tensor:
+        return x.unflatten(-1, (22, 3))
+
+    def rebase(self, x: np.ndarray) -> np.ndarray:
+        return x
+
+
+def stored(*motions: np.ndarray, captions: list[list[str]], action: int | None = None) -> Any:
+    """A store of clips with these motions (F, 22, 3) and captions."""
+    clips = [
+        Entry(f"clip/{number}", 0, len(x), "train", f"{number}", texts, action)
+        for number, (x, texts) in enumerate(zip(motions, captions, strict=True))
+    ]
+    by_id = {clip.id: x.reshape(len(x), 66) for clip, x in zip(clips, motions, strict=True)}
+    info = {"actions": ["walk", "run"], "fps": 20.0, "clips": {"train": len(clips), "val": 0}}
+    return SimpleNamespace(
+        clips=clips, info=info, fingerprint="f00d", motion=lambda clip: by_id[clip.id]
+    )
+
+
+def test_the_first_fifteen_seconds_are_shown_on_the_floor():
+    body = np.random.default_rng(0).uniform(0, 1, (320, 22, 3)).astype(np.float32)
+    body[..., 1] -= body[..., 1].min()
+    for height, lowest in ((-0.29, -0.29), (-0.31, 0.0), (0.5, 0.5)):
+        lifted = body + np.array([0, height, 0], np.float32)
+        lifted[310:] -= 5.0  # past what is shown
+        store = stored(lifted, captions=[["walks", "goes"]])
+        shown = motion(store, cast(Any, Raw()), store.clips[0])
+        assert len(shown.joints) == 300
+        assert shown.joints[..., 1].min() == pytest.approx(
+            lifted[:300, :, 1].min() if lowest else 0, abs=1e-5
+        )
+        assert shown.text == "walks · goes (the first 15 of 16 s)"
+    short = stored(body[:300], captions=[[]], action=1)
+    assert motion(short, cast(Any, Raw()), short.clips[0]).text == "run"
+
+
+def test_written_clips_have_different_captions_and_the_length_of_evaluations(tmp_path):
+    bodies = [np.random.default_rng(number).uniform(0, 1, (50, 22, 3)) for number in range(4)]
+    texts = [["walks", "goes"], ["walks", "goes"], ["walks"], []]
+    store = stored(*[body.astype(np.float32) for body in bodies], captions=texts, action=0)
+    write_clips(tmp_path / "out", store, cast(Any, Raw()), store.clips, 40)
+    files = sorted((tmp_path / "out").glob("*.npz"))
+    assert [file.name for file in files] == [f"motion_{n:03d}_clip_{n}.npz" for n in range(4)]
+    contents = [np.load(file) for file in files]
+    assert [str(content["text"]) for content in contents] == ["walks", "goes", "walks", "walk"]
+    assert {len(content["joints"]) for content in contents} == {40}
+    assert (str(contents[0]["clip"]), str(contents[0]["data"])) == ("clip/0", "f00d")
+
+
+def test_a_data_set_is_described_by_its_minutes_lengths_and_words(monkeypatch):
+    seen: dict[str, Any] = {}
+    monkeypatch.setattr(browse, "render", lambda _, **values: seen.update(values))
+    bodies = [np.zeros((frames, 22, 3), np.float32) for frames in (600, 1200, 900)]
+    texts = [["walks on", "walks on"], ["jumps"], []]
+    store = stored(*bodies, captions=texts, action=1)
+    describe(store)
+    # clips, minutes, frames (shortest, median, longest), captions, different ones, words of each
+    assert seen["rows"] == [["train", 3, "2.2", 600, "900", 1200, 3, 2, "1.7"]]
+    assert seen["actions"] == [("run", 3)]

@@ -26,8 +26,16 @@ from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.checkpoints.released import import_flame, import_mdm
+from flame_mdm.checkpoints.released import (
+    Released,
+    _flame_recipe,
+    _mdm_recipe,
+    import_flame,
+    import_mdm,
+)
 from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
+from flame_mdm.denoisers.flame import FLAME
+from flame_mdm.denoisers.mdm import MDMEncoder
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import sha256
@@ -598,6 +606,41 @@ def test_options_of_mfm(tmp_path, subtests):
             assert (model.config["denoiser"]["num_heads"], losses["joints"]) == (2, 1)
 
 
+def recipe_of(kind: str, cond_features: int = 512, **options: Any) -> dict[str, Any]:
+    """The recipe and the facts of a released model of text whose code had these options."""
+    network = Released(MDMEncoder, (263, 263, cond_features), {"latent_dim": 8}, {})
+    config, facts = _mdm_recipe(kind, network, Options(**options))
+    task = {name: config["task"][name] for name in ("guidance_scale", "num_inference_steps")}
+    task |= {"dropped": config["task"]["cond_drop_prob"], "longest": facts["max_frames"]}
+    return task | {"losses": config["losses"], "condition": config["condition"]["_target_"]}
+
+
+@pytest.mark.parametrize(("options", "expected"), [
+    ({}, {"guidance_scale": 2.5, "dropped": 0.1, "longest": 196, "num_inference_steps": 1000}),
+    ({"cond_mask_prob": 0.0}, {"guidance_scale": 1.0, "dropped": 0.0}),
+    ({"dataset": "kit"}, {"longest": 196}),
+    ({"dataset": "uestc"}, {"longest": 60}),
+    ({"dataset": "uestc", "num_frames": 40}, {"longest": 40}),
+    ({"dataset": "humanml", "num_frames": 40}, {"longest": 196}),
+    ({"context_len": 20, "pred_len": 40}, {"guidance_scale": 7.5, "longest": 60}),
+    ({"lambda_rcxyz": 1.0, "lambda_vel": 2.0, "lambda_fc": 3.0},
+     {"losses": {"joints": 1.0, "velocity": 2.0, "foot_contact": 3.0}}),
+])  # fmt: skip
+def test_released_models_of_mdm_are_sampled_as_by_their_authors(
+    options: dict[str, Any], expected: dict[str, Any]
+):
+    recipe = recipe_of("mdm", **options)
+    assert {name: recipe[name] for name in expected} == expected
+
+
+def test_the_released_model_of_flame_has_the_authors_guidance_and_length():
+    network = Released(FLAME, (135, 270, 1024), {"max_frames": 421}, {})
+    config, facts = _flame_recipe(network)
+    task = config["task"]
+    assert (task["guidance_scale"], task["cond_drop_prob"], facts["max_frames"]) == (8.0, 0.25, 420)
+    assert (config["condition"]["features"], config["optimizer"]["weight_decay"]) == (1024, 0.0)
+
+
 def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sampled_at_their_length(
     tmp_path,
 ):
@@ -724,6 +767,8 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, su
     assert main(["export", str(trained), str(half), "half=true"]) == 0
     assert half.stat().st_size < 0.6 * file.stat().st_size
     assert {value.dtype for value in load_file(half).values() if value.ndim > 1} == {torch.float16}
+    vectors = {n: v for n, v in load_file(half).items() if v.ndim == 1 and v.is_floating_point()}
+    assert {value.dtype for value in vectors.values()} == {torch.float32}, "statistics are exact"
     torch.testing.assert_close(load(half).state_dict(), before.state_dict(), atol=1e-3, rtol=1e-3)
     assert model_files.read_model_file(half)["origin"]["half_precision"]
 

@@ -13,6 +13,7 @@ from support.runs import TINY, inputs_of, untrained
 
 import flame_mdm
 from flame_mdm.__main__ import main
+from flame_mdm.commands.edit import EditSettings, origin
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
@@ -428,3 +429,17 @@ def test_the_command_writes_the_original_beside_the_edits(trained, store, tmp_pa
     # what was written can be edited again
     again = flame_mdm.edit(flame_mdm.load(trained), out / "motion_001.npz", region="in_between")[0]
     assert again.feature_error == 0
+
+
+READINGS: list[dict[str, Any]] = [
+    {"motion": "b.bvh"}, {"cut": [0, 1]}, {"fps": 30.0}, {"unit": 0.01}, {"up": "z"}, {"animation": "walk"},
+    {"adapter": ["a.safetensors"]}, {"adapter_strength": 0.5},
+]  # fmt: skip
+
+
+def test_edits_of_a_file_that_is_read_differently_have_different_folders():
+    def keys(**changes: Any) -> str:
+        return repr(origin(EditSettings(**{"ckpt": "x", "motion": "a.bvh"} | changes)))
+
+    assert len({keys(), *(keys(**changes) for changes in READINGS)}) == 1 + len(READINGS)
+    assert keys(seed=1) == keys(samples=5) == keys()

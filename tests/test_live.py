@@ -253,3 +253,49 @@ def test_a_stream_ends_after_two_minutes_without_a_request_and_after_an_hour(mod
     with pytest.raises(AttributeError):  # it goes on
         live.block(name, WALK, 72_000)
     live._streams[name].stream = stream
+
+
+def test_the_guard_reads_bodies_and_paths_up_to_its_limits():
+    testing = pytest.importorskip("starlette.testclient", reason="starlette is not installed")
+    from starlette.responses import PlainTextResponse
+
+    from flame_mdm.demo.guard import Guard
+
+    app: Any = PlainTextResponse("read")
+    headers = {"Content-Type": "application/json"}
+    with testing.TestClient(
+        Guard(app, ("Demo.example", "1.2.3.4"), {}, bool), "http://localhost"
+    ) as client:
+        for size, status in ((64 * 1024, 400), (64 * 1024 + 1, 413)):
+            assert client.post("/live", content=b"x" * size, headers=headers).status_code == status
+        for length, status in ((200, 200), (201, 404)):
+            assert client.get("/assets/" + "a" * (length - 8)).status_code == status
+        assert client.post("/live", content=b"{}").status_code == 415
+        assert client.get("/assets/a", headers={"Host": "demo.example:80"}).status_code == 200
+        assert client.get("/assets/a", headers={"Host": "other.example"}).status_code == 421
+        assert client.get("/assets/a", headers={"Host": "9.9.9.9"}).status_code == 200
+        called = {"data": ["x"], "fn_index": 3, "session_hash": "s"}
+        assert client.post("/gradio_api/queue/join", json=called).status_code == 400
+        answer = client.get("/assets/a")
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert "frame-ancestors 'self'" in answer.headers["content-security-policy"]
+
+
+def test_a_function_of_the_page_is_called_at_its_own_address_with_its_own_arguments():
+    testing = pytest.importorskip("starlette.testclient", reason="starlette is not installed")
+    from starlette.responses import PlainTextResponse
+
+    from flame_mdm.demo.guard import Guard
+
+    app: Any = PlainTextResponse("called")
+    queue = "/gradio_api/queue/join"
+    calls: Any = {3: (queue, lambda data: data == ["x"])}
+    call = {"data": ["x"], "fn_index": 3, "session_hash": "s"}
+    opened = Guard(app, (), calls, lambda session: session == "s")
+    with testing.TestClient(opened, "http://localhost") as client:
+        assert client.post(queue, json=call).text == "called"
+        assert client.post("/gradio_api/run/predict", json=call).status_code == 400
+        for change in ({"fn_index": 4}, {"data": ["y"]}, {"data": []}, {"session_hash": "a b"}):
+            assert client.post(queue, json=call | change).status_code == 400, change
+        stream = "/gradio_api/queue/data?session_hash="
+        assert [client.get(stream + name).status_code for name in ("s", "t")] == [200, 404]

@@ -1,7 +1,9 @@
 """The referee: claims of sentences, measurements, verdicts, and what changes none of them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from html import unescape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +15,25 @@ import flame_mdm
 from evaluators.metrics.claims import ClaimAccuracy
 from evaluators.perturbations import drop_repetition
 from flame_mdm.__main__ import main
+from flame_mdm.data.synthetic import example
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.generation import best
+from flame_mdm.sampling.referee import kinds
+from flame_mdm.sampling.referee.body import Body
 from flame_mdm.sampling.referee.claims import Claim, falsified
-from flame_mdm.sampling.referee.judging import claim_score, verdicts
-from flame_mdm.sampling.referee.kinds import KINDS, band, group_of, thresholds
+from flame_mdm.sampling.referee.judging import END, claim_score, decide, verdicts
+from flame_mdm.sampling.referee.kinds import KINDS, Kind, band, group_of, thresholds
+from flame_mdm.sampling.referee.readings import (
+    Reading,
+    counted,
+    cycles,
+    held,
+    of_side,
+    spans_of,
+)
 from flame_mdm.sampling.referee.sentences import read_claims
 from flame_mdm.seeds import key
 
@@ -473,3 +486,202 @@ def test_a_folder_is_judged_by_the_texts_in_its_files(tmp_path, capsys, monkeypa
     captured = capsys.readouterr()
     assert "a: 'a person raises the left arm'" in captured.out
     assert "b: text is missing" in captured.err
+
+
+ACTIONS: list[dict[str, str | int]] = [
+    {"action": "walk", "direction": "forward", "speed": "slow"},
+    {"action": "walk", "direction": "clockwise"},
+    {"action": "run", "direction": "forward"},
+    {"action": "turn", "direction": "right", "amount": "half"},
+    {"action": "jump", "count": 2},
+    {"action": "hop", "side": "left"},
+    {"action": "kick", "side": "right", "count": 2},
+    {"action": "clap", "count": 3},
+    {"action": "push-ups"},
+    {"action": "sit"},
+    {"action": "lie"},
+    {"action": "crawl", "direction": "forward"},
+    {"action": "raise", "side": "both"},
+    {"action": "stand"},
+]
+WAYS = ("left", "right", "forward", "backward", "clockwise", "counterclockwise")
+MEASURED = Path(__file__).parent / "golden" / "referee.npz"
+
+
+def variants() -> list[Claim]:
+    """Claims of each kind, with the sides, directions, speeds, amounts, ends and durations that they may have."""
+    listed = []
+    for name, kind in KINDS.items():
+        if name.startswith("use "):
+            listed += [Claim(name, side=side) for side in ("left", "right")]
+        elif name == "pace":
+            listed += [Claim(name, speed=speed) for speed in ("slow", "fast")]
+        elif name in ("lean", "veer"):
+            listed += [Claim(name, direction=way) for way in ("left", "right")]
+        elif name == "turn angle":
+            listed += [Claim(name, amount=amount) for amount in (90, 180)]
+        elif kind.group == "count":
+            listed += [Claim(name, amount=2), Claim(name)]
+        else:
+            listed += [Claim(name), Claim(name, when="end"), Claim(name, seconds=2)]
+        if kind.group == "contact" or name in ("kick", "strike"):
+            listed += [Claim(name, side=side) for side in ("left", "both")]
+        if name in ("count kicks", "count punches", "count raises"):
+            listed.append(Claim(name, side="right", amount=2))
+    listed += [Claim("count raises", side="both", amount=1)]
+    listed += [Claim("travel", direction=way) for way in WAYS[:4]]
+    listed += [Claim(name, direction=way) for name in ("turn", "circle") for way in WAYS[::5]]
+    pairs = (
+        ("walk", "turn"),
+        ("sit", "walk"),
+        ("get down", "stand up"),
+        ("raise hand", "hand down"),
+    )
+    return listed + [Claim("order", parts=(Claim(a), Claim(b))) for a, b in pairs]
+
+
+def measured() -> dict[str, np.ndarray]:
+    """Score, number, times of the evidence, and answers for all claims about motions of the synthetic set."""
+    rows, texts = [], []
+    for attributes in ACTIONS:
+        joints = example(attributes)
+        for verdict in verdicts(joints, FPS, variants()):
+            reading = verdict.reading
+            times = np.sum(reading.spans, axis=0) if reading.spans else np.zeros(2)
+            rows.append([reading.score, reading.number, *times])
+            texts.append(f"{verdict.answer}; {reading.joint}; {reading.unit}; {reading.unclear}")
+    return {"numbers": np.array(rows, np.float32), "texts": np.array(texts)}
+
+
+def test_measurements_are_those_for_which_the_thresholds_were_calibrated():
+    kept, now = np.load(MEASURED), measured()
+    claims = [str(claim) for claim in variants()] * len(ACTIONS)
+    changed = [claims[row] for row in np.flatnonzero(kept["texts"] != now["texts"])]
+    assert changed == [], "calibrate again, then: python tests/test_referee.py"
+    for column, tolerance in enumerate((1e-3, 1e-3, 0.08, 0.08)):
+        now_, kept_ = now["numbers"][:, column], kept["numbers"][:, column]
+        np.testing.assert_allclose(now_, kept_, rtol=1e-3, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("score", "answer"), [(0.25, "no"), (0.26, "cannot tell"), (0.69, "cannot tell"), (0.7, "yes")]
+)
+def test_the_ends_of_a_band_are_decided(score: float, answer: str, monkeypatch):
+    def measure(body: Body, claim: Claim) -> Reading:
+        return Reading(score, score, "m", unclear=unclear)
+
+    unclear = ""
+    still = Body(example({"action": "stand"}), FPS)
+    monkeypatch.setitem(KINDS, "walk", replace(KINDS["walk"], measure=measure))
+    monkeypatch.setattr(kinds, "thresholds", lambda: {"walk": {"no": 0.25, "yes": 0.7}})
+    assert decide(still, Claim("walk")).answer == answer
+    unclear = "it also does something else"
+    assert decide(still, Claim("walk")).answer == {"yes": "cannot tell"}.get(answer, answer)
+
+
+def test_a_body_is_scaled_to_legs_of_eighty_centimeters_and_measured_at_thirty_frames():
+    joints = example({"action": "walk", "direction": "forward"})
+    small, large = Body(joints, 20.0), Body(1.7 * joints, 20.0)
+    np.testing.assert_allclose(small.joints, large.joints, atol=1e-9)
+    legs = [np.linalg.norm(small.joints[:, b] - small.joints[:, a], axis=-1) for a, b in ((1, 4), (4, 7))]  # fmt: skip
+    assert np.median(np.sum(legs, axis=0)) == pytest.approx(0.8, abs=0.005)
+    assert (len(small), small.seconds) == (89, 89 / 30)
+    assert small.velocity[:, 1].max() == pytest.approx(small.speed.max(), rel=0.05)
+
+
+def test_spans_shorter_than_asked_are_left_out_and_a_value_is_held_in_total():
+    flags = np.zeros(60, bool)
+    flags[[*range(6), *range(20, 29), 59]] = True
+    assert spans_of(flags) == ((0, 0.2), (20 / 30, 29 / 30), (59 / 30, 2.0))
+    assert spans_of(flags, 0.2) == ((0, 0.2), (20 / 30, 29 / 30))
+    assert spans_of(flags, 0.21) == ((20 / 30, 29 / 30),)
+    signal = np.array([5.0, 1, 4, 3, 2, 0])
+    assert [held(signal, seconds) for seconds in (0.0, 0.1, 0.2, 9)] == [5, 3, 0, 0]
+
+
+def test_repetitions_rise_and_fall_by_the_depth_and_cut_ones_may_count():
+    assert cycles(np.array([0, 1, 0, 0.5, 0, 1.2, 1.1, 0.0]), 0.6) == [1, 5]
+    assert cycles(np.array([1, 0, 1.0]), 0.6) == []
+    twice = np.array([0, 1, 0, 1, 0.0])
+    for amount, score in ((2, 0.0), (1, -1.0), (3, -1.0), (4, -2.0), (None, -1.0)):
+        assert counted(twice, (0.3, 0.6), amount, "foot", "kicks").score == score
+    low = np.array([0, 1, 0, 0.5, 0.0])
+    assert counted(low, (0.3, 0.6), 2, "foot", "kicks").score == -0.5
+    assert counted(low, (0.3, 0.6), 1, "foot", "kicks").score == -0.5
+    cut = np.array([1, 0, 1, 0.0])
+    assert counted(cut, (0.3, 0.6), 2, "foot", "kicks").score == -0.5
+    assert counted(cut, (0.3, 0.6), 3, "foot", "kicks").score == -1
+
+
+def test_the_margin_between_limbs_decides_whether_a_side_is_clear():
+    left, right = Reading(1.0, 1.0, "m", "left wrist"), Reading(0.75, 0.75, "m", "right wrist")
+    assert of_side([left, right], "left", 0.25).unclear == ""
+    assert of_side([left, right], "left", 0.26).unclear == "the right wrist does the same"
+    assert of_side([left, right], "right", 0.0).unclear == "the left wrist does the same"
+    assert of_side([left, right], "", 9).joint == "left wrist"
+    assert of_side([left, right], "both", 9) == replace(right, joint="both wrists")
+
+
+def measuring(monkeypatch: pytest.MonkeyPatch, **readings: Reading) -> Body:
+    """A body of 4 seconds, on which these kinds, true from 0.7 on and false up to 0.3, have these readings."""
+    for name, reading in readings.items():
+        kind = Kind("posture", lambda body, claim, reading=reading: reading, 0.3, 0.7)
+        monkeypatch.setitem(KINDS, name, kind)
+    monkeypatch.setattr(kinds, "thresholds", dict)
+    return Body(np.repeat(example({"action": "stand"})[:1], 121, axis=0), 30.0)
+
+
+@pytest.mark.parametrize(("first", "second", "answer", "later"), [
+    (((1, 2),), ((3, 4), (4.5, 5)), "yes", 3.5), (((1, 2), (5, 6)), ((3, 4), (4.5, 5)), "cannot tell", 3.5),
+    (((3, 4),), ((1, 2),), "no", -2), (((1, 2),), ((1.2, 2),), "cannot tell", 0.2),
+    (((1, 2), (3.3, 4)), ((3, 4),), "yes", 2), (((1, 2), (3.4, 4)), ((3, 4),), "cannot tell", 2),
+    (((1, 2),), (), "cannot tell", 0),
+])  # fmt: skip
+def test_an_order_is_the_longest_time_between_its_parts_and_unclear_if_it_also_goes_back(
+    first: Any, second: Any, answer: str, later: float, monkeypatch
+):
+    still = measuring(
+        monkeypatch, a=Reading(1.0, 1, "m", spans=first), b=Reading(1.0, 1, "m", spans=second)
+    )
+    verdict = decide(still, Claim("order", parts=(Claim("a"), Claim("b"))))
+    assert (verdict.answer, verdict.reading.number) == (answer, pytest.approx(later))
+    if second and answer == "yes":
+        assert verdict.reading.spans == (first[0], max(second))
+
+
+@pytest.mark.parametrize(("gap", "claimed", "answer", "lasting"), [
+    (15, 2, "yes", 2.5), (16, 2, "no", 1.0), (15, 3, "yes", 2.5), (15, 4, "cannot tell", 2.5), (15, 5, "no", 2.5),
+])  # fmt: skip
+def test_a_duration_spans_breaks_of_half_a_second(
+    gap: int, claimed: int, answer: str, lasting: float, monkeypatch
+):
+    signal = np.zeros(121)
+    signal[5:35] = signal[35 + gap : 65 + gap] = 0.5  # the middle of the band
+    signal[110:112] = 1.0  # too short
+    still = measuring(monkeypatch, a=Reading(1.0, 1, "m", signal=signal))
+    verdict = decide(still, Claim("a", seconds=claimed))
+    assert (verdict.answer, verdict.reading.number) == (answer, pytest.approx(lasting))
+
+
+@pytest.mark.parametrize("when", ["start", "end"])
+@pytest.mark.parametrize(
+    ("frames", "others", "answer"),
+    [(6, 0, "yes"), (5, 0, "no"), (6, 6, "cannot tell"), (6, 5, "yes")],
+)
+def test_a_posture_at_an_end_is_held_there_and_not_at_the_other_end(
+    when: str, frames: int, others: int, answer: str, monkeypatch
+):
+    signal = np.zeros(121)
+    signal[:frames], signal[121 - others :] = 0.8, 0.5
+    signal[60] = 0.8
+    signal = signal if when == "start" else signal[::-1]
+    still = measuring(monkeypatch, a=Reading(1.0, 1, "m", signal=signal))
+    verdict = decide(still, Claim("a", when=when))
+    assert verdict.answer == answer
+    begin, end = verdict.reading.spans[0]
+    assert end - begin == pytest.approx(END)
+    assert (begin == 0) == (when == "start")
+
+
+if __name__ == "__main__":
+    np.savez_compressed(MEASURED, **measured())

@@ -69,11 +69,8 @@ def main(settings: EditSettings) -> None:
     say(*degenerate_notes(edits))
 
     title = f"edit {Path(original.id).stem} {edits[0].text}"
-    general = (settings.motion, settings.cut, settings.adapter, settings.adapter_strength)
-    folder = Path(
-        settings.out
-        or default_folder(model, title, model.sha256, replace(request, samples=1), *general)
-    )
+    general = (model.sha256, replace(request, samples=1), *origin(settings))
+    folder = Path(settings.out or default_folder(model, title, *general))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": model.sha256, "keep": edits[0].keep}
     write_motions(
@@ -98,3 +95,12 @@ def main(settings: EditSettings) -> None:
             "a kept part that follows a generated part begins where the generated part ends, so its "
             "position in the world may differ"
         )
+
+
+def origin(settings: EditSettings) -> tuple[object, ...]:
+    """Returns the keys that determine, with the request, which motion is edited by which model.
+
+    Edits with other keys are written to another folder.
+    """
+    reading = (settings.fps, settings.unit, settings.up, settings.animation)
+    return settings.motion, settings.cut, reading, settings.adapter, settings.adapter_strength

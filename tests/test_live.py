@@ -257,11 +257,13 @@ def test_a_stream_ends_after_two_minutes_without_a_request_and_after_an_hour(mod
 
 def test_the_guard_reads_bodies_and_paths_up_to_its_limits():
     testing = pytest.importorskip("starlette.testclient", reason="starlette is not installed")
+    from starlette.applications import Starlette
     from starlette.responses import PlainTextResponse
+    from starlette.routing import Mount
 
     from flame_mdm.demo.guard import Guard
 
-    app: Any = PlainTextResponse("read")
+    app = Starlette(routes=[Mount("/", PlainTextResponse("read"))])
     headers = {"Content-Type": "application/json"}
     with testing.TestClient(
         Guard(app, ("Demo.example", "1.2.3.4"), {}, bool), "http://localhost"
@@ -283,11 +285,13 @@ def test_the_guard_reads_bodies_and_paths_up_to_its_limits():
 
 def test_a_function_of_the_page_is_called_at_its_own_address_with_its_own_arguments():
     testing = pytest.importorskip("starlette.testclient", reason="starlette is not installed")
+    from starlette.applications import Starlette
     from starlette.responses import PlainTextResponse
+    from starlette.routing import Mount
 
     from flame_mdm.demo.guard import Guard
 
-    app: Any = PlainTextResponse("called")
+    app = Starlette(routes=[Mount("/", PlainTextResponse("called"))])
     queue = "/gradio_api/queue/join"
     calls: Any = {3: (queue, lambda data: data == ["x"])}
     call = {"data": ["x"], "fn_index": 3, "session_hash": "s"}

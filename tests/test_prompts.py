@@ -7,7 +7,7 @@ from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,10 +19,12 @@ import flame_mdm
 from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.locating import find
+from flame_mdm.commands.sample import _distance
 from flame_mdm.conditions.vocabulary import advice, check_known
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
 from flame_mdm.safe_io import read_package_yaml, sha256
+from flame_mdm.sampling import targets
 from flame_mdm.sampling.output import default_folder
 
 SENTENCES = read_package_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
@@ -289,3 +291,10 @@ def test_any_word_of_a_model_may_be_suggested(word):
     (line,) = advice("a person kickzx", facts)
     suggestion = f" Did you mean 'a person {word}'?" if word else ""
     assert line == f"never seen in training: kickzx.{suggestion}"
+
+
+def test_distances_from_targets_are_printed_in_centimeters_over_all_motions(monkeypatch):
+    distances = iter([[0.01, 0.02], [0.123]])
+    monkeypatch.setattr(targets, "errors", lambda *_: np.array(next(distances)))
+    line = _distance(cast(Any, None), cast(Any, [None, None]))
+    assert line == "distance from the targets: mean 5.1 cm, max 12.3 cm"

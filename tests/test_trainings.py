@@ -1,15 +1,19 @@
 """Trainings of a benchmark side by side."""
 
+from copy import deepcopy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
 import torch
+from support.fixtures import recipe
 from support.runs import TINY
 
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import trainings
 from flame_mdm.commands.benchmark import BenchmarkSettings, check, main
+from flame_mdm.commands.distill import DistillSettings, student_recipe
 from flame_mdm.commands.trainings import Training, plan, run_trainings
 from flame_mdm.config import EXPERIMENTS
 from flame_mdm.errors import UserError
@@ -152,3 +156,25 @@ def test_values_of_a_benchmark_are_within_their_ranges(value: float | None, righ
     assert of_mdm == f"MDM: FID {measured}, expected 0.1 to 0.3"
     assert of_mfm == "MFM: FID not measured, expected 0.1 to 0.3"
     assert (is_within, unmeasured) == (right, False)
+
+
+@pytest.mark.parametrize(("trained", "steps", "interval"), [(1003, 201, 50), (12, 2, 2), (2, 1, 1)])
+def test_a_student_trains_a_fifth_of_the_steps_at_a_tenth_of_the_rate(
+    trained: int, steps: int, interval: int, monkeypatch, tmp_path
+):
+    config = deepcopy(recipe("quickstart"))
+    config["trainer"]["val_check_interval"], config["optimizer"]["lr"] = 50, 0.003
+    config["callbacks"]["samples"]["every_n_steps"] = 70
+    teacher = SimpleNamespace(config=config, steps=trained)
+    monkeypatch.setattr("flame_mdm.training.distillation.read_teacher", lambda file: teacher)
+    monkeypatch.setenv("FLAME_MDM_DATA", "elsewhere")
+    (tmp_path / "last.ckpt").touch()
+    student: Any = student_recipe(DistillSettings(ckpt=str(tmp_path / "last.ckpt")))
+    trainer = student["trainer"]
+    assert (trainer["max_steps"], trainer["val_check_interval"]) == (steps, interval)
+    assert student["optimizer"]["lr"] == pytest.approx(0.0003)
+    assert student["callbacks"]["samples"]["every_n_steps"] == min(70, steps)
+    name = f"{config['experiment']}_distilled"
+    assert (student["experiment"], student["run"]["dir"]) == (name, f"runs/{name}/default")
+    assert (student["data_root"], student["data"]["root"]) == ("elsewhere", "elsewhere")
+    assert student["distillation"]["teacher"] == str(tmp_path / "last.ckpt")

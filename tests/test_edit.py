@@ -439,7 +439,8 @@ READINGS: list[dict[str, Any]] = [
 
 def test_edits_of_a_file_that_is_read_differently_have_different_folders():
     def keys(**changes: Any) -> str:
-        return repr(origin(EditSettings(**{"ckpt": "x", "motion": "a.bvh"} | changes)))
+        settings: dict[str, Any] = {"ckpt": "x", "motion": "a.bvh", **changes}
+        return repr(origin(EditSettings(**settings)))
 
     assert len({keys(), *(keys(**changes) for changes in READINGS)}) == 1 + len(READINGS)
     assert keys(seed=1) == keys(samples=5) == keys()

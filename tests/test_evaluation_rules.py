@@ -277,14 +277,8 @@ def test_a_static_baseline_holds_the_first_pose():
 
 
 def protocol_of(**options: Any) -> Protocol:
-    return Protocol(
-        name="p",
-        version=1,
-        condition="text",
-        extractor=None,
-        metrics={},
-        **{"replications": 20} | options,
-    )
+    parts: dict[str, Any] = {"name": "p", "version": 1, "condition": "text", "extractor": None}
+    return Protocol(**parts | {"metrics": {}, "replications": 20} | options)
 
 
 SEVERAL = {"prompts": 10, "samples": 30, "replications": 5, "metrics": {}}

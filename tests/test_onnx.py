@@ -208,7 +208,8 @@ def test_noise_of_the_runner_depends_on_prompt_sample_and_seed() -> None:
     passes = {"steps": [[0, 0, 0, 1, 0, 0, 0]]}  # the last step keeps the noise
     first = sampler_without_graphs(**passes).generate("a")
     np.testing.assert_array_equal(sampler_without_graphs(**passes).generate("a"), first)
-    for others in ({"prompt": "b"}, {"sample": 1}, {"seed": 1}):
+    changes: list[dict[str, Any]] = [{"prompt": "b"}, {"sample": 1}, {"seed": 1}]
+    for others in changes:
         other = sampler_without_graphs(**passes).generate(**{"prompt": "a"} | others)
         assert np.abs(other - first).max() > 0.5, others
     expected = seeded_noise(["a#0"], 60, 10, seed=0, replication=0, like=torch.zeros(1))(0)

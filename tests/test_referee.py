@@ -16,6 +16,7 @@ from evaluators.metrics.claims import ClaimAccuracy
 from evaluators.perturbations import drop_repetition
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import example
+from flame_mdm.data.synthetic_motions.body import Attributes
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample
@@ -488,7 +489,7 @@ def test_a_folder_is_judged_by_the_texts_in_its_files(tmp_path, capsys, monkeypa
     assert "b: text is missing" in captured.err
 
 
-ACTIONS: list[dict[str, str | int]] = [
+ACTIONS: list[Attributes] = [
     {"action": "walk", "direction": "forward", "speed": "slow"},
     {"action": "walk", "direction": "clockwise"},
     {"action": "run", "direction": "forward"},
@@ -684,4 +685,4 @@ def test_a_posture_at_an_end_is_held_there_and_not_at_the_other_end(
 
 
 if __name__ == "__main__":
-    np.savez_compressed(MEASURED, **measured())
+    np.savez_compressed(MEASURED, allow_pickle=False, **measured())

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -432,9 +432,9 @@ def test_checks_have_the_limits_that_their_docstrings_state(
 
 @pytest.mark.parametrize(("apart", "high", "count"), [(0.46, 0.11, 1), (0.44, 0.11, 0), (0.46, 0.09, 0)])  # fmt: skip
 def test_jumping_jacks_spread_the_feet_while_the_hands_rise(apart: float, high: float, count: int):
-    feet = {"left_ankle": during(10, (0.05, 0.08, 0), (apart - 0.05, 0.08, 0))}
+    feet: dict[str, Any] = {"left_ankle": during(10, (0.05, 0.08, 0), (apart - 0.05, 0.08, 0))}
     feet |= {"right_ankle": (-0.05, 0.08, 0.0)}
-    hands = {f"{side}_wrist": (0.2, 1.4 + high, 0.0) for side in ("left", "right")}
+    hands: dict[str, Any] = {f"{side}_wrist": (0.2, 1.4 + high, 0.0) for side in ("left", "right")}
     shown = check("jumping jacks", standing_view(**feet, **hands))
     assert shown.get("count", 0) == count
 
@@ -460,7 +460,7 @@ def test_a_slash_goes_down_and_inward_within_half_a_second(
     wrist[2, 1] = 1.4 + above
     wrist[2 + frames :] = sign * (0.2 - inward), 1.39, 0.0
     expected = {"action": "slash", "side": side} if slashes else {}
-    assert check("slash", standing_view(**{f"{side}_wrist": wrist})) == expected
+    assert check("slash", standing_view(**cast(Any, {f"{side}_wrist": wrist}))) == expected
 
 
 def test_a_rise_counts_after_the_signal_was_low():

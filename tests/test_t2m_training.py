@@ -222,7 +222,7 @@ def test_terms_of_the_movements_are_means_over_real_frames_and_whole_units():
     x = torch.randn(2, 14, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     network: Any = SimpleNamespace(used=3, movement_encoder=Quarter())
     terms = reconstruction_terms(
-        network, lambda latents: latents.repeat_interleave(4, 1), batch_of(x, [14, 7])
+        network, cast(Any, lambda latents: latents.repeat_interleave(4, 1)), batch_of(x, [14, 7])
     )
     for row, frames, units in ((0, 12, 3), (1, 7, 1)):
         real = x[row, :, :3]

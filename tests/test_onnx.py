@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from unittest.mock import patch
 
 import numpy as np
@@ -210,7 +210,7 @@ def test_noise_of_the_runner_depends_on_prompt_sample_and_seed() -> None:
     np.testing.assert_array_equal(sampler_without_graphs(**passes).generate("a"), first)
     changes: list[dict[str, Any]] = [{"prompt": "b"}, {"sample": 1}, {"seed": 1}]
     for others in changes:
-        other = sampler_without_graphs(**passes).generate(**{"prompt": "a"} | others)
+        other = sampler_without_graphs(**passes).generate(**cast(Any, {"prompt": "a"} | others))
         assert np.abs(other - first).max() > 0.5, others
     expected = seeded_noise(["a#0"], 60, 10, seed=0, replication=0, like=torch.zeros(1))(0)
     np.testing.assert_allclose(first, expected[0].numpy(), atol=2e-6)

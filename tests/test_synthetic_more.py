@@ -66,7 +66,7 @@ def test_the_clips_of_the_core_do_not_change():
 @pytest.mark.parametrize("source", [Synthetic, SyntheticSequences])
 def test_a_share_of_the_clips_shows_the_actions_that_are_drawn_often(source):
     often = ("nod", "spin")
-    more = {} if source is SyntheticSequences else {"actions": "all"}
+    more: dict[str, Any] = {} if source is SyntheticSequences else {"actions": "all"}
     data = source(300, often=often, often_share=0.6, **more)
     rng = np.random.default_rng(0)
     drawn = [data.attributes(rng)["action"] for _ in range(1000)]

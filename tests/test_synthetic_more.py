@@ -149,11 +149,13 @@ def test_the_clips_of_all_actions_do_not_change():
 
 def test_a_share_of_the_clips_shows_actions_of_the_core():
     few = Synthetic(400, workers=1, actions="all", core_share=0.5)
-    actions = [few.actions[few.clip(k, 10).action or 0] for k in range(400)]
-    share = sum(action in CORE for action in actions) / 400
     without = Synthetic(400, workers=1, actions="all")
-    plain = sum(without.actions[without.clip(k, 10).action or 0] in CORE for k in range(400)) / 400
-    assert share == pytest.approx(0.5 + 0.5 * plain, abs=0.06)
+
+    def share(source: Synthetic) -> float:
+        rng = np.random.default_rng(0)
+        return sum(source.attributes(rng)["action"] in CORE for _ in range(1000)) / 1000
+
+    assert share(few) == pytest.approx(0.5 + 0.5 * share(without), abs=0.05)
     assert few.options["core_share"] == 0.5
     assert "core_share" not in without.options
     with pytest.raises(

@@ -16,6 +16,9 @@ from flame_mdm.batch import Edit
 from flame_mdm.processes.schedules import Schedule
 from flame_mdm.sampler_options import SamplerOptions
 
+# Relative and absolute tolerance of adaptive samplers, as in MFM
+TOLERANCE = 1e-5
+
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
 """Signature: (x_t (B, F, D), step i) -> clean estimate (B, F, D), log-variance of x_{t-1}.
 
@@ -366,7 +369,9 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     ends = torch.tensor([t, end], dtype=x.dtype, device=x.device)
     from torchdiffeq import odeint  # imported here because it imports much of scipy
 
-    path = odeint(lambda t, y: run.velocity(y, t), x, ends, rtol=1e-5, atol=1e-5, method="dopri5")
+    path = odeint(
+        lambda t, y: run.velocity(y, t), x, ends, rtol=TOLERANCE, atol=TOLERANCE, method="dopri5"
+    )
     assert isinstance(path, Tensor)
     return path[-1]
 

@@ -284,7 +284,7 @@ def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
     assert result.features.shape == motion.features.shape
     assert {x_t.shape[1] for x_t, *_ in seen} == {60}
     beyond = seen[-1][0][:, len(motion.features) :]  # the kept zeros with the noise of step 1
-    assert beyond.std() < seen[0][0].std()
+    assert beyond.std() < 0.3 * seen[0][0].std()
     assert beyond.mean().abs() < 0.1
 
 

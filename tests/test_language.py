@@ -267,3 +267,9 @@ def test_abilities_are_read_from_the_facts_of_a_model():
 )
 def test_next_to_a_thing_is_a_place_and_next_alone_a_time(text: str, count: int):
     assert len(understand(text).steps) == count
+
+
+@pytest.mark.parametrize("text", ["three squats", "three slow squats", "three big slow squats"])
+def test_words_between_a_number_and_its_action_do_not_hide_the_count(text: str):
+    (mention,) = understand(text).mentions
+    assert (mention.action, mention.attributes["count"]) == ("squat", 3)

@@ -342,6 +342,8 @@ def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():
     assert (values["top1"], values["top2"], values["proper"]) == (0, 1, 0.5)
     angles = torch.linspace(0, math.pi / 2, 5)
     assert dissimilar(torch.stack([angles.cos(), angles.sin()], 1)) == [0, 4]
+    angles = torch.linspace(0, math.pi / 2, 7)
+    assert dissimilar(torch.stack([angles.cos(), angles.sin()], 1)) == [0, 6, 3]
 
 
 def test_equal_captions_count_as_correct_and_the_classic_value_stays():

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_type_hints
+from typing import Any, cast, get_type_hints
 from unittest.mock import patch
 
 import numpy as np
@@ -440,3 +440,18 @@ def test_keys_that_do_not_fit_the_output_are_refused(words, message, tmp_path, m
     request = [f"text={TEXT}", "seconds=1", "num_inference_steps=2"]
     assert message in error_of(capsys, "sample", "quickstart", *request, *options, *out)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_frame_with_two_faults_counts_once_when_candidates_are_compared(monkeypatch):
+    faults = {"overlapping": [(0, 10), (2, 12)], "long": [(0, 14)], "apart": [(0, 8), (20, 28)]}
+    monkeypatch.setattr(
+        "flame_mdm.sampling.generation.find_faults",
+        lambda name: [SimpleNamespace(start=start, end=end) for start, end in faults[name]],
+    )
+    assert best(cast(Any, ["long", "apart", "overlapping"])) == "overlapping"
+
+
+def test_an_option_that_is_zero_replaces_the_value_of_the_recipe():
+    recipe = SamplerOptions(guidance_scale=2.5, sampler="ddim", eta=0.7)
+    chosen = SamplerOptions(guidance_scale=0, eta=0).over(recipe).chosen()
+    assert chosen == {"guidance_scale": 0, "sampler": "ddim", "eta": 0}

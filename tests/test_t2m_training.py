@@ -272,3 +272,23 @@ def test_words_are_learned_from_captions_without_tags(words, tmp_path):
     assert text.lengths.tolist() == [4, 22]
     assert torch.equal(text.vectors[1, 1], text.vectors[1, 20])
     assert not text.parts.any()
+
+
+def test_the_wrong_motions_of_a_text_are_those_that_it_does_not_describe(monkeypatch):
+    seen = []
+
+    def loss(motion: Any, text: Any, margin: float, fits: torch.Tensor) -> torch.Tensor:
+        seen.append(fits.tolist())
+        return torch.zeros(())
+
+    monkeypatch.setattr("evaluators.extractors.t2m_training.matching_loss", loss)
+    captions = {"first": {"walks", "runs"}, "second": {"runs"}, "third": {"hops"}}
+    task: Any = SimpleNamespace(
+        network=SimpleNamespace(movement_encoder=torch.nn.Identity()),
+        tokens=captions, margin=1.0, device="cpu", _learns_movement=False,
+        _embed=lambda batch: (None, None), seed_step=lambda _: None, report=lambda _: None, _idle=list,
+    )  # fmt: skip
+    batch: Any = SimpleNamespace(ids=["first", "second", "third"], text=["walks", "runs", "hops"])
+    T2MTask.training_step(task, batch, 0)
+    rows = [[True, False, False], [True, True, False], [False, False, True]]
+    assert seen == [rows], "rows are texts, columns are motions"

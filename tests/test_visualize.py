@@ -257,6 +257,7 @@ def test_a_thumbnail_shows_the_pose_farthest_from_the_first(monkeypatch):
     motion.joints[:, :, 0] += np.arange(5)[:, None]
     motion.joints[2, 20] += 0.5
     motion.joints[3, 20:22] += 0.3
+    motion.joints[4, :, 1] -= 0.2  # a body that is lower has a different pose
 
     def draw(motion: Figure, body: Any, frame: int, size: int) -> Image.Image:
         shown.append(frame)
@@ -264,7 +265,7 @@ def test_a_thumbnail_shows_the_pose_farthest_from_the_first(monkeypatch):
 
     monkeypatch.setattr(render, "_figure", draw)
     image = Image.open(io.BytesIO(render.thumbnail(motion, 60)))
-    assert shown == [3]
+    assert shown == [4]
     assert (image.format, image.size) == ("WEBP", (42, 60))
 
 

@@ -24,6 +24,7 @@ from flame_mdm.formats.grounding import (
     jolt,
     pivot,
     planted,
+    planted_toes,
     repeated,
     slide,
 )
@@ -532,3 +533,13 @@ def test_in_three_the_clips_blend_without_sliding_feet(
                         frame["playing"],
                     )
     assert 4 < scene["place"][2] < 12
+
+
+def test_a_toe_is_planted_if_it_is_slow_before_or_after_a_frame():
+    joints = np.zeros((60, 22, 3))
+    stands = np.arange(60)
+    # The left toe stands from frame 20 to frame 39, and moves at 2 m/s before and after.
+    joints[:, 10, 2] = 0.1 * np.where(stands < 20, stands - 20, np.maximum(stands - 39, 0))
+    planted = planted_toes(joints, 20.0)
+    assert np.flatnonzero(planted[:, 0]).tolist() == list(range(20, 40))
+    assert planted[:, 1].all()

@@ -397,3 +397,18 @@ def test_windows_of_transitions_are_centered_at_the_first_frame_after_them(
     metric = TransitionJerk(20.0, window=10)
     metric.update(joints, torch.ones(1, 40, dtype=torch.bool), kept, torch.arange(1))
     assert (metric.compute()["peak"] > 0) == is_inside
+
+
+def test_kept_joints_count_as_end_effectors_only_in_frames_that_keep_a_part():
+    real = torch.zeros(1, 4, 22, 3)
+    joints = real.clone()
+    joints[0, :2] += torch.tensor([0.0, 0.5, 0.0])  # frames that keep all joints
+    joints[0, 2:] += torch.tensor([0.0, 0.2, 0.0])  # frames that keep the hands
+    kept = torch.zeros(1, 4, 22, dtype=torch.bool)
+    kept[0, :2] = True
+    kept[0, 2:, 20:] = True
+    metric = KimodoConstraints()
+    metric.update(joints, real, torch.ones(1, 4) > 0, kept, keys=torch.tensor([0]))
+    values = metric.compute()
+    assert values["fullbody_keyframe"] == pytest.approx(0.5)
+    assert values["end_effector"] == pytest.approx(0.2)

@@ -35,6 +35,7 @@ from flame_mdm.config import (
     sweeps,
     trust,
 )
+from flame_mdm.config.building import moved
 from flame_mdm.config.command_line import make_variables, read_settings, run
 from flame_mdm.config.jobs import run_jobs
 from flame_mdm.config.options import option
@@ -700,3 +701,10 @@ def test_training_names_the_devices_that_are_missing(
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     with pytest.raises(UserError, match=f"^{message}$") if message else nullcontext():
         check_devices({"accelerator": accelerator, "devices": devices})
+
+
+def test_paths_below_a_moved_folder_move_and_folders_with_similar_names_do_not():
+    folders = {"runs/x/default": "${run.dir}"}
+    node = {"a": "runs/x/default", "b": ["runs/x/default/c.ckpt"], "d": "runs/x/default/c.ckpt"}
+    node |= {"e": "runs/x/default2/c.ckpt", "f": "x/runs/x/default", "g": 3}
+    assert moved(node, folders) == node | {"a": "${run.dir}", "d": "${run.dir}/c.ckpt"}

@@ -489,6 +489,24 @@ def test_a_folder_is_judged_by_the_texts_in_its_files(tmp_path, capsys, monkeypa
     assert "b: text is missing" in captured.err
 
 
+def test_the_player_shows_the_motions_with_the_most_false_claims(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    texts = {
+        "no_claim": "a person",
+        "one_false": "a person raises the right hand",
+        "all_true": "a person raises the left hand",
+        "half_false": "a person raises the left hand and then raises the right hand twice",
+    }
+    for name, text in texts.items():
+        motion = raising("left")
+        motion.text = text
+        motion.save(f"motions/{name}.npz")
+    assert main(["judge", "motions", "page.html", "clips=2"]) == 3
+    capsys.readouterr()
+    worst = {motion["caption"] for motion in Page(tmp_path / "page.html").motions}
+    assert worst == {texts["one_false"], texts["half_false"]}
+
+
 ACTIONS: list[Attributes] = [
     {"action": "walk", "direction": "forward", "speed": "slow"},
     {"action": "walk", "direction": "clockwise"},

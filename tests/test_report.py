@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from wandb import Run
 
 from flame_mdm.__main__ import main
-from flame_mdm.records import Result
+from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import filled, interval, number, page, short
 from flame_mdm.reporting.plots import Histogram, Panel, _linear_axis, _log_axis, _tick, chart, svg
 from flame_mdm.reporting.report import charted, write_report
@@ -443,3 +443,11 @@ def test_a_page_names_the_number_of_motions_of_most_values():
     uneven = {"mean": 1.0, "ci": 0.1, "replications": 2, "n": None, "n_per_replication": [64, 5]}
     assert check_shape(result(values={"a": uneven}), Result).counts == "64 + 5"
     assert check_shape(result(values={"none": values["none"]}), Result).counts == ""
+
+
+@pytest.mark.parametrize(
+    ("resampled", "half"), [([1.0, 2.0, 3.0], 0.95), ([1.0, None, 3.0], None), ([], None)]
+)
+def test_a_value_that_some_draws_lack_has_no_interval(resampled, half):
+    value = Value(mean=2.0, ci=None, replications=1, n=3, resampled=resampled)
+    assert value.half == pytest.approx(half)

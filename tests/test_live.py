@@ -250,7 +250,7 @@ def test_a_stream_ends_after_two_minutes_without_a_request_and_after_an_hour(mod
     with pytest.raises(UserError, match="the limit of one hour"):
         live.block(name, WALK, 72_001)
     Late.frames = 72_000
-    with pytest.raises(AttributeError):  # it goes on
+    with pytest.raises(AttributeError, match="'Late' object"):  # the next block is requested
         live.block(name, WALK, 72_000)
     live._streams[name].stream = stream
 

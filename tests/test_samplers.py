@@ -468,8 +468,6 @@ def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler, subtest
 
 @pytest.mark.parametrize(("build", "sampler"), EVERY)
 def test_estimates_of_a_run_contain_the_kept_part_and_no_padding(build, sampler):
-    if build().samplers[sampler].adaptive:
-        pytest.skip("cannot keep a part")
     known, estimates = torch.full((2, 6, 3), -2.0), []
     keep, mask = half_kept(known), length_mask(torch.tensor([6, 3]))
     denoise = CountedDenoise(pulled)

@@ -43,8 +43,7 @@ Above 1.5 times this speed, the body follows its feet entirely.
 """
 # A hand begins to avoid the body this many seconds before it would enter the body
 CLEAR = 0.15
-# Depth in meters below the floor from which a toe is lifted. Toes of captured motions are within
-# this depth.
+# Depth in meters below the floor from which a toe is lifted
 DEEP = 0.01
 # Maximum distance from hip to ankle, relative to the straight leg, unless it was already longer
 REACH = 0.999
@@ -85,8 +84,8 @@ def cleanup(
 ) -> np.ndarray:
     """Removes pops, changes in bone lengths, foot sliding, toes below the floor, and hands inside the body.
 
-    The floor is at y = 0. If more than a tenth of the motion is below it, the floor is at the
-    lowest tenth of the toes' heights.
+    The floor is at y = 0, or lower if the lowest toe is below y = 0 in a tenth of the frames: then
+    it is the 10th percentile of the heights of the lowest toe.
 
     Args:
         joints: (F, J, 3) in meters, y up. Motions with fewer than 4 frames are returned unchanged.

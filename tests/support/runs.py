@@ -51,7 +51,7 @@ TINY = [
 ]
 """Overrides that make the quick-start experiment train in a second."""
 
-# SGD: Adam makes much of gradients that are 0 but for rounding.
+# With SGD: Adam scales gradients that are 0 except for rounding up to full steps.
 RUN = [
     "speed=reference",
     *(

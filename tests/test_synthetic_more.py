@@ -77,6 +77,11 @@ def test_a_share_of_the_clips_shows_the_actions_that_are_drawn_often(source):
     assert "often" not in source(1).options
 
 
+def test_an_action_outside_the_core_cannot_be_drawn_often_from_the_core():
+    with pytest.raises(UserError, match="often=idle: this action requires actions=all"):
+        Synthetic(1, often=["idle"], often_share=0.3)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -336,6 +336,8 @@ class Synthetic(MotionSource):
 
 def _check_often(often: Sequence[str], share: float, actions: Mapping[str, Action]) -> None:
     for name in often:
+        if name in ACTIONS.keys() - actions.keys():
+            raise UserError(f"synthetic: often={name}: this action requires actions=all")
         if name not in actions:
             raise UserError(
                 f"synthetic: often={name}: unknown action.{did_you_mean(name, list(actions))}"

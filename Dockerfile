@@ -1,8 +1,9 @@
-# Installs the versions in constraints.txt. Build and use: docs/clusters.md.
+# Installs the versions in constraints.txt and checks their hashes. Build and use: docs/clusters.md.
 #   docker build -t flame-mdm .
 #   docker build -t flame-mdm:cpu --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu .
-#   docker build -t flame-mdm --build-arg BASE=python:3.11-slim-bookworm@sha256:... .  (docker buildx imagetools inspect)
-ARG BASE=python:3.11-slim-bookworm
+# The digest is Python 3.11.16 for all platforms. For a newer base: docker buildx imagetools inspect python:3.11-slim-bookworm
+#   docker build -t flame-mdm --build-arg BASE=python:3.11-slim-bookworm@sha256:... .
+ARG BASE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 FROM $BASE
 
 # PyPI has torch for CUDA, which includes the CUDA libraries.
@@ -18,12 +19,13 @@ WORKDIR /flame_mdm
 COPY constraints.txt ./
 # The torch index contains other versions of unrelated packages, so only torch is installed from it. The packages that
 # torch needs are installed from PyPI below.
-RUN pip install --no-cache-dir --no-deps -c constraints.txt --index-url "$TORCH_INDEX" torch
+RUN pip install --no-cache-dir uv==0.13.9 \
+    && uv pip install --system --no-cache --no-deps -c constraints.txt --default-index "$TORCH_INDEX" torch
 COPY pyproject.toml README.md LICENSE ./
 COPY flame_mdm flame_mdm
 COPY evaluators evaluators
 COPY experiments experiments
-RUN pip install --no-cache-dir -c constraints.txt ".[offline,slurm]"
+RUN uv pip install --system --no-cache -c constraints.txt ".[offline,slurm]"
 
 # Data and runs are mounted; the container does not run as root.
 RUN useradd --create-home --uid 1000 researcher && mkdir /workspace && chown researcher /workspace

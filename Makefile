@@ -32,8 +32,8 @@ setup: $(READY) ## install into .venv
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -q --upgrade pip
-	$(VENV)/bin/python -m pip install -q --no-compile -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx,usd]'
+	$(VENV)/bin/python -m pip install -q --upgrade pip uv==0.13.9
+	$(VENV)/bin/python tools/install.py -e '.[dev,offline,video,demo,docs,onnx,usd]'
 	@$(VENV)/bin/python -m compileall -qq -j 0 -x '$(UNUSED)' $(VENV)/lib || true # on all cores; some packages hold files for other versions
 	@touch $@
 

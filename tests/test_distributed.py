@@ -12,7 +12,7 @@ from typing import cast
 
 import pytest
 import torch
-from support.fixtures import ROOT
+from support.fixtures import ROOT, script
 from support.refusals import one_error
 from support.runs import RUN, TWO, alarm, ended, finish, forked, free_port, reference, spawn
 from torchmetrics import MeanMetric
@@ -287,14 +287,40 @@ def assert_lints(program: str, *words: str | Path) -> None:
 
 def test_the_container_takes_torch_alone_from_its_index_and_any_base():
     text = (ROOT / "Dockerfile").read_text()
-    installed = [line for line in text.splitlines() if line.startswith("RUN pip install")]
+    installed = [line for line in text.splitlines() if "uv pip install" in line]
+    assert len(installed) == 2
     assert all("-c constraints.txt" in line for line in installed)
     (torch_alone,) = [line for line in installed if "TORCH_INDEX" in line]
     assert "--no-deps" in torch_alone
     assert torch_alone.endswith(" torch")
-    assert "FROM $BASE\n" in text, "a digest can be passed"
-    assert "@sha256:" in text, "and the file says how"
-    assert "pip install -q --upgrade pip" in (ROOT / "Makefile").read_text()
+    assert "FROM $BASE\n" in text, "another digest can be passed"
+    assert re.search(r"^ARG BASE=\S+@sha256:[0-9a-f]{64}$", text, re.M), "the base has a digest"
+    assert "pip install -q --upgrade pip uv==" in (ROOT / "Makefile").read_text()
+
+
+def test_every_package_but_torch_is_pinned_with_hashes():
+    packages = re.split(r"^(?=[A-Za-z])", (ROOT / "constraints.txt").read_text(), flags=re.M)[1:]
+    assert len(packages) > 150
+    unhashed = [package.split("==")[0] for package in packages if "--hash=sha256:" not in package]
+    assert unhashed == ["torch"]
+
+
+def test_uv_reads_the_settings_of_pip():
+    settings = "\n".join(
+        [
+            "global.index-url='https://mirror.example/simple'",
+            "global.find-links='/wheels'",
+            "global.cert='/certificates.pem'",
+            ":env:.find-links='/other wheels'",
+        ]
+    )
+    variables = script("tools/install.py").uv_environment(
+        settings, {"UV_DEFAULT_INDEX": "https://own.example"}
+    )
+    assert variables["UV_DEFAULT_INDEX"] == "https://own.example"
+    assert variables["UV_FIND_LINKS"] == "/other wheels"
+    assert variables["VIRTUAL_ENV"] == sys.prefix
+    assert "/certificates.pem" not in variables.values()
 
 
 def test_the_container_file_is_clean_and_copies_what_is_there():

@@ -12,11 +12,11 @@ from flame_mdm.errors import UserError
 SCENES = (".fbx", ".glb", ".vrm", ".vrma")
 # Extensions of motion files that can be read
 ENDINGS = (".npz", ".bvh", *SCENES, ".amc", ".json", ".npy")
-# Extensions of files with a tree of joints and their rotations
+# Extensions of files that contain a hierarchy of joints and their rotations
 TREES = (".bvh", ".amc")
 # Universal Scene Description
 USD = (".usda", ".usdc", ".usdz")
-# Extensions of files that can be written with the skeleton of another program
+# Extensions of files that can be written with another program's skeleton
 RIGGED = (".bvh", ".glb", ".fbx", *USD)
 # Extensions of the files that `Motion.save` writes
 WRITTEN = (
@@ -32,17 +32,17 @@ WRITTEN = (
 ADVICE = {
     ".gltf": "Save it as .glb, which is a single file, for example with Blender (File > Export > glTF 2.0)",
     ".blend": "Open it in Blender and export BVH (File > Export > Motion Capture)",
-    ".c3d": "It contains markers, not joints. Fit a skeleton with your motion capture program and export BVH",
-    ".trc": "It contains markers, not joints. Fit a skeleton with your motion capture program and export BVH",
-    ".pkl": "A pickle can run code and is never opened. Save its arrays with numpy.savez as poses, trans and fps",
-    ".pt": "Save its arrays with numpy.savez as joints and fps, or as poses, trans and mocap_framerate",
-    ".csv": "Save joints (frames, joints, 3) with numpy.savez as joints and fps",
+    ".c3d": "It contains markers, not joints. Fit a skeleton to them in your motion capture program and export BVH",
+    ".trc": "It contains markers, not joints. Fit a skeleton to them in your motion capture program and export BVH",
+    ".pkl": "Pickle files can run code and are never opened. Save the arrays with numpy.savez as poses, trans and fps",
+    ".pt": "Save the arrays with numpy.savez as joints and fps, or as poses, trans and mocap_framerate",
+    ".csv": "Save the joint positions (frames, joints, 3) with numpy.savez as joints, together with fps",
 }
 """Advice by extension, for motion files that cannot be read."""
 
 NO_MOTIONS = ("shape.npz", "_stagei.npz")
 """Suffixes of AMASS files that contain a body shape but no motion."""
-# Name of the joint array, which occurs only in JSON files that contain a motion
+# Beginning of the joint array, which occurs only in JSON files that contain a motion
 JOINTS_IN_JSON = re.compile(rb'"(joints|posed_joints)"\s*:\s*\[\s*\[')
 
 
@@ -59,13 +59,13 @@ def motions_in(folder: Path) -> list[Path]:
     """Returns the motion files in a folder and its subfolders, sorted.
 
     Hidden files (created by macOS and editors), folders, and AMASS files without motion are
-    skipped. A JSON file is a motion only if it contains an array of joints.
+    skipped. A JSON file counts as a motion only if it contains an array of joints.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 
 
 def motion_files(folder: Path) -> list[Path]:
-    """Returns the same files as `motions_in`. Raises `UserError` if there are none."""
+    """Returns the files that `motions_in` finds, and raises `UserError` if there are none."""
     files = motions_in(folder)
     if not files:
         raise UserError(f"{folder}: contains no motion files ({', '.join(ENDINGS)})")

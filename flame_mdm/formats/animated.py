@@ -1,7 +1,7 @@
 """Animated node hierarchies in FBX and GLB files: the positions of all nodes in each frame.
 
-Only the positions are used, and the rotations of the motion are computed from them. Therefore, the
-rest pose need not be a T-pose, and the local axes, which differ between programs, do not matter.
+Only the node positions are used; the rotations of the motion are computed from them. The rest pose
+therefore need not be a T-pose, and the local axes, which differ between programs, do not matter.
 """
 
 from collections.abc import Sequence
@@ -12,23 +12,23 @@ import numpy as np
 
 from flame_mdm.errors import UserError, did_you_mean
 
-LARGEST = 1e9  # maximum coordinate that is read, in the unit of the file
+LARGEST = 1e9  # maximum absolute value of a coordinate, in the unit of the file
 
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
 class AnimatedNodes:
-    """The nodes of a file during one of its animations.
+    """The node hierarchy of a file and its motion in one animation.
 
     Attributes:
         names: names of the N nodes.
         parents: index of each node's parent, smaller than the node's own index, or -1 for a root.
-        positions: (F, N, 3) in the world, in meters, y up.
+        positions: (F, N, 3), world positions of the nodes in meters, y up.
         fps: frames per second.
         animation: the name of the animation.
-        humanoid: index of the node for each SMPL joint if the file declares which nodes form a
-            human body, otherwise empty.
+        humanoid: node index of each SMPL joint. Empty if the file does not declare which nodes form
+            a human body.
         unit: meters per unit of length, as declared in the file.
     """
 
@@ -71,7 +71,7 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 
 
 def parents_first(parents: Sequence[int]) -> list[int]:
-    """Returns an order of nodes in which parents precede their children.
+    """Returns the node indices in an order in which parents precede their children.
 
     Args:
         parents: index of each node's parent, or -1 for a root.
@@ -94,7 +94,7 @@ def parents_first(parents: Sequence[int]) -> list[int]:
 
 
 def world_matrices(parents: Sequence[int], local: np.ndarray) -> np.ndarray:
-    """Converts matrices (F, N, 4, 4) relative to the parents to world matrices.
+    """Converts parent-relative matrices (F, N, 4, 4) to world matrices.
 
     Parents must precede their children.
     """

@@ -13,7 +13,8 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.smpl import AXIS_ANGLES, read_pose
 from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz
 
-# Maximum size of a `.json` motion in bytes. Once parsed, it takes several times as much memory.
+# Maximum size in bytes of a `.json` motion, which takes several times as much memory once it is
+# parsed
 JSON_LIMIT = 128 * MEBIBYTE
 RATES = (
     "fps",
@@ -35,7 +36,7 @@ NEEDED = {
 }
 """Arrays that are read from an .npz file.
 
-Other arrays may contain pickled objects; they are never loaded.
+Other arrays are never loaded, because they may contain pickled objects.
 """
 LENGTHS = {
     "m": 1.0,
@@ -46,16 +47,16 @@ LENGTHS = {
     "centimetre": 0.01,
     "mm": 0.001,
 }
-"""Names of units in `.json` files -> meters."""
+"""Length in meters of each unit that a `.json` file may name."""
 NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays in an .npz, .json or .npy motion file.
 
-    Returns joints, or poses (F, 72) and trans (F, 3) as in AMASS. Also returns fps, text, features
-    and representation if the file contains them, and up, unit and names for `.json` files. `ours`
-    is True if this project wrote the file.
+    The result contains `joints`, or `poses` (F, 72) and `trans` (F, 3) as in AMASS. If the file
+    stores them, it also contains `fps`, `text`, `features` and `representation` and, for `.json`
+    files, `up`, `unit` and `names`. `ours` states whether this project wrote the file.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -81,7 +82,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
     if "poses" in data:
         data["poses"] = _axis_angles(data["poses"])
         if data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
-            raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
+            raise UserError(
+                "poses require trans (F, 3) with the same number of frames, as in AMASS files"
+            )
     for key in RATES:
         if key in data:
             data["fps"] = frame_rate(data[key], key)
@@ -94,9 +97,9 @@ def is_real(values: np.ndarray) -> bool:
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns the motion in AMASS arrays, resampled to `fps` if it is given.
+    """Returns the translation (F, 3) and the quaternions (F, 24, 4) in AMASS arrays.
 
-    The motion consists of the translation (F, 3) and quaternions (F, 24, 4), float64.
+    Both are float64. If `fps` is given, the motion is resampled.
     """
     poses = data["poses"]
     frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
@@ -141,8 +144,8 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     """Checks the numbers in an array (F, ...).
 
     Raises:
-        UserError: If there are no frames or too many frames, or if a number is not real, not finite,
-            or has an absolute value of a million or more.
+        UserError: If the array has no frames or too many frames, or if a number is not real, is not
+            finite, or has an absolute value of a million or more.
     """
     if not is_real(values):
         raise UserError(f"{name} are not an array of real numbers")

@@ -1,10 +1,10 @@
-"""ASF/AMC motion capture files, as used by Acclaim and the CMU database: one file per skeleton, one per motion.
+"""ASF/AMC motion capture files (Acclaim, CMU): one file per skeleton, and one per motion.
 
-An ASF file lists the bones of a subject. Each bone has a direction and length in world coordinates
-in the standing rest pose, the axes C in which it turns, and its degrees of freedom. An AMC file
-contains the angles of these degrees of freedom for each frame. If M is the rotation given by these
-angles, the bone turns by C M C^-1 relative to its parent. In an order such as XYZ, x is applied
-first: C = Rz Ry Rx.
+An ASF file lists the bones of a subject. For each bone, it contains the direction and the length in
+the standing rest pose, in world coordinates, as well as the axes C in which the bone turns and its
+degrees of freedom. An AMC file contains the angles of these degrees of freedom in each frame. If M
+is the rotation given by these angles, the bone turns by C M C^-1 relative to its parent. In an
+order such as XYZ, x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -28,10 +28,13 @@ _POSITIONS, _ROTATIONS = CHANNELS[:3], CHANNELS[:2:-1]
 
 
 class Bone(NamedTuple):
-    """A bone.
+    """A bone in an ASF file.
 
-    The fields are the vector (3,) from the start of the bone to its end, the axes C as a
-    rotation, and the degrees of freedom in the order of the file.
+    Attributes:
+        vector: (3,), from the start of the bone to its end.
+        axes: the axes C, as a rotation.
+        order: order of the axes, such as "XYZ".
+        freedoms: names of the degrees of freedom, such as "RX", in the order of the file.
     """
 
     vector: np.ndarray
@@ -43,8 +46,8 @@ class Bone(NamedTuple):
 def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints.
 
-    Each bone becomes a joint with the same name at its start. AMC files do not contain the frame
-    rate `fps`, which is 120 for most of CMU's recordings.
+    Each bone becomes a joint with the same name at its start. The frame rate `fps` is required,
+    because AMC files do not contain it. It is 120 for most of CMU's recordings.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
@@ -83,7 +86,7 @@ def read(path: Path, fps: float | None) -> Bvh:
 
 
 def skeleton_of(path: Path) -> Path:
-    """Returns the ASF file for an AMC file, from the same folder.
+    """Returns the ASF file that belongs to an AMC file in the same folder.
 
     The ASF file has the name of the AMC file or of its subject (02.asf), or is the only ASF file in
     the folder.
@@ -176,7 +179,7 @@ def _order(lines: Lines, words: list[str]) -> str:
 
 
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
-    """Returns, for each bone, the values (F, N) of its N degrees of freedom. Angles are in degrees.
+    """Returns the angles (F, N) in degrees of the N degrees of freedom of each bone.
 
     Raises:
         UserError: If there are too many frames for this number of `joints`.

@@ -15,9 +15,9 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.visualize.body import ANCHORS, HELPERS, Figure, FittedBody, Mesh, mannequin
 
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
-"""How much the width of the trunk at a joint follows the shoulders, from 0 to 1.
+"""Weight of the shoulder width in the width of the trunk at a joint, from 0 to 1.
 
-The rest follows the hips.
+The hip width has the remaining weight.
 """
 # Limits on the scale of hips and shoulders, relative to the scale of the limbs. Joints at unusual
 # positions must not make the trunk too thin or too wide.
@@ -26,7 +26,7 @@ WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)
 # Limits on the length scale of all other parts, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
-ORTHONORMAL = 0.1  # maximum error in the dot products between rows of a rotation matrix
+ORTHONORMAL = 0.1  # maximum error in the dot products of the rows of a rotation matrix
 LIMBS = tuple(
     JOINT[f"{side}_{name}"]
     for side in ("left", "right")
@@ -45,9 +45,9 @@ class PosedFigure(Figure):
     poses: Poses | None = None
 
     def posed(self) -> Poses:
-        """Returns the rotations.
+        """Returns the rotations of SMPL's joints.
 
-        Unknown rotations are computed from the joint positions of SMPL's skeleton.
+        If they are unknown, they are computed from the joint positions.
         """
         if self.poses is not None:
             return self.poses
@@ -57,9 +57,9 @@ class PosedFigure(Figure):
         return solve(joints, self.fps)
 
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
-        """Returns the body from `fit_body` and "".
+        """Returns the fitted body and "", or None and the reason why no body fits.
 
-        If no body fits, returns None and the reason why this motion is drawn as a skeleton.
+        If no body fits, the motion is drawn as a skeleton. See `fit_body`.
         """
         try:
             return fit_body(self, body), ""
@@ -74,7 +74,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     sole.
 
     Args:
-        motion: the clip. Missing rotations are computed and completed.
+        motion: the clip. If it has no rotations, they are computed from its joint positions.
         body: the mesh; None = the mannequin.
 
     Raises:
@@ -124,7 +124,7 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the linear map (22, 3, 3) for each part of a body, and the scale of the body's width.
+    """Returns the linear maps (22, 3, 3) of the parts of a body, and the scale of its width.
 
     With these maps, the body in its rest pose has the `offsets` (22, 3) of a clip.
     """

@@ -23,9 +23,10 @@ from flame_mdm.formats.rig import LIMBS, SIDES, rest_pose
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
-# Rotations agree with positions if the mean distance between joints, in meters, is at most this
+# Maximum mean distance, in meters, between the joint positions in the file and the positions that
+# follow from the rotations
 APART = 0.03
-# Maximum angle, as a cosine, between a limb of a known skeleton in its T-pose and SMPL's limb
+# Cosine of the maximum angle between a limb of a known skeleton in its T-pose and SMPL's limb
 ALIKE = np.cos(np.radians(30))
 VERTICALS = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 """Possible directions of the trunk in a rest pose.
@@ -41,13 +42,13 @@ def bone_poses(
     worlds: np.ndarray,
     in_front: np.ndarray | None = None,
 ) -> BoneRotations:
-    """Returns the rotations of SMPL's joints in a file.
+    """Returns the rotations of SMPL's joints, taken from the bones in a file.
 
-    The rotations are unusable if the rest pose is unknown, or if they do not move the joints to
-    their positions, as in files that move each joint by position channels.
+    They cannot be used if the rest pose is unknown, or if they do not reproduce the joint
+    positions, as in files that move each joint by position channels.
 
     Args:
-        tree: the file.
+        tree: the tree of joints in the file.
         layout: the skeleton of the file.
         joints: (F, 22, 3), positions of SMPL's joints in meters, y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
@@ -83,7 +84,7 @@ def _rest(
     steps: np.ndarray,
     in_front: np.ndarray | None,
 ) -> np.ndarray | None:
-    """Returns the rotations (22, 3, 3) of bones in the rest pose, y up and facing +z.
+    """Returns the bone rotations (22, 3, 3) in the rest pose, with y up and the body facing +z.
 
     Returns None if no rest pose is known.
     """
@@ -107,9 +108,9 @@ def _rest(
 
 
 def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
-    """Returns the rotations (22, 3, 3) of bones in a pose, turned so that y is up and +z is ahead.
+    """Returns the bone rotations (22, 3, 3) in a pose, turned so that y is up and +z is ahead.
 
-    Returns None if the pose (22, 3) leans.
+    Returns None if the body in the `pose` (22, 3) is not upright.
     """
     shoulders = pose[[JOINT["left_shoulder"], JOINT["right_shoulder"]]].mean(0)
     trunk = shoulders - pose[[JOINT["left_hip"], JOINT["right_hip"]]].mean(0)
@@ -123,7 +124,7 @@ def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
 
 
 def _limbs() -> list[tuple[int, int]]:
-    """Returns the first and the last joint of each bone of arms and legs."""
+    """Returns the first and the last joint of each bone in the arms and legs."""
     return [
         (JOINT[f"{side}_{start}"], JOINT[f"{side}_{end}"])
         for side in SIDES
@@ -154,7 +155,7 @@ def _unit(vector: ArrayLike) -> np.ndarray:
 
 
 def _assembled(turned: np.ndarray, root: np.ndarray, steps: np.ndarray) -> Poses:
-    """Returns the poses of joints with world rotations (F, 22, 3, 3).
+    """Returns poses with the given world rotations (F, 22, 3, 3) of the joints.
 
     The body has the bone lengths of the file.
     """

@@ -1,4 +1,4 @@
-"""BVH motion capture files: reading, forward kinematics, resampling, writing.
+"""BVH motion capture files: reading, forward kinematics, resampling and writing.
 
 A BVH file contains a tree of joints with offsets, and a table of numbers with one row per frame and
 one column per channel. The rotation channels of a joint are intrinsic Euler angles in degrees, in
@@ -27,7 +27,7 @@ from flame_mdm.safe_io import TEXT_LIMIT, naming, regular_file, write_text
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 # Maximum number of joints and end sites in a file
 MAX_JOINTS = 4096
-# Maximum absolute value of a number, and maximum sum of the numbers in a line
+# Maximum sum of the absolute values of the numbers in a line
 LARGEST = 1e9
 
 
@@ -38,7 +38,8 @@ class Bvh:
     Lengths are in the unit of the file.
     """
 
-    # J names. The end site of a joint is a joint without channels, called `NAME.end`.
+    # Names of the J joints. The end site of a joint counts as a joint without channels and is
+    # called `NAME.end`.
     joints: tuple[str, ...]
     # Index of each joint's parent, smaller than the joint's own index, or -1 for a root
     parents: tuple[int, ...]
@@ -71,8 +72,8 @@ class Bvh:
     def translations(self) -> np.ndarray:
         """Returns the position (F, J, 3) of each joint in its parent's frame.
 
-        Positions are read from the position channels. For a joint without such channels,
-        the offset is used.
+        Positions are read from the position channels. A joint without such channels stays at its
+        offset.
         """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
@@ -86,11 +87,11 @@ class Bvh:
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
     def resample(self, fps: float, cubic: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Resamples to times 0, 1/fps, ... up to the last frame.
+        """Resamples the motion at times 0, 1/fps, ... up to the last frame.
 
         Returns rotations (F', J, 3, 3) and translations (F', J, 3). Rotations are interpolated on
         the sphere (slerp), so that bones keep their length. Translations are interpolated linearly
-        or, with `cubic`, by splines.
+        or, with `cubic`, by cubic splines.
         """
         before, after, share = frame_pairs(
             len(self.frames), self.fps, fps, len(self.joints), slack=0
@@ -132,7 +133,7 @@ def forward_kinematics(
 
 
 def read_lines(path: str | Path) -> Lines:
-    """Reads a text file. Raises `UserError` if it is not UTF-8 or too large."""
+    """Reads a text file. Raises `UserError` if it is too large or not UTF-8."""
     regular_file(path, TEXT_LIMIT)
     return Lines(Path(path).read_bytes(), str(path))
 
@@ -140,7 +141,7 @@ def read_lines(path: str | Path) -> Lines:
 def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
-    Raises `UserError`, which names the file and the line, if the file is incomplete or invalid.
+    If the file is incomplete or invalid, raises a `UserError` that names the file and the line.
     """
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
@@ -192,8 +193,8 @@ def read(path: str | Path) -> Bvh:
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:
         source.fail(f"the frame time must be between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
-    # A rounded time (0.0333333 for 1/30) stands for an integer rate. Otherwise, resampling could
-    # move the last frame past the end.
+    # A rounded time such as 0.0333333 (1/30) is read as an integer frame rate. Otherwise,
+    # resampling could move the last frame past the end.
     whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
     fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     width = sum(len(node.channels) for node in nodes)
@@ -228,9 +229,9 @@ class _Node:
 
 
 class Lines:
-    """Splits the lines of a text file into words. Skips blank lines and comments (#).
+    """Splits the lines of a text file into words, and skips blank lines and comments (#).
 
-    Counts lines for error messages.
+    The number of the current line is kept for error messages.
     """
 
     def __init__(self, data: bytes, name: str):
@@ -255,7 +256,7 @@ class Lines:
                 yield words
 
     def fail(self, fault: str) -> NoReturn:
-        """Raises `UserError` that names the file and the current line."""
+        """Raises a `UserError` that names the file and the current line."""
         raise UserError(f"{self.name}, line {self.line}: {fault}")
 
     def word(self, expected: str = "") -> str:
@@ -273,7 +274,10 @@ class Lines:
         return word
 
     def name_of_joint(self) -> str:
-        """Returns the rest of the line up to a brace, because names may contain spaces."""
+        """Returns the name of a joint: the rest of the line up to a brace.
+
+        Names may contain spaces.
+        """
         words = [self.word()]
         while self.pending and self.pending[-1] != "{":
             words.append(self.pending.pop())
@@ -290,7 +294,7 @@ class Lines:
         return values
 
     def labeled(self, pattern: str, expected: str) -> str:
-        """Returns the value on the next line, the first group of `pattern`."""
+        """Returns the part of the next line that matches the first group of `pattern`."""
         line = " ".join(next(iter(self), []))
         if not (match := re.fullmatch(pattern, line, re.IGNORECASE)):
             self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")

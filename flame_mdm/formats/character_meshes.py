@@ -1,4 +1,4 @@
-"""Meshes of a character in a .glb file, for writers of other formats."""
+"""Converts the meshes of a .glb character for writers of other formats."""
 
 import io
 from collections.abc import Sequence
@@ -22,7 +22,9 @@ MAX_IMAGE = 64 * 2**20
 
 
 def character_clip(character: Character, motion: PosedFigure, name: str) -> RiggedClip:
-    """Returns a moving character with its meshes; `name` is the name of the animation.
+    """Returns a clip in which a character with its meshes performs a motion.
+
+    `name` is the name of the animation.
 
     Raises:
         UserError: If a mesh is stored in a form that cannot be converted.
@@ -177,9 +179,9 @@ def _material(file: glb.Glb, number: int) -> Material:
 
 
 def _image(file: glb.Glb, number: int | None) -> bytes:
-    """Returns an image in the file as PNG or JPEG.
+    """Returns the content of a PNG or JPEG image in the file.
 
-    Returns b"" if the image is outside the file, or is of another type.
+    Returns b"" if the image is stored outside the file or in another format.
     """
     if number is None:
         return b""

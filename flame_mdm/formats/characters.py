@@ -33,14 +33,14 @@ from flame_mdm.safe_io import read_yaml
 
 @dataclass(frozen=True, eq=False)
 class Character(RestPose):
-    """A character with a skin, and its .glb file."""
+    """A character with a skin, read from a .glb file."""
 
     file: glb.Glb
 
 
 @dataclass(frozen=True, eq=False)
 class BvhCharacter(RestPose):
-    """A character without meshes, and its .bvh file."""
+    """A character without meshes, read from a .bvh file."""
 
     file: bvh.Bvh
 
@@ -72,7 +72,7 @@ def _read_bvh(path: Path) -> BvhCharacter:
     for joint, number in joints.items():
         if len(turning := _order(file.channels[number])) < 3:
             name = f"{file.joints[number]} ({joint})"
-            raise UserError(f"{path}: {name} has {len(turning)} rotation channels. It needs three")
+            raise UserError(f"{path}: {name} has {len(turning)} rotation channels instead of three")
     if not any(_moves(names) for names in _above(file, joints["pelvis"]).values()):
         name = file.joints[joints["pelvis"]]
         raise UserError(
@@ -161,12 +161,14 @@ def read_skinned(path: Path) -> Character:
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns the pose in which the skin was bound, and the corners of a box around its meshes.
 
-    The pose consists of matrices (N, 4, 4) of the nodes. If the nodes are stored in a different
-    pose, the pelvis, which is nearly upright, determines how the coordinates of the skin are turned.
+    The pose consists of the matrices (N, 4, 4) of the nodes. If the nodes are stored in a different
+    pose, the orientation of the skin's coordinates is derived from the pelvis, which is nearly
+    upright.
     """
-    # If the file is stored in the bind pose, joint matrix times inverse bind matrix is the same
-    # for all joints. Otherwise, this product for the pelvis, with its rotation rounded to quarter
-    # turns, is used as the frame of the skin. The bind matrices then determine the pose of all joints.
+    # If the file is stored in the bind pose, the product of joint matrix and inverse bind matrix is
+    # the same for all joints. Otherwise, this product for the pelvis, with its rotation rounded to
+    # quarter turns, is used as the frame of the skin. The bind matrices then determine the pose of
+    # all joints.
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}
     for skin in sorted(file.skins, key=lambda skin: (pelvis in skin.joints, len(skin.joints))):
@@ -201,7 +203,7 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 class UnknownJoints(UserError):
     """Error for joints that cannot be identified.
 
-    `template` contains the lines of a file of joint names that the user can complete.
+    `template` contains the lines of a joint name file for the user to complete.
     """
 
     def __init__(self, message: str, template: list[str]):
@@ -276,7 +278,7 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
-    """Writes the character's file with an additional animation. Returns a line that describes it.
+    """Writes the character's file with an additional animation, and returns a summary line.
 
     The new animation is the first one.
     """
@@ -294,7 +296,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
     for joint, source in enumerate(rig.sources):
         if source >= 0 or joint in skinned:
             turns = glb.quaternions(np.concatenate([rest[None, joint], local[:, joint]]))
-            # Animations need a node with translation, rotation and scale instead of a matrix. The
+            # An animated node must have a translation, rotation and scale instead of a matrix. The
             # node takes the rest pose, even if the file was stored in a different pose.
             size = float(
                 rig.scales[joint]
@@ -322,7 +324,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 
 
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
-    """Writes the character's file with this motion. Returns a line that describes the file."""
+    """Writes the character's file with this motion, and returns a summary line."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
             f"{path}: a .bvh character has no meshes, so it can only be saved as a .bvh file"
@@ -351,6 +353,6 @@ def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
 
 
 def _following(rig: Rig, joints: int) -> str:
-    """Returns how many of the `joints` of a character follow the motion."""
+    """Describes how many of a character's `joints` follow the motion."""
     follow = sum(source >= 0 for source in rig.sources)
     return f"{follow} of {joints} joints follow the motion, {joints - follow} keep their angle"

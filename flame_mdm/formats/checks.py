@@ -7,19 +7,20 @@ from flame_mdm.representations.skeleton import SMPL22
 
 # A body is lying if the mean vertical component of its trunk direction is smaller than this
 LYING = 0.3
-# With a different up axis, a body is standing if the component is larger than this
+# A different up axis is suggested if the component along this axis is larger than this
 STANDING = 0.7
-# Maximum speed of the pelvis in m/s. Sprinters reach 12; files with higher speeds are damaged.
+# Maximum speed of the pelvis in m/s. Sprinters reach 12, so a file with a higher speed than this is
+# damaged.
 FASTEST = 15.0
 # Seconds over which the speed of the pelvis is averaged
 AVERAGED = 0.05
-# Speed of an ankle relative to the pelvis, in m/s, above which a leg has flipped between frames.
-# The fastest kicks reach 20.
+# Speed of an ankle relative to the pelvis, in m/s, above which a leg is assumed to have flipped
+# between two frames. The fastest kicks reach 20.
 KICK = 30.0
 UNDER = 0.02  # maximum depth in meters below the floor; a deeper body is reported as too small
 
 # Maximum time in seconds between a motion and the rest pose that precedes it. Some conversions
-# blend these frames.
+# blend from one to the other.
 BLEND = 0.04
 # Number of subsequent frames with which the first steps are compared
 CALM = 8
@@ -31,7 +32,8 @@ JUMP = (
 )
 # Cosine of the maximum bend of arms and legs in a rest pose
 STRAIGHT = np.cos(np.radians(25))
-# Arms in a rest pose are raised from the trunk by at least 25 degrees
+# Cosine of the minimum angle between the arms and the downward direction of the trunk in a rest
+# pose
 HANGING = np.cos(np.radians(25))
 SYMMETRIC = 0.2  # maximum difference between the cosines of the left and the right arm
 
@@ -44,7 +46,7 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
 
     The `layout` of the file contains its unit, its up axis, and whether the body may be a child's.
     If the size is wrong and the body is lying, the message names both the unit and the axis, so
-    that the file needs only one correction.
+    that the user can correct both at once.
 
     Raises:
         UserError: If the size is wrong, if a foot has no length, or if the feet point backwards.
@@ -65,8 +67,8 @@ def uprightness(joints: np.ndarray) -> float:
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     """Returns a message if the body is lying in most frames, with the axis that makes it stand.
 
-    Returns "" otherwise. `joints` (F, 22, 3) have y up. They were converted from the axes of the
-    file by `axes` (3, 3). `up` is the up axis of the file.
+    Returns "" otherwise. `joints` (F, 22, 3), with y up, were converted from the axes of the file
+    by `axes` (3, 3). `up` is the up axis of the file.
     """
     if uprightness(joints) >= LYING:
         return ""
@@ -86,7 +88,7 @@ def jump(joints: np.ndarray, fps: float) -> str:
     `joints` are (F, 22, 3).
     """
     ankles = joints[:, [_NUMBER["left_ankle"], _NUMBER["right_ankle"]]] - joints[:, :1]
-    # A body that shakes for one frame does not jump, but a leg can flip within a frame.
+    # A body that shakes for one frame does not jump, but a leg can flip within a single frame.
     apart = max(1, round(fps * AVERAGED))
     for verb, points, frames, fastest in (
         ("the body jumps", joints[:, :1], apart, FASTEST),
@@ -116,7 +118,7 @@ def below_floor(joints: np.ndarray) -> str:
 
 
 def rest_frames(joints: np.ndarray, fps: float) -> int:
-    """Returns the number of frames before a motion that show a rest pose or a transition from it.
+    """Returns the number of initial frames that show a rest pose or lead from it to the motion.
 
     Several programs write a T-pose or A-pose as the first frame. In a recorded motion that begins
     with a rest pose, the first step is not longer than the following steps.

@@ -31,13 +31,13 @@ SLOW = 0.5
 SHARE, SHARE_PINNED = 0.5, 0.4
 """Fractions of the body's speed that are added to `SLOW`.
 
-The first applies before the body is moved to follow its feet, the second after it.
+The first is used before the body is moved to follow its feet, and the second afterward.
 
 In generated motion, a foot on the floor may slide along with the body. A swinging foot is faster
 than the body.
 """
 DRIFT = 0.2
-"""Maximum speed in m/s at which the body may slide over its feet; the legs compensate for it.
+"""Maximum speed in m/s at which the body may slide over its feet while the legs compensate.
 
 Above 1.5 times this speed, the body follows its feet entirely.
 """
@@ -45,7 +45,8 @@ Above 1.5 times this speed, the body follows its feet entirely.
 CLEAR = 0.15
 # Depth in meters below the floor from which a toe is lifted
 DEEP = 0.01
-# Maximum distance from hip to ankle, relative to the straight leg, unless it was already longer
+# Maximum distance from hip to ankle, as a fraction of the length of the straight leg, unless the
+# distance was already larger
 REACH = 0.999
 
 
@@ -84,15 +85,15 @@ def cleanup(
 ) -> np.ndarray:
     """Removes pops, changes in bone lengths, foot sliding, toes below the floor, and hands inside the body.
 
-    The floor is at y = 0, or lower if the lowest toe is below y = 0 in a tenth of the frames: then
-    it is the 10th percentile of the heights of the lowest toe.
+    The height of the floor is the 10th percentile, over all frames, of the height of the lowest
+    toe, but at most y = 0.
 
     Args:
         joints: (F, J, 3) in meters, y up. Motions with fewer than 4 frames are returned unchanged.
         fps: frames per second.
         skeleton: skeleton of the joints.
-        contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor until the next
-            frame. With some representations, models predict these probabilities. None = they are
+        contacts: (F, N), probabilities that each of `skeleton.feet` stays on the floor until the
+            next frame, as models predict them with some representations. None = the contacts are
             estimated from the height and speed of the toes.
 
     Returns:
@@ -133,11 +134,11 @@ def cleanup(
 def _least_squares(
     frames: int, *terms: tuple[int, np.ndarray | float, np.ndarray | float]
 ) -> np.ndarray:
-    """Returns x (frames, N) with the minimum sum of all terms.
+    """Returns the x (frames, N) that minimizes the sum of all terms.
 
-    A term (n, weight, target) is weight (n-th differences of x - target)^2. The weight is
-    (frames - n,) or a number. The target is (frames - n, N) or a number. At least one target is
-    an array.
+    A term (n, weight, target) is weight (n-th differences of x - target)^2. The weight is a number
+    or has the shape (frames - n,). The target is a number or has the shape (frames - n, N), and at
+    least one target is an array.
     """
     # An n-th difference has binomial coefficients with alternating signs. It couples frames that
     # are at most three apart. The normal equations are therefore a banded matrix, and solving
@@ -200,7 +201,7 @@ def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) ->
 
 
 def _arm(skeleton: Skeleton, side: str) -> list[int]:
-    """Returns shoulder, elbow, wrist and, if the skeleton has one, hand of one side."""
+    """Returns the shoulder, elbow, wrist and, if the skeleton has one, the hand of one side."""
     arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
     return arm + [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
 
@@ -260,7 +261,7 @@ def _lift(motion: np.ndarray, leg: Sequence[int], floor: float) -> None:
 
 
 def _faded(size: np.ndarray, frames: float) -> np.ndarray:
-    """Returns sizes (F, ...) that rise and fall smoothly, `frames` before and after each peak."""
+    """Returns sizes (F, ...) that rise and fall smoothly within `frames` of each peak."""
     return gaussian_filter1d(
         maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0
     )
@@ -271,10 +272,10 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
     arm = _arm(skeleton, side)
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
-    # A hand near the axis is moved to its own side
+    # A hand near the axis is moved to its own side of the body
     aside = unit(motion[:, arm[0]] - motion[:, other])
-    # Each pass moves the wrist out of its deepest point. The shift fades in and out within `CLEAR`
-    # seconds, so that the hand avoids the body instead of jumping out of it.
+    # Each pass moves the wrist out of the body where it is deepest. The shift fades in and out
+    # within `CLEAR` seconds, so that the hand avoids the body instead of jumping out of it.
     for _ in range(4):
         depth, away = (values[:, 1:] for values in depths(motion, skeleton.joints, side))
         deepest = depth.argmax(1)[:, None]

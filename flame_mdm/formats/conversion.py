@@ -23,7 +23,7 @@ It is its own inverse.
 """
 KIT_SOURCES = {"root": "pelvis", "belly": "spine2", "thorax": "spine3"}
 KIT_SOURCES |= {f"{side}_toes": f"{side}_foot" for side in ("left", "right")}
-"""SMPL joint at the same location on the body, for KIT-ML joints with different names."""
+"""KIT-ML joints whose names differ from SMPL's, with the SMPL joint at the same location."""
 LEGS = tuple(
     SMPL22.joints.index(f"{side}_{name}")
     for side in ("left", "right")
@@ -57,10 +57,10 @@ def needs_rotations(representation: Representation) -> bool:
 def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     """Converts a motion to the form and frame rate of a representation.
 
-    Joints are resampled with cubic splines, and rotations on the sphere. KIT-ML's 21 joints are
-    computed from SMPL's joints. If SMPL rotations are not known, they are computed from the bones
-    of the file or, without bones, fitted to the joints. The body then has the bones of an adult,
-    and its path is scaled by the leg length.
+    Joint positions are resampled with cubic splines, and rotations are interpolated on the sphere.
+    KIT-ML's 21 joints are computed from SMPL's joints. If SMPL rotations are unknown, they are
+    computed from the bones of the file or, without bones, fitted to the joints. The body then has
+    the bones of an adult, and its path is scaled by the leg length.
 
     Raises:
         UserError: If the representation cannot encode the skeleton of the motion.
@@ -79,7 +79,7 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
 def kit_joints(joints: np.ndarray) -> np.ndarray:
     """Converts joints (F, 22 or more, 3) of SMPL to the 21 joints (F, 21, 3) of KIT-ML.
 
-    The result is mirrored, like KIT-ML. The middle of a foot in KIT-ML is placed halfway between
+    The result is mirrored, as in KIT-ML. The middle of a foot in KIT-ML is placed halfway between
     the ankle and the toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
@@ -128,7 +128,7 @@ def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
     """Transfers a motion to an adult body. The path is scaled by the leg length.
 
     Args:
-        body: the motion with the bones of its own body.
+        body: the motion on a body with its original bone lengths.
         joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:

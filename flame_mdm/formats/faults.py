@@ -97,8 +97,8 @@ def find_faults(motion: Motion) -> list[Fault]:
     low = joints[:, toes, 1] < LOW
     travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
     slides[:-1, toes] = travel * (low[1:] & low[:-1])
-    # This is an acceleration: the distance of a joint from the midpoint between its neighbors in
-    # time.
+    # The acceleration of a joint is proportional to its distance from the midpoint between its
+    # positions in the previous and the next frame.
     jumps = np.zeros(joints.shape[:2])
     jumps[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
     # A morphological opening of a flag over time keeps only runs that are at least as long as the
@@ -127,9 +127,9 @@ def _runs(
     flags: np.ndarray | None = None,
     frames: int = 1,
 ) -> list[Fault]:
-    """Returns the runs of at least `frames` frames.
+    """Returns the faults that last at least `frames` frames.
 
-    A frame belongs to a run if its flag (F, J) is set or, without flags, if its value (F, J)
+    A frame belongs to a fault if its flag (F, J) is set or, without flags, if its value (F, J)
     exceeds the limit.
     """
     runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
@@ -158,7 +158,7 @@ def _stretched(
 
 
 def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Returns how deep elbows and wrists are inside the body. The hand counts as the wrist."""
+    """Returns how deep elbows and wrists are inside the body. Wrists include the hands."""
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
@@ -209,9 +209,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand. It is negative
-        outside the body. The second result is the unit vectors (F, 3, 3) to these points, from the
-        axis of the part in which each point is deepest.
+        The depths (F, 3) in meters of the elbow, the wrist and the middle of the hand, which are
+        negative outside the body, and unit vectors (F, 3, 3). Each vector points to one of these
+        points from the axis of the part in which the point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

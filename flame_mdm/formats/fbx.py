@@ -31,7 +31,7 @@ OLDEST_VERSION = 7000
 LIMIT = 512 * MEBIBYTE
 # Maximum total size in bytes of all decompressed arrays in a file
 EXPANDED_LIMIT = 512 * MEBIBYTE
-# Maximum nesting of records; programs write about 8
+# Maximum nesting depth of records; programs write about 8 levels
 MAX_DEPTH = 32
 # Maximum number of records in a file
 MAX_RECORDS = 1_000_000
@@ -69,11 +69,11 @@ class Record:
 
     Attributes:
         name: the name, such as "Model".
-        properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int
-            as a 64-bit integer and a float as a double. `Int` and `Short` are written as shorter
+        properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int as
+            a 64-bit integer and a float as a double. `Int` and `Short` are stored as shorter
             integers.
         children: nested records.
-        block: whether a terminator follows the children even if there are none. Some readers
+        block: whether a terminator is written even if the record has no children. Some readers
             require it.
     """
 
@@ -116,14 +116,14 @@ def read(path: Path) -> Record:
     """Reads a binary FBX file of version 7 and returns the record that contains all others.
 
     Raises:
-        UserError: If the file is too large, damaged, in ASCII, or of an earlier version.
+        UserError: If the file is too large or damaged, is an ASCII file, or has an earlier version.
     """
     regular_file(path, LIMIT)
     content = path.read_bytes()
     if not content.startswith(MAGIC[:18]):
         if content.lstrip()[:1] == b";" or b"FBXHeaderExtension" in content[:4096]:
             raise UserError(
-                f"{path}: this FBX file is in ASCII. Export it as binary FBX, the default in most programs"
+                f"{path}: this is an ASCII FBX file. Export it as binary FBX, the default in most programs"
             )
         raise UserError(f"{path}: not an FBX file")
     try:
@@ -218,7 +218,8 @@ class _Reader:
             raise ValueError(f"its arrays take more than {EXPANDED_LIMIT // MEBIBYTE} MiB")
         if encoding == 1:
             unpacker = zlib.decompressobj()
-            # One more byte than declared is decompressed, to detect arrays that are too long.
+            # One byte more than declared is decompressed, so that arrays that are too long are
+            # detected.
             packed = unpacker.decompress(packed, size + 1)
         elif encoding != 0:
             raise ValueError(f"an array has the unknown encoding {encoding}")

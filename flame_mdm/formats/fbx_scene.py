@@ -5,8 +5,8 @@ transform of a model is
 
     T  Roff  Rp  Rpre  R  Rpost^-1  Rp^-1  Soff  Sp  S  Sp^-1
 
-with translation T, rotation R, scale S, offsets and pivots of rotation and scale, and pre- and
-post-rotation.
+where T is the translation, R is the rotation and S is the scale. Roff and Soff are the offsets and
+Rp and Sp the pivots of rotation and scale, and Rpre and Rpost are the pre- and post-rotation.
 """
 
 import math
@@ -59,7 +59,7 @@ TIME_MODES = {
 
 # Bits of `KeyAttrFlags`; without them, interpolation is linear
 CONSTANT, CUBIC = 0x2, 0x8
-# Bit for a constant segment that has the value of the next key
+# Bit for a constant segment that takes the value of the next key
 NEXT_VALUE = 0x100
 # A frame takes the value of a key that is up to this many seconds after the frame
 UNSTEPPED = 1e-6
@@ -75,8 +75,7 @@ class Curve:
         times: (K,) in seconds, increasing.
         values: (K,).
         flags: (K,), interpolation from each key to the next.
-        slopes: (K, 2), change per second after each key and before the next key, for cubic
-            segments.
+        slopes: (K, 2), slopes per second of cubic segments, after each key and before the next key.
     """
 
     times: np.ndarray
@@ -109,7 +108,7 @@ class Curve:
 
 
 def hermite(begin: Any, end: Any, leaving: Any, arriving: Any, share: Any) -> Any:
-    """Returns the cubic Hermite spline between two keys at `share`, from 0 to 1.
+    """Evaluates the cubic Hermite spline between two keys at `share`, from 0 to 1.
 
     `leaving` and `arriving` are the slopes at the two keys, per segment.
     """
@@ -142,14 +141,14 @@ class _Model:
     def animated(
         self, name: str, default: tuple[float, float, float], times: np.ndarray
     ) -> np.ndarray:
-        """Returns a property (F, 3) at times (F,)."""
+        """Returns the values (F, 3) of a property at times (F,)."""
         values = np.tile(self.vector(name, default), (len(times), 1))
         for axis, curve in self.curves.get(name, {}).items():
             values[:, axis] = curve.at(times)
         return values
 
     def local(self, times: np.ndarray) -> np.ndarray:
-        """Returns the matrix (F, 4, 4) to the parent's coordinates at times (F,)."""
+        """Returns the matrices (F, 4, 4) from local to parent coordinates at times (F,)."""
         active = bool(self.number("RotationActive"))
         order = ORDERS[self.number("RotationOrder") % len(ORDERS)] if active else "xyz"
         before = euler("xyz", self.vector("PreRotation")) if active else np.eye(3)
@@ -171,7 +170,7 @@ class _Model:
 def euler(order: str, degrees: np.ndarray) -> np.ndarray:
     """Returns rotations (..., 3, 3) from angles (..., 3) about x, y and z in degrees.
 
-    The angles are applied in `order`.
+    The rotations are applied in `order`.
     """
     angles = degrees[..., ["xyz".index(axis) for axis in order]]
     return Rotation.from_euler(order, angles, degrees=True).as_matrix()
@@ -237,7 +236,7 @@ class _Scene:
                 self.models[child].parent = parent
 
     def takes(self) -> list[tuple[str, int]]:
-        """Returns the names of animations with keys, and the ids of their layers."""
+        """Returns the name and the layer id of each animation that has keys."""
         takes = []
         for number, record in self.records.items():
             if record.name != "AnimationStack":
@@ -257,7 +256,7 @@ class _Scene:
         ]
 
     def _keys(self, layer: int) -> list[tuple[int, int, int]]:
-        """Returns curve node, axis and curve for each curve in a layer."""
+        """Returns the curve node, the axis and the curve itself for each curve in a layer."""
         axes = {"d|X": 0, "d|Y": 1, "d|Z": 2}
         curves = []
         for node in self._below(layer, "AnimationCurveNode"):
@@ -346,7 +345,7 @@ def _is_object(record: fbx.Record) -> bool:
 def _name(record: fbx.Record) -> str:
     """Returns the name of an object.
 
-    The file stores the name together with the object's class.
+    The file stores it together with the object's class.
     """
     name = record.properties[1]
     return str(name).partition("\x00")[0] or record.name

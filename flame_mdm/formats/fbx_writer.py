@@ -1,9 +1,9 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files of Autodesk's FBX SDK. Different programs require different
-details. Comments name the program that requires a detail. The bones are at the top level, because
-Unreal and Unity treat a node above them as a bone. The rest pose of the bones is in `PreRotation`,
-so that rotations of 0 are the rest pose in every program.
+The structure of the scene follows files written by Autodesk's FBX SDK. Programs differ in the
+details that they require; comments name the program that requires a detail. The bones are at the
+top level, because Unreal and Unity treat a node above them as a bone. The rest pose of the bones is
+stored in `PreRotation`, so that rotations of 0 result in the rest pose in every program.
 """
 
 from collections import Counter
@@ -22,7 +22,7 @@ from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 
 # The files are in centimeters
 PER_METER = 100
-# `TimeMode` for a rate that is given in `CustomFrameRate`
+# `TimeMode` for a frame rate that is stored in `CustomFrameRate`
 CUSTOM_RATE = 14
 # A fixed time, so that identical motions result in identical files. Readers compare it with `FileId`.
 CREATED = "1970-01-01 10:00:00:000"
@@ -39,7 +39,7 @@ HELD_KEY = 0x2  # flag of a key whose value is held until the next key
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a motion, with the skin of its person if there is one."""
+    """Writes a motion, including the skin of the person if the clip has one."""
     fbx.write(path, _Writer(clip).scene())
 
 
@@ -63,8 +63,8 @@ class _Writer:
         for skin in clip.skins:
             poses |= self._mesh(skin, bones, materials)
         if poses and clip.root >= 0:
-            # three.js takes the position of the root from the bind pose, so the root is moved there
-            # as well.
+            # three.js takes the position of the root from the bind pose, so the root is moved back
+            # in the bind pose, too.
             poses[bones[clip.root]][2, 3] -= PER_METER * ROOT_BACK
         if poses:
             self._bind_pose(poses)
@@ -111,8 +111,8 @@ class _Writer:
     def _lifted(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
         """Returns the offsets (J, 3) and the moves of the clip in centimeters.
 
-        The person stands on the soles. A root on the floor is moved back by `ROOT_BACK`, and the
-        hips are moved forward by the same distance.
+        The person is raised to stand on the soles. A root on the floor is moved back by
+        `ROOT_BACK`, and the hips are moved forward by the same distance.
         """
         clip = self.clip
         offsets, moves = clip.on_soles()
@@ -152,8 +152,8 @@ class _Writer:
     ) -> dict[int, np.ndarray]:
         """Adds a mesh in its bind pose, with its materials and its skin.
 
-        `materials` contains the ids of the materials written so far. Returns the matrix (4, 4) of
-        each object in the bind pose, by id.
+        `materials` contains the ids of the materials written so far. Returns the bind-pose matrix
+        (4, 4) of each object by id.
         """
         # A Geometry contains the vertices, and a Model places it. A Skin deforms the geometry with
         # one Cluster per bone. A cluster contains its vertices, their weights, and the matrices of
@@ -222,7 +222,7 @@ class _Writer:
         return number
 
     def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
-        """Adds the matrix (4, 4) of each object, by id, in the bind pose of the meshes."""
+        """Adds the bind pose of the meshes, given the matrix (4, 4) of each object by id."""
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))
@@ -250,7 +250,7 @@ class _Writer:
             self._curves(layer, bone, "Lcl Rotation", "R", times, angles[:, joint])
         for joint, moved in self.moves.items():
             self._curves(layer, bones[joint], "Lcl Translation", "T", times, moved)
-        # Unreal imports bone properties of this kind as curves.
+        # Unreal imports animated bone properties of this kind as curves.
         for name, (changes, planted) in clip.contact_changes().items():
             values = planted[:, None].astype(float)
             self._curves(layer, bones[0], name, name, times[changes], values, (name,), HELD_KEY)

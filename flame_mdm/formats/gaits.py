@@ -37,17 +37,18 @@ SLOWEST = 0.2
 ASIDE = 35.0
 # Weight of velocities relative to positions, in seconds, when poses are compared
 VELOCITY = 0.1
-# A body is standing if no joint moves faster than this relative to the root, in m/s
+# A body is standing if no joint moves faster than this, in m/s, relative to the root
 SETTLED = 0.12
 # Seconds of standing still that are kept before a start and after a stop
 MARGIN = 0.15
 # Seconds over which the first or last pose of a clip is blended into the motion
 FADE = 0.5
-# Minimum and maximum angle of a turn, relative to the requested angle
+# Minimum and maximum angle of a turn, as a fraction of the requested angle
 OVERSHOOT = (0.6, 1.6)
 # Minimum length of a start or stop in seconds
 PART = 0.5
-# Meters and degrees between repetitions of a loop. A loop that moves less stays in place.
+# Minimum movement, in meters and degrees, from one repetition of a loop to the next. A loop that
+# moves less stays in place.
 STILL = (
     0.1,
     10.0,
@@ -61,7 +62,7 @@ class Clip:
 
     Attributes:
         name: name of the clip, without the name of the set.
-        kind: loop (the last pose equals the first pose), start, stop or turn.
+        kind: loop (whose last pose equals its first pose), start, stop or turn.
         motion: the joints and the root trajectory.
         text: the text from which the motion was generated.
     """
@@ -91,7 +92,7 @@ def direction(degrees: float) -> np.ndarray:
 
 
 def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the velocities (F,) of the root along a direction, and to the left of this direction.
+    """Returns the root velocities (F,) along a direction, and perpendicular to it (to the left).
 
     The direction is relative to the heading of the root.
     """
@@ -108,7 +109,7 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 
 
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
-    """Returns, of all gait cycles in a direction, the one whose ends differ least.
+    """Returns the gait cycle in a direction whose ends differ least.
 
     Returns None if there is no cycle. Cycles that begin with a landing of the left foot are
     preferred, so that the loops of a set begin with the same foot.
@@ -207,7 +208,7 @@ def closed(motion: GroundedMotion) -> GroundedMotion:
 
 
 def moving(motion: GroundedMotion) -> tuple[int, int]:
-    """Returns the first and last frame in which the body moves, extended by `MARGIN`."""
+    """Returns the first and last frame of the movement, extended by `MARGIN` at both ends."""
     speed = np.linalg.norm(np.gradient(motion.world(), axis=0), axis=-1).max(1) * motion.fps
     speed = gaussian_filter1d(speed, 0.05 * motion.fps, mode="nearest")
     fast = np.flatnonzero(speed > SETTLED)
@@ -218,9 +219,10 @@ def moving(motion: GroundedMotion) -> tuple[int, int]:
 
 
 def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedMotion | None:
-    """Returns a turn in place by an angle. `stand` (22, 3) is the first and the last pose.
+    """Returns a turn in place that begins and ends with the pose `stand` (22, 3).
 
-    Returns None if the motion turns by a very different angle or in the other direction.
+    Returns None if the motion turns in the other direction, or by an angle that is very different
+    from `degrees`.
     """
     # The model turns by about the requested angle. The root is turned by exactly this angle, and
     # the pose turns with it.
@@ -237,7 +239,7 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 
 
 def loop(motion: GroundedMotion) -> GroundedMotion:
-    """Returns the middle repetition of a loop that was generated three times in a row.
+    """Returns the middle repetition of a loop that was generated with three repetitions.
 
     If the loop travels, the root follows a straight line at a constant speed. Otherwise, the root
     stays in place.
@@ -254,8 +256,8 @@ def loop(motion: GroundedMotion) -> GroundedMotion:
 def passing(motion: GroundedMotion) -> list[float | None]:
     """Returns the times in seconds at which the planted left and right toes pass the root of a loop.
 
-    None = the toes never pass the root. Two gaits are best blended at these times, because both
-    then have the foot in the same place.
+    The time is None if the toes never pass the root. Two gaits are best blended at these times,
+    because both then have the foot in the same place.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)

@@ -1,6 +1,6 @@
 """glTF 2.0 binary files (.glb).
 
-Readers receive a validated document. Writers use `Binary` for the binary part. Source: Khronos
+Readers receive a validated document, and writers use `Binary` for the binary part. Source: Khronos
 Group, "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
 
@@ -22,7 +22,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-# For each integer type, the integer that represents 1 if the accessor is normalized
+# For each integer type, the integer that represents 1 in normalized accessors
 WHOLE = {
     5120: 127,
     UNSIGNED_BYTE: 255,
@@ -41,14 +41,14 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # numbers per item
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 # Maximum size of a file that is read
 LIMIT = 512 * MEBIBYTE
-# Maximum size of the JSON part in bytes. Once parsed, it takes several times as much memory.
+# Maximum size in bytes of the JSON part, which takes several times as much memory once it is parsed
 DOCUMENT_LIMIT = 16 * MEBIBYTE
 # Maximum number of nodes, and of items in any other list
 MAX_NODES, MAX_ITEMS = 4096, 65_536
 # Largest coordinate or matrix entry that is read
 LARGEST = 1e9
 HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
-"""Required extensions that change neither nodes, skins nor bounds. Characters may use them."""
+"""Extensions that a character may require, because they do not change nodes, skins or bounds."""
 
 Item = TypeVar("Item")
 # Index in another list, or number of bytes. A missing index is -1.
@@ -60,9 +60,10 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class _Object(BaseModel):
-    """A part of the document that is read.
+    """Base of the parts of the document that are read.
 
-    Types are strict. All other keys are ignored and copied unchanged.
+    Types are checked strictly. Keys without a field are ignored here, and copied unchanged when the
+    file is written.
     """
 
     model_config = ConfigDict(strict=True)
@@ -148,7 +149,7 @@ def _item(items: Sequence[Item], index: int, name: str) -> Item:
 
 
 def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
-    """Returns an order of nodes in which parents precede their children, and the parents.
+    """Returns the node indices with parents before their children, and the parent of each node.
 
     Raises:
         ValueError: If the nodes do not form trees.
@@ -178,7 +179,7 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class Glb:
-    """A valid .glb file with N nodes. Parents precede their children."""
+    """A valid .glb file with N nodes, in which parents precede their children."""
 
     # The JSON part, with the lists `buffers`, `bufferViews` and `accessors`
     document: dict[str, Any]
@@ -213,7 +214,7 @@ def read(path: Path) -> Glb:
         parts = _Document.model_validate(document)
         if unread := [name for name in parts.extensionsRequired if not HARMLESS.match(name)]:
             raise UserError(
-                f"it requires {unread[0][:80]}, which cannot be read. Export it without this compression"
+                f"it requires {unread[0][:80]}, which is not supported. Export the file without this compression"
             )
         order, above = _ordered(parts.nodes)
         rank = np.argsort(order).tolist()  # index in the document -> index in `Glb`
@@ -279,7 +280,7 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
 
 
 def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
-    """Returns the corners (8, 3) of the box around a part of a mesh."""
+    """Returns the corners (8, 3) of the bounding box of a part of a mesh."""
     accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
     if {len(accessor.min), len(accessor.max)} != {3}:
         raise ValueError("a mesh has no bounds for its positions")
@@ -383,7 +384,7 @@ class Binary:
     ) -> dict[str, Any]:
         """Appends an animation of nodes and returns it.
 
-        A curve consists of a property, a node, and values (F, K) per frame.
+        A curve consists of a property, a node, and one row of values (F, K) per frame.
         """
         times = self.add(
             np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True
@@ -418,7 +419,7 @@ class Binary:
 def quaternions(matrices: np.ndarray) -> np.ndarray:
     """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w.
 
-    Successive quaternions have no sign flips.
+    The sign does not flip between successive quaternions.
     """
     turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
     return turns[..., [1, 2, 3, 0]].float().numpy()

@@ -1,4 +1,4 @@
-"""Motions in animated .glb, .vrm and .vrma files: positions of all nodes in each frame.
+"""Motions in animated .glb, .vrm and .vrma files: the positions of all nodes in each frame.
 
 Sources: Khronos Group, "glTF 2.0 Specification", section 3.11 and appendix C (interpolation); VRM
 consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification
@@ -22,9 +22,10 @@ from flame_mdm.formats.resampling import MAX_FRAMES, RATES
 
 # Maximum number of frames times nodes
 MAX_CELLS = 4_000_000
-# Keys at a lower rate than this are assumed to be set by hand. Sampled motions have denser keys.
+# Keys with a lower rate than this are assumed to have been set by hand. Sampled motions have denser
+# keys.
 SPARSE_RATE = 24.0
-# Rate at which motions with hand-set keys are sampled
+# Frame rate at which motions with hand-set keys are sampled
 USUAL_RATE = 30.0
 # Numbers per key, for the properties that move nodes
 WIDTHS = {
@@ -33,7 +34,7 @@ WIDTHS = {
     "scale": 3,
 }
 
-# SMPL joint for each bone of VRM's humanoid
+# SMPL joint that corresponds to each bone of VRM's humanoid
 HUMANOID = {
     "hips": "pelvis",
     "spine": "spine1",
@@ -93,7 +94,7 @@ class Track:
         times: (K,) in seconds, increasing.
         values: (K, C).
         interpolation: interpolation between the keys.
-        slopes: (2, K, C), change per second before and after each key; only for CUBICSPLINE.
+        slopes: (2, K, C), slopes per second before and after each key, for CUBICSPLINE only.
     """
 
     times: np.ndarray
@@ -154,7 +155,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
             nodes.
 
     Raises:
-        UserError: If the file is damaged, or has no such animation.
+        UserError: If the file is damaged or has no such animation.
     """
     file = glb.read(path)
     try:
@@ -223,7 +224,7 @@ def _worlds(
 
 
 def _animated(node: dict[str, Any], tracks: dict[str, Track], times: np.ndarray) -> np.ndarray:
-    """Returns the matrix (F, 4, 4) from a node's coordinates to its parent's coordinates."""
+    """Returns the matrices (F, 4, 4) from a node's coordinates to its parent's coordinates."""
     rest = {"translation": (0, 0, 0), "rotation": (0, 0, 0, 1), "scale": (1, 1, 1)}
     values = {}
     for name, usual in rest.items():
@@ -276,11 +277,11 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     """Returns the frame rate.
 
     The frame rate is read from `asset.extras.fps` if the writer stored it there. Otherwise, it is
-    computed from the distances between keys.
+    computed from the intervals between keys.
     """
-    # glTF stores keys, but no frame rate. In a sampled animation, the median distance between keys
-    # determines the frame rate. Times have single precision, so the rate is rounded to a nearly equal
-    # integer.
+    # glTF stores keys, but no frame rate. In a sampled animation, the median interval between keys
+    # determines the frame rate. Times have single precision, so the rate is rounded to a nearly
+    # equal integer.
     extras = file.document["asset"].get("extras")
     noted = extras.get("fps") if isinstance(extras, dict) else None
     if isinstance(noted, int | float) and RATES[0] <= noted <= RATES[1]:
@@ -298,9 +299,9 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
 
 
 def humanoid(file: glb.Glb) -> dict[str, int]:
-    """Returns the node of each SMPL joint, if the file declares the bones of a VRM humanoid.
+    """Returns the node index of each SMPL joint if the file declares a VRM humanoid.
 
-    Otherwise, returns {}.
+    Returns {} for other files.
     """
     extensions = file.document.get("extensions")
     if not isinstance(extensions, dict):

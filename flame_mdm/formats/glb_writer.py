@@ -12,11 +12,11 @@ VERTICES, INDICES = 34962, 34963  # values of a buffer view's target in glTF
 
 
 def write(path: Path, clip: RiggedClip, text: str) -> None:
-    """Writes a clip with one node per joint and, if there is one, the skin of a person.
+    """Writes a clip with one node per joint, including the skin of the person if the clip has one.
 
     `text` is stored in the file. The node `lifted` above the joints is raised by the thickness of
     the soles, so that the person stands on the soles. In a rig with a root on the floor, the hips
-    are lifted instead, so that the root stays on the floor.
+    are raised instead, so that the root stays on the floor.
     """
     offsets, moves, lift = clip.offsets, clip.moves, clip.lift
     if clip.root >= 0:
@@ -59,7 +59,7 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
 
 
 def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
-    """Appends the mesh of a person. Returns the parts of the document that describe it."""
+    """Appends the mesh of a person, and returns the parts of the document that describe it."""
     light = np.rint(255 * (skin.colors / 255) ** 2.2)  # from screen colors to linear colors
     light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
     attributes = {

@@ -2,8 +2,8 @@
 
 Game engines move a character with a root on the floor, and play the rest of the motion relative to
 this root. Motions are cut in this representation, so that the last pose of one clip can be the
-first pose of the next. Then the path of the root is added again, and inverse kinematics keeps each
-foot in place during its contacts.
+first pose of the next. Afterward, the path of the root is added again, and inverse kinematics keeps
+each foot in place during its contacts.
 
 Arrays contain the positions of the 22 SMPL joints in F frames, in meters, y up. Angles are in
 radians. Positive angles turn to the left.
@@ -19,16 +19,16 @@ from flame_mdm.representations.skeleton import JOINT, SMPL22
 
 # Seconds over which the path of the root is smoothed, so that it does not follow individual steps
 SMOOTHNESS = 0.15
-# A toe is in contact up to this height in meters above its lowest position
+# A toe counts as in contact up to this height, in meters, above its lowest position
 LOW = 0.05
 # Maximum horizontal speed of a planted toe in m/s
 SLOW = 0.25
 # Contacts and gaps between contacts are ignored if they are shorter than this many seconds
 SHORT = 0.1
-# Seconds over which the body is lowered for a leg that is too short
+# Seconds over which the body is lowered if a leg is too short
 LOWERING = 0.2
-# Number of repetitions of a loop in which toes are planted together. The middle repetition has
-# neighbors on both sides.
+# Number of repetitions of a loop in which toes are planted together, so that the middle repetition
+# has neighbors on both sides
 COPIES = 3
 FEET = tuple(
     tuple(JOINT[f"{side}_{name}"] for name in ("hip", "knee", "ankle", "foot"))
@@ -44,7 +44,7 @@ class GroundedMotion:
     Attributes:
         local: (F, 22, 3), joint positions relative to the root, which faces +z.
         path: (F, 2), x and z of the root.
-        heading: (F,), direction of the root; 0 = it faces +z.
+        heading: (F,), direction of the root; 0 = facing +z.
         contacts: (F, 2), whether the left and the right toes are planted.
         fps: frames per second.
     """
@@ -65,7 +65,7 @@ class GroundedMotion:
         return joints
 
     def with_world(self, joints: np.ndarray) -> "GroundedMotion":
-        """Returns this motion with other world joint positions (F, 22, 3) above the same root."""
+        """Returns a motion with the same root but other world joint positions (F, 22, 3)."""
         local = joints.copy()
         local[..., [0, 2]] -= self.path[:, None]
         return replace(self, local=turned(local, -self.heading[:, None]))
@@ -106,9 +106,9 @@ def facing(joints: np.ndarray) -> np.ndarray:
 
 
 def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
-    """Adds a root on the floor below the pelvis of joints (F, 22, 3).
+    """Adds a root on the floor, beneath the pelvis, to joint positions (F, 22, 3).
 
-    The path and the direction of the root are smooth.
+    The path and the direction of the root are smoothed over time.
     """
     # The root is the pelvis, projected onto the floor and smoothed in time. In an engine, the sway
     # of a walk belongs to the pose, not to the path.
@@ -155,7 +155,7 @@ def anchored(
 
 
 def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns joints (F, 22, 3) with the bone lengths of a pose (22, 3).
+    """Returns the joints (F, 22, 3) with the bone lengths of a pose (22, 3).
 
     The bones keep their directions.
     """
@@ -180,7 +180,7 @@ def planted(
 ) -> GroundedMotion:
     """Returns the motion with toes that do not move during contacts.
 
-    The toes are also never below the floor. If a leg would be too short, the body is lowered. With
+    The toes also stay above the floor. If a leg is too short, the body is lowered. With
     `fixed_start` and `fixed_end`, the first and the last pose do not change. A foot that is planted
     in a fixed pose stays at its position in that pose.
     """
@@ -219,7 +219,7 @@ def planted(
 
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
-    """Returns by how much (F,) the hip of a leg is too high for a foot moved by `shift` (F, 3)."""
+    """Returns how far (F,) the hip of a leg must be lowered for a foot moved by `shift` (F, 3)."""
     # The hip may be anywhere in a sphere around the ankle. The radius of the sphere is the length
     # of the straight leg, or the distance from hip to ankle in the motion if this distance is
     # longer. `highest` is the height of the sphere above the hip's position on the floor.
@@ -307,8 +307,8 @@ def planted_loop(motion: GroundedMotion) -> GroundedMotion:
 
     The result is still a loop: its last pose is its first pose.
     """
-    # Contacts are cut at the ends of a single cycle. Therefore, several cycles in a row are planted.
-    # The middle cycle is kept, because its neighbors are also cycles.
+    # The ends of a single cycle would cut contacts in two. Therefore, several cycles in a row are
+    # planted, and the middle one is kept, because its neighbors are also cycles.
     count = len(motion) - 1
     several = planted(repeated(motion))
     middle = several.local[count * (COPIES // 2) : count * (COPIES // 2 + 1) + 1].copy()

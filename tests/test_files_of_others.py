@@ -446,7 +446,7 @@ def test_two_people_and_rates_of_cmu_are_said(tmp_path: Path):
     numbered = [*rows[:3], *(f"{row} {row}" for row in rows[3:])]
     (tmp_path / "two.bvh").write_text(head + second + "MOTION" + "\n".join(numbered) + "\n")
     two = read(tmp_path / "two.bvh")
-    assert two.notes == ("the file contains 2 people (ROOT), of which only the first one is read",)
+    assert two.notes == ("the file contains 2 people (ROOT), but only the first one is read",)
     np.testing.assert_allclose(two.joints, walk().joints, atol=1e-5)
     motion = replace(walk(), fps=120.0)
     motion.save(tmp_path / "60_01.bvh", rig="cmu")

@@ -121,7 +121,7 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns whether the left and right toes are planted (F, 2), given their height and speed."""
+    """Returns whether the left and right toes are planted (F, 2), from their height and speed."""
     # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
     # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]

@@ -1,4 +1,4 @@
-"""Skeletons in motion files, their maps to SMPL's joints, and body size checks."""
+"""Skeletons in motion files, their maps to SMPL's joints, and checks of the body size."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ LEG, USUAL_LEG = (
 CHILD = 0.25
 # Minimum length of a foot in meters, ankle to toes
 FOOT = 0.02
-# If left and right limbs differ by more than this ratio, the joints are not in the assumed order
+# The joints are not in the assumed order if the lengths of left and right limbs differ by more than
+# this ratio
 UNEQUAL = 1.5
-# The order is also wrong if the lengths of limbs vary by more than this fraction of their mean
+# The order is also wrong if the length of a limb varies by more than this fraction of its mean
 CHANGING = 0.25
 LIMBS = (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 # Prefixes of SMPL's joints
@@ -57,7 +58,7 @@ Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """Map from the joints in files to SMPL's 22 joints, whose positions are in meters, y up.
+    """How the joints in files map to SMPL's 22 joints, whose positions are in meters, y up.
 
     The fields are the keys of `skeleton.yaml`.
     """
@@ -65,7 +66,7 @@ class Layout(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
     # For each SMPL joint, the name of its joint in the files
     map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}
-    # Joint names for arrays, in order. BVH files contain their own names.
+    # Names of the joints in arrays, in order. BVH files contain the names of their joints.
     joints: list[str] = []
     # Meters per unit of length in the files
     unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0
@@ -73,7 +74,7 @@ class Layout(BaseModel):
     up: Literal["y", "z", "-y"] = "y"
     # Frame rate of files that contain none
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
-    # Whether the files contain mirrored motion. If so, the sign of x is changed.
+    # Whether the files contain mirrored motion, in which case the sign of x is changed
     mirrored: bool = False
     # Whether bodies may be children
     children: bool = False
@@ -83,7 +84,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The joints in the files that the map uses."""
+        """The names of the joints in the files that the map uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -93,9 +94,9 @@ class Layout(BaseModel):
 
     @property
     def bones(self) -> Mapping[str, str]:
-        """Bones that SMPL's joints follow, by joint.
+        """For each SMPL joint, the bone in the files whose rotation it follows.
 
-        The position map may use the mean of several joints instead.
+        The position of the joint may be the mean of several joints instead.
         """
         return self._bones
 
@@ -107,8 +108,8 @@ class Layout(BaseModel):
     def bone(self, joint: str) -> str:
         """Returns the joint in the files that turns like an SMPL joint.
 
-        The result is the bone of the SMPL joint, or the joint with the largest weight in its
-        position.
+        This is the bone of the SMPL joint or, without a bone, the joint with the largest weight in
+        its position.
         """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
@@ -180,7 +181,7 @@ def _shares(source: Source) -> Mapping[str, float]:
 def _layout(
     joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, **fields: Any
 ) -> Layout:
-    """Returns a layout from `layouts.yaml`. The comments in this file describe the arguments."""
+    """Returns a layout from `layouts.yaml`. The comments in that file describe the arguments."""
     parts = {key: fields.pop(key) for key in ("sides", "trunk", "arm", "leg") if key in fields}
     skeleton = presets()[rig] if rig else parts
     bones = joint_names(skeleton) if skeleton else {joint: joint for joint in SMPL22.joints}
@@ -224,7 +225,7 @@ def _variants() -> dict[str, Layout]:
 
 @cache
 def _spelled() -> dict[str, dict[str, str]]:
-    """Returns the spellings of the joint names that each of `_variants` uses.
+    """Returns the spellings of the joint names for each of `_variants`.
 
     The result maps each layout to a mapping from spelling to name.
     """
@@ -238,7 +239,7 @@ def _nearest(names: tuple[str, ...]) -> Match:
 
 
 def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
-    """Reads a BVH or AMC file. `rate` overrides its frame rate."""
+    """Reads a BVH or AMC file. `rate` overrides the frame rate of the file."""
     if path.suffix.lower() == ".amc":
         return asf.read(path, rate)
     file = bvh.read(path)
@@ -248,8 +249,8 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns the layout of a file from `read_tree`, and the names of its joints in this layout.
 
-    `fields` of `Layout` override the known fields. Known skeletons whose arrays are in meters use
-    centimeters in BVH files, as written by `flame_mdm.formats`.
+    `fields` override the fields of the supported layout. If arrays with this skeleton are in
+    meters, BVH files are assumed to be in centimeters, as written by `flame_mdm.formats`.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
@@ -260,7 +261,7 @@ def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Seque
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns the layout and the joint names of an array (F, J, 3).
 
-    Both are taken from `fields`, or determined by the number of joints.
+    Both are taken from `fields` or determined by the number of joints.
     """
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"joints have shape {joints.shape}, not (frames, joints, 3)")
@@ -296,7 +297,7 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
     The map of the layout uses these names. Names are matched as in `flame_mdm.formats.names`.
 
     Raises:
-        UserError: If no layout fits, or a name could mean several joints.
+        UserError: If no layout fits, or if a name could refer to several joints.
     """
     joints, mapped = ", ".join(names)[:1000], "map" in fields
     advice = (
@@ -328,7 +329,7 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 def _one(name: str, candidates: Sequence[str]) -> str:
     """Returns the joint of a file to which a name refers.
 
-    If several joints are possible, the joint with exactly this name is returned.
+    If several joints match, the joint with exactly this name is returned.
     """
     if len(set(candidates)) == 1 or name in candidates:
         return name if name in candidates else candidates[0]
@@ -347,7 +348,7 @@ def _renamed(source: Source, names: Mapping[str, str]) -> Source:
 def skeleton_file(path: Path) -> Path | None:
     """Returns the nearest `skeleton.yaml` in a file's folder or above it.
 
-    Raises `UserError` if it is not a regular file.
+    Raises `UserError` if that path is not a regular file.
     """
     for folder in path.absolute().parents:
         if os.path.lexists(folder / "skeleton.yaml"):
@@ -370,7 +371,7 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 def read_skeleton(path: Path) -> dict[str, Any]:
     """Reads fields of `Layout` from a skeleton file.
 
-    A `UserError` names the file and the key.
+    If a field is invalid, raises a `UserError` that names the file and the key.
     """
     try:
         fields = Layout.model_validate(read_yaml(path)).model_dump(exclude_unset=True)
@@ -406,12 +407,12 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
 
     Args:
         joints: (F, 22, 3), positions of SMPL's joints in meters.
-        unit: unit of the file, in meters.
+        unit: meters per unit of length in the file.
         children: whether bodies may be children.
-        doubt: a line about another problem with the motion, which is added to the message.
+        doubt: a line about another problem with the motion, to be added to the error message.
 
     Raises:
-        UserError: If the leg length is not a person's. The message suggests a unit.
+        UserError: If the leg length is not plausible for a person. The message suggests a unit.
     """
     leg, shortest = leg_length(joints), CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:
@@ -436,7 +437,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
 
 
 def _usual_unit(leg: float, unit: float) -> str:
-    """Returns advice for a file with legs of `leg` meters if no usual unit fits."""
+    """Returns advice for a file with legs of `leg` meters that no common unit explains."""
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"
@@ -461,10 +462,9 @@ def check_feet(joints: np.ndarray) -> None:
             raise UserError(
                 f"the {side} foot has no length. Map {side}_foot in skeleton.yaml {advice}"
             )
-    # The toes of a foot in the air may point backwards, for example in a run. Therefore, only the
-    # lower foot of each frame counts. The toes of one foot of a kneeling person also point
-    # backwards. Therefore, left and right count as swapped only if both feet point backwards in
-    # enough frames.
+    # Only the lower foot of each frame counts, because the toes of a foot in the air may point
+    # backwards, for example in a run. One foot of a kneeling person may also point backwards, so
+    # left and right count as swapped only if both feet do so in enough frames.
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     depths = [
         ((at[f"{side}_hip"] - at[f"{side}_ankle"]) * trunk).sum(1) for side in ("left", "right")
@@ -480,18 +480,19 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Checks that an array of joints was not mistaken for another skeleton with the same number of joints.
+    """Checks that an array was not mistaken for a skeleton with the same number of joints.
 
-    The limbs of a person have the same length on both sides, and their length does not change. With
-    a different joint order or skeleton, these pairs of joints are not bones.
+    The limbs of a person have the same length on both sides, and this length does not change. If
+    the joint order or the skeleton is wrong, the pairs of joints that are compared are not limbs.
 
     Args:
-        joints: (F, 22, 3), SMPL's joints, mapped as if the array had the joints of the skeleton.
+        joints: (F, 22, 3), positions of SMPL's joints under the assumption that the array has the
+            joints of the skeleton.
         count: number of joints in the array.
         skeleton: name of the skeleton.
 
     Raises:
-        UserError: If the limbs differ between the sides or change in length.
+        UserError: If limbs differ in length between the sides, or if their length changes.
     """
     lengths = np.stack(
         [_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1

@@ -1,9 +1,9 @@
 """`Motion`, a single motion independent of any model, and writers for motion files.
 
-`docs/formats.md` describes the files. The 6D rotations in the 263 features of HumanML3D are not
-SMPL's rotations: they follow different chains and do not define the twist of a bone. They are never
-exported. Rotations are computed from joint positions (`flame_mdm.formats.poses`), or come from
-features and files that contain SMPL's rotations.
+`docs/formats.md` describes the files. The 6D rotations in the 263 features of HumanML3D are never
+exported, because they are not SMPL's rotations: they follow different chains and do not define the
+twist of a bone. Exported rotations are computed from joint positions (`flame_mdm.formats.poses`) or
+come from features and files that contain SMPL's rotations.
 """
 
 import json
@@ -57,7 +57,7 @@ END_SITES = {
     "left_wrist": ADULT[22],
     "right_wrist": ADULT[23],
 }
-"""Tips of the head, toes and hands beyond the last joints, in meters.
+"""Positions of the tips of head, toes and hands relative to the last joints, in meters.
 
 Programs draw a bone only if it has a tip.
 """
@@ -72,15 +72,17 @@ class Motion(PosedFigure):
             are float32.
         poses: rotations of SMPL's joints, if known.
         features: (F, D) float32 features in the units of the data, or empty if unknown.
-        representation: name of the representation of the features.
+        representation: name of the representation to which the features belong.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
         degenerate: number of frames in which the features determine no rotation for at least one
             joint.
-        parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
-        notes: lines for the user about the file that was read, such as frames that were left out.
-        bones: rotations from the bones of the source file, for features that contain rotations.
-            They show how a forearm turns about its own axis. Files and pictures are made from
-            `poses` or joint positions instead.
+        parts: text, first frame and end (exclusive) of each part of a sequence; () if there is only
+            one part.
+        notes: lines for the user about the file that was read, for example about frames that were
+            left out.
+        bones: rotations from the bones of the source file, which also show how a forearm turns
+            about its own axis. They are used to encode features that contain rotations. Files and
+            pictures are created from `poses` or joint positions instead.
 
     Raises:
         UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive
@@ -142,20 +144,21 @@ class Motion(PosedFigure):
             path: the file. Its extension selects the format (docs/formats.md).
             rest_pose: begin a `.bvh` file with a frame in the rest pose, in which the arms point to
                 the sides. Some programs expect this frame.
-            rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file, one of
+            rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file: a name from
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's skeleton.
             character: your own character, as a file or as the result of `characters.read`. The
                 motion of a `.glb` character with a skin can be saved as a `.glb`, `.fbx` or USD
-                file, the motion of a `.bvh` character as a `.bvh` file.
+                file, and the motion of a `.bvh` character as a `.bvh` file.
             body: the body in `.glb`, `.fbx`, USD, `.gif` and `.mp4` files, from
                 `formats.people.load_body`. Default: the mannequin.
-            root_motion: whether the root of `rig` on the floor follows the hips in a `.glb`, `.fbx`
-                or USD file. Otherwise, it stays in place. Only for `rig="unreal"` and `rig="soma"`.
+            root_motion: whether the root on the floor follows the hips in a `.glb`, `.fbx` or USD
+                file. Otherwise, the root stays in place. Only `rig="unreal"` and `rig="soma"` have
+                such a root.
             facts: additional entries for an `.npz` file, such as the seed.
 
         Raises:
-            UserError: If an argument is unknown, if it does not fit the file or the motion, or if
-                the package av is missing for `.mp4`.
+            UserError: If an argument is unknown or does not fit the file or the motion, or if the
+                package av, which `.mp4` files require, is missing.
         """
         path = Path(path)
         ending = path.suffix.lower()
@@ -234,8 +237,8 @@ class Motion(PosedFigure):
     def show(self) -> Any:
         """Returns a player.
 
-        A Jupyter notebook displays the player. Elsewhere, the path of an HTML page is returned,
-        which opens in any browser.
+        In a Jupyter notebook, the player is displayed. Elsewhere, the path of an HTML page that
+        opens in any browser is returned.
         """
         from flame_mdm.visualize import player_page
 
@@ -244,7 +247,7 @@ class Motion(PosedFigure):
         if hasattr(ipython, "kernel"):  # a notebook, not a terminal
             style = "width:100%;height:560px;border:0"
             frame = f'<iframe sandbox="allow-scripts allow-downloads" style="{style}" srcdoc="{escape(page)}"></iframe>'
-            # IPython warns of a bare iframe, so it is wrapped in a division.
+            # IPython warns about a bare iframe, so it is wrapped in a division.
             return import_module("IPython.display").HTML(f"<div>{frame}</div>")
         path = Path(tempfile.mkdtemp(prefix="flame_mdm_")) / "motion.html"
         write_text(path, page)
@@ -252,7 +255,7 @@ class Motion(PosedFigure):
 
 
 def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Returns axis-angle vectors (F, 66) of 22 joints and the translation (F, 3).
+    """Returns the axis-angle vectors (F, 66) of the 22 joints and the translation (F, 3).
 
     Both are in AMASS's coordinates: meters, z up.
     """
@@ -320,7 +323,7 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
             at_rest = np.tile(offsets[joint], (len(angles), 1))
             columns.append(np.round(root / skeleton.unit, 5) if joint == skeleton.hips else at_rest)
         columns.append(angles[:, joint])
-    # Programs disagree on whether the channels replace the offset or are added to it.
+    # Programs disagree on whether the channels replace the offset or are added to it, so it is 0.
     offsets[skeleton.hips] = 0
     ends = {
         skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()
@@ -345,7 +348,7 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
 def _write_rigged(
     motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool
 ) -> str:
-    """Writes a .glb, .fbx or USD file: the moving skeleton with a skinned body, if one fits."""
+    """Writes a .glb, .fbx or USD file with the moving skeleton and, if one fits, a skinned body."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
     name = motion.text or motion.id or "motion"
@@ -415,8 +418,8 @@ def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     return summary + (reason and f"; without a body: {reason}")
 
 
-# In millimeters. If the error is larger than this, the message about a written file names the joint
-# with the largest error.
+# Error in millimeters above which the message about a written file names the joint with the largest
+# error
 LARGE_ERROR = 10
 
 

@@ -1,10 +1,10 @@
 """Matching of joint names.
 
-Blender's extension contains this file, so it uses only the standard library.
+The Blender extension also contains this file, so it uses only the standard library.
 
 Programs spell the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
-left up leg`, `L_UpLeg`. Differences in case, separators, and a prefix that many joints share are
-ignored. The side may be marked at the beginning or the end of a name, by a letter or a word.
+left up leg`, `L_UpLeg`. Case, separators, and a prefix that many joints share are ignored. The side
+may be marked at the beginning or the end of a name, by a letter or a word.
 """
 
 import re
@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 # Marks of the left and of the right side in names
 SIDES = (("left", "l"), ("right", "r"))
-# Minimum number of joints with a prefix; without hands, skeletons have about 20
+# Minimum number of joints that share a prefix; skeletons without hands have about 20 joints
 SHARED = 10
 # Maximum number of prefixes that are tried
 PREFIXES = 16
-# A prefix that may have no separator after it
+# A prefix that need not be followed by a separator
 JOINED = re.compile(r"mixamorig\d*")
 
 
@@ -43,10 +43,10 @@ def plain(name: str) -> str:
 
 
 def spellings(name: str, opposite: str) -> list[str]:
-    """Returns the `plain` spellings of a name. The name itself is first.
+    """Returns the `plain` spellings of a name, beginning with the name itself.
 
-    `opposite` is the counterpart on the other side. The mark of the side is spelled short or long,
-    before or after the rest of the name: LeftHip, L_Hip, hip.L.
+    `opposite` is the counterpart on the other side. The mark of the side may be short or long, and
+    may precede or follow the rest of the name: LeftHip, L_Hip, hip.L.
     """
     name, opposite = plain(name), plain(opposite)
     options = [name]
@@ -64,7 +64,7 @@ def spellings(name: str, opposite: str) -> list[str]:
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
     """Returns a mapping from each spelling (see `spellings`) to its name.
 
-    If two names have the same spelling, it refers to the name that is spelled exactly like it.
+    A spelling that two names share refers to the name that is spelled exactly like it.
 
     Args:
         pairs: for each name, its counterpart on the other side, or the name itself.
@@ -82,11 +82,11 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
     """Returns the skeleton that best matches a list of joint names.
 
-    Skeletons without missing joints are preferred. The next criteria are the number of joints and
-    the order. If several prefixes match equally well, the match is ambiguous.
+    Skeletons without missing joints are preferred, then skeletons with more matching names, then
+    earlier ones. If several prefixes match equally well, the match is ambiguous.
 
     Args:
-        names: joint names in a file, at least one.
+        names: joint names in a file. There must be at least one.
         skeletons: for each skeleton, a mapping from spellings of a joint to the skeleton's name of
             the joint. The first spelling is preferred.
     """

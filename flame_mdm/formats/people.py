@@ -33,8 +33,8 @@ from flame_mdm.visualize.body import (
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's shape parameters and their defaults.
 
-Values from 0 to 1 mean male to female, baby to old (2/3: a young adult), small to tall, and light
-to heavy.
+Values range from 0 to 1: from male to female, from baby to old (2/3 is a young adult), from small
+to tall, and from light to heavy.
 """
 PARTS = {
     "spine1": "spine04 spine03",
@@ -214,7 +214,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 
 
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns a color (V, 3), from 0 to 255, for each vertex, given the joint that it follows.
+    """Returns the color (V, 3), from 0 to 255, of each vertex, based on the joint that it follows.
 
     The hair has the shape of the mannequin's hair.
     """
@@ -249,11 +249,11 @@ def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
 
 
 def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Returns weights (V, 28) with helper bones.
+    """Adds helper bones to skinning weights, and returns the new weights (V, 28).
 
     The upper part of a limb follows a helper bone, which turns less about the limb. In the forearm,
     the lower part follows a helper bone, which takes part of the twist of the wrist. `joints` (22,
-    3) are the joints of the mesh.
+    3) are the joint positions of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:
@@ -276,8 +276,7 @@ def packed(
 ) -> dict[str, np.ndarray]:
     """Returns the arrays that make up a body file, which `Mesh` reads.
 
-    Points are stored in units of 1/20 mm, with the pelvis at 0. Normals are stored in units of
-    1/127.
+    Points are stored in units of 1/20 mm, with the pelvis at 0, and normals in units of 1/127.
     """
     bones, shares = largest_weights(weights)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -21,7 +21,8 @@ CHILDREN = tuple(
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
 """Joints with children, from the root outward. Corresponding left and right joints form groups."""
-# For each joint between pelvis and chest, its fraction of the rotation from pelvis to chest
+# For each joint between pelvis and chest, the fraction of the rotation from pelvis to chest that it
+# takes
 SPINE = {
     3: 1 / 3,
     6: 2 / 3,
@@ -37,16 +38,17 @@ dominates.
 # Weight of the foot relative to the shin, for the twist of a thigh. While the leg is straight, the
 # shin does not determine the twist.
 FOOT = 0.3
-# Seconds over which bends are averaged, so that an arm does not spin while it is nearly straight
+# Seconds over which bend directions are averaged, so that an arm does not spin while it is nearly
+# straight
 SMOOTH = 0.1
-# Number of squarings. The result is the 4,096th power, in which only the largest eigenvector
+# Number of squarings. They result in the 4,096th power, in which only the dominant eigenvector
 # remains.
 SQUARINGS = 12
 
 
 @dataclass(eq=False)
 class Poses:
-    """A moving body, in meters, y up.
+    """A moving body, given by its rest pose and rotations, in meters, y up.
 
     The rest pose is SMPL's rest pose: arms to the sides, facing +z, left at +x.
     """
@@ -98,11 +100,11 @@ class BoneRotations:
 
 
 def solve(joints: Tensor, fps: float) -> Poses:
-    """Computes a body and its rotations, which reproduce joint positions in every frame.
+    """Computes a body and the rotations with which it reproduces joint positions in every frame.
 
-    Bones have their mean length over the clip. Pelvis and chest have three bones each, and take the
-    rotation that fits all three bones best (Kabsch 1976). Every other joint aims its bone at the
-    next joint.
+    Bones have their mean length over the clip. Pelvis and chest, which have three bones each, take
+    the rotation that fits all three bones best (Kabsch 1976). Every other joint aims its bone at
+    the next joint.
 
     Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
     twisted so that knees and elbows bend like hinges. The twist of the spine is distributed evenly
@@ -192,8 +194,8 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
 
     The quaternions are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute
-    orientation using unit quaternions"), computed by repeated squaring. Bones without length result
-    in the identity.
+    orientation using unit quaternions"), computed by repeated squaring. If the bones have no
+    length, the result is the identity.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
     # The rotation is the eigenvector of this symmetric matrix with the largest eigenvalue. ONNX has

@@ -1,6 +1,6 @@
 """World rotations of a body.
 
-Blender's extension contains this file, so the file requires only numpy.
+The Blender extension also contains this file, so it requires only numpy.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ TOES = (0.02, 0.09, np.radians(60))
 """Limits of the toe bend.
 
 Toes stay flat while the toe joint is below the first height, and follow the foot above the second
-height. The third number is the maximum bend.
+height (both in meters). The third number is the maximum bend in radians.
 """
 
 

@@ -56,26 +56,25 @@ BODY_AXES = {"z": AMASS_AXES, "y": torch.eye(3, dtype=torch.float64), "-y": CAME
 As in AMASS, the default is z.
 """
 PELVIS = (0.0, -0.223, 0.028)
-"""Position of the pelvis in SMPL's template in meters, in the axes of the file.
+"""Pelvis position in SMPL's template, in meters and in the axes of the file.
 
 A body with translation 0 is at this position, for any rotation.
 """
 
 Standard = Callable[[Bvh], tuple[Bvh, Mapping[str, Any]]]
-"""A function that changes the tree of a published data set.
+"""A function that changes the joint tree of a published data set.
 
-It returns the tree and fields of `Layout`.
-
-Without fields, the layout is determined from the file.
+It returns the new tree and fields of `Layout`. If there are no fields, the layout is determined
+from the file.
 """
 
 
 @dataclass(frozen=True)
 class Doubts:
-    """Findings that look wrong in a motion, but may be intended.
+    """Properties of a motion that look wrong but may be intended.
 
     Attributes:
-        upright: mean vertical component of the trunk direction, from -1 to 1. The value is NaN (not
+        upright: mean vertical component of the trunk direction, from -1 to 1. It is NaN (not
             measured) for files from this project and for KIT-ML's skeleton.
         lying: a message if the body is lying, otherwise "".
         jump: a message if the body jumps or a leg flips, otherwise "".
@@ -93,12 +92,12 @@ class Doubts:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A motion that was read from a file, with the findings of the reader.
+    """A motion that was read from a file, with further results of the reader.
 
     Attributes:
         motion: the motion. Its notes are lines for the user.
         layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
-        doubts: findings that look wrong. Their lines are among the notes of the motion.
+        doubts: properties that look wrong. The notes of the motion also state them.
         smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, or
             None if the file contains no such rotations.
         tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
@@ -130,8 +129,8 @@ def read(
             except for files written by this project. `fps`, `unit` and `up` override it.
         fps: frames per second; overrides the rate in the file. .npy and .amc files contain no frame
             rate.
-        unit: meters per unit of length in the file. Not applicable to files with SMPL's rotations,
-            such as AMASS's files.
+        unit: meters per unit of length in the file. It does not apply to files with SMPL's
+            rotations, such as AMASS's files.
         up: the up axis of the file: y, z or -y.
         resample_to: target frame rate; None = the frame rate of the file. Rotations are
             interpolated on the sphere, joints and translations with cubic splines.
@@ -143,9 +142,8 @@ def read(
 
     Raises:
         FileNotFoundError: If there is no such file.
-        UserError: If the file is damaged or of an unsupported type, if it has no frame rate, or if
-            the body does not have the size of a person. Also if an argument has no effect on the
-            file.
+        UserError: If the file is damaged or of an unsupported type, if it has no frame rate, if the
+            body does not have the size of a person, or if an argument has no effect on the file.
 
     Example:
         >>> walk = read("walk.bvh", resample_to=20)
@@ -170,7 +168,7 @@ def read_recording(
     """Reads and checks a motion; see `read` for arguments and errors.
 
     With `as_smpl`, all arrays are mapped to SMPL's 22 joints. Otherwise, KIT-ML's 21 joints and
-    SMPL's hands are kept. `standard` changes the tree of a published data set, whose root is then
+    SMPL's hands are kept. `standard` changes the tree of a published data set, and the root is then
     resampled linearly, as in the published version.
     """
     path = Path(path)
@@ -229,9 +227,7 @@ def _of_tree(
     )
     notes = []
     if (people := tree.parents.count(-1)) > 1:
-        notes.append(
-            f"the file contains {people} people (ROOT), of which only the first one is read"
-        )
+        notes.append(f"the file contains {people} people (ROOT), but only the first one is read")
 
     if standard is not None:
         tree, standard_fields = standard(tree)
@@ -309,7 +305,7 @@ def _of_joints(
 ) -> Recording:
     """Returns the recording of an array of joints.
 
-    `said` contains the keys from the command, which override the keys in the file.
+    `said` contains the keys that were set in the command. They override the keys in the file.
     """
     rate, joints = _rate(data, rate, fields), data["joints"]
     stated = {key: data[key] for key in ("up", "unit") if key in data}
@@ -398,7 +394,7 @@ def _of_ours(
 ) -> Recording:
     """Returns the recording of a file that this project wrote.
 
-    The motion is in meters, y up, with rotations and features.
+    Such a file is in meters, y up, and contains rotations and features.
     """
     for key, value in said.items():
         raise UserError(
@@ -451,7 +447,7 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: str) -> None:
-    """Raises `UserError` if a key is set that has no effect on the file."""
+    """Raises `UserError` if a key that has no effect on the file is set."""
     for key in without_effect:
         if key in fields:
             raise UserError(
@@ -533,7 +529,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
             raise UserError(
                 f"{len(data['poses'])} frames of poses, but {len(data['joints'])} frames of joints"
             )
-        # This translation does not include the pelvis position of SMPL's template
+        # This translation does not include the pelvis position in SMPL's template
         translation, turns = smpl_motion(data)
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))

@@ -8,7 +8,7 @@ from flame_mdm.safe_io import read_package_yaml
 AT_60: frozenset[str] = frozenset(
     read_package_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"]
 )
-"""Subjects and single recordings that CMU recorded at 60 frames per second."""
+"""Subjects and individual recordings that CMU captured at 60 frames per second."""
 # Skeletons in CMU's recordings and in their conversions
 CMU_SKELETONS = (
     "CMU",
@@ -16,12 +16,12 @@ CMU_SKELETONS = (
     "Daz",
     "Character Creator",
 )
-# File name of a CMU recording, with its subject
+# Pattern for a CMU recording in a file name; the group is the number of the subject
 TRIAL = re.compile(r"(?<!\d)(\d{2,3})_\d{2,3}(?!\d)")
 
 
 def is_at_60(trial: str) -> bool:
-    """Returns whether CMU lists a recording, such as 60_01, at 60 frames per second."""
+    """Returns whether CMU lists a recording, such as 60_01, as captured at 60 frames per second."""
     return not {trial, trial.partition("_")[0]}.isdisjoint(AT_60)
 
 

@@ -1,6 +1,6 @@
 """Frame rates, lengths and resampling of motions.
 
-Rates and lengths are limited, because even a file of a few bytes can declare any value.
+Frame rates and lengths are limited, because even a file of a few bytes can declare any values.
 """
 
 import math
@@ -16,7 +16,8 @@ RATES = (0.1, 1000.0)
 MAX_FRAMES = 500_000
 # Maximum number of frames times joints of a tree: one hour with 57 joints at 120 frames per second
 MAX_POSITIONS = 25_000_000
-# Number of frames times joints that is accepted in files of any size; reading it takes 300 MB
+# Number of frames times joints that is accepted in files of any size; reading so many takes 300 MB
+# of memory
 FEW_POSITIONS = 1_000_000
 BYTES_PER_POSITION = 4
 """Minimum number of bytes per frame and joint, for files with more positions.
@@ -28,7 +29,7 @@ MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
-    """Returns a frame rate as a float. `name` is its name in error messages.
+    """Checks a frame rate and returns it as a float. `name` is its name in error messages.
 
     Raises:
         UserError: If the value is not a number in the range `RATES`.
@@ -70,7 +71,7 @@ def frame_pairs(
     """Returns the frames before and after each new frame, and its position between them, from 0 to 1.
 
     New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may be up
-    to `slack` of a frame later.
+    to `slack` frames later.
 
     Raises:
         UserError: If there are more than `MAX_FRAMES` frames before resampling, or more than
@@ -107,7 +108,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Returns the cubic spline through values (F, ...) at `times` (N,).
 
-    The values are at times 0, 1, ...; `times` are in frames.
+    The values are at times 0, 1, ..., and `times` are in frames.
     """
     from scipy.interpolate import CubicSpline  # imported here, because few motions need it
 

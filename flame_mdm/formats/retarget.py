@@ -119,8 +119,8 @@ def preset(name: str | None, poses: Poses) -> Rig:
 class _RigJoint(NamedTuple):
     """A joint of a rig in the rest pose.
 
-    Its fields are a name, a parent, an SMPL joint, a position, a world rotation and a neutral
-    rotation.
+    Its fields are its name, the index of its parent, the index of the SMPL joint that it follows
+    (or -1), its position, its world rotation, and its neutral rotation.
     """
 
     name: str
@@ -133,10 +133,9 @@ class _RigJoint(NamedTuple):
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
     """Returns the local axes (3, 3) of a joint in a T-pose; `bone` is the bone's direction."""
-    # Gram-Schmidt: the first direction is kept. The component along the first direction is removed
-    # from the second direction. The third axis is their cross product. The right side is the mirror
-    # image of the left side. In "opposed" skeletons, all three axes are then reversed, which keeps
-    # them right-handed.
+    # Gram-Schmidt: the first direction is kept, its component is removed from the second direction,
+    # and the third axis is their cross product. The right side is the mirror image of the left
+    # side. In "opposed" skeletons, all three axes are then reversed, which keeps them right-handed.
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
     matrix, columns = np.eye(3), []
     # The file lists the axes for two directions, and only for the left side.
@@ -166,9 +165,9 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
-    """Converts rotations to Euler angles in radians, without jumps.
+    """Converts rotations to Euler angles in radians that do not jump between frames.
 
-    Programs can then interpolate the angles.
+    Programs can therefore interpolate the angles.
 
     Args:
         matrices: (F, J, 3, 3), the rotations.
@@ -177,9 +176,9 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
     Returns:
         Angles (F, J, 3).
     """
-    # Two triples of Euler angles describe each rotation, (a, b, c) and (a + pi, pi - b, c + pi).
-    # Full turns may be added to each angle. In each frame, the triple nearest to the previous
-    # frame is used.
+    # Each rotation is described by two triples of Euler angles, (a, b, c) and (a + pi, pi - b, c +
+    # pi), and full turns may be added to each angle. In each frame, the triple nearest to the
+    # previous frame is used.
     turn = 2 * torch.pi
     first = torch.stack(
         [rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1

@@ -1,6 +1,6 @@
 """Skeletons of other programs, and moving characters.
 
-Blender's extension contains this file, so the file requires only numpy.
+The Blender extension also contains this file, so it requires only numpy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,15 +17,15 @@ CENTIMETER = 0.01
 SIDES = ("left", "right")
 LEGS = (("hip", "knee"), ("knee", "ankle"))
 LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
-"""Joints whose bone takes the direction of the motion's bone, with the joint at the end of the bone."""
+"""Joints whose bones take the directions of the motion's bones, and the joints at their ends."""
 SPINE = ("spine1", "spine2", "spine3")
 # Maximum angle in degrees between the trunk in a rest pose and the vertical
 TILT = 45
-# A facing direction within this angle of an axis, in degrees, is replaced by the axis
+# A facing direction within this angle of an axis, in degrees, is snapped to the axis
 SNAP = 8
 # Minimum sine of the bend angle of an elbow or knee in the rest pose. The twist of a straighter
-# limb cannot be determined. The limbs of people also bend sideways, in SMPL's body by 7 degrees at
-# the knees and by 5 degrees at the elbows. The axis of a small bend is therefore far from the axis
+# limb cannot be determined. The limbs of people also bend sideways; in SMPL's body, the knees do so
+# by 7 degrees and the elbows by 5 degrees. The axis of a small bend is therefore far from the axis
 # of the joint.
 BEND = 0.25
 # Maximum height in meters of the lowest joint of a clip that stands on the floor
@@ -33,7 +33,7 @@ GROUND = 0.1
 # Distance of the knee from the line of the leg, in thigh lengths, at which the bend of the knee
 # and the front of the thigh have the same weight
 STRAIGHT = 0.05
-REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
+REACH = 0.999  # maximum distance from hip to ankle, as a fraction of the straight leg's length
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,11 @@ class Rig:
     sources: tuple[int, ...]
     # (J, 3, 3), world rotations of these joints while SMPL is in its rest pose
     neutral: np.ndarray
-    # Order of the Euler angles of each joint in BVH files
+    # Order of each joint's Euler angles in BVH files
     orders: tuple[str, ...]
     # Meters per unit of length in BVH files
     unit: float = CENTIMETER
-    # (3, 3), rotation from the world coordinates of the file
+    # (3, 3), rotation from the world coordinates of the file to y up, facing +z
     frame: np.ndarray = field(default_factory=lambda: np.eye(3))
     # (J,), scale of each joint: world units per unit of the joint. Empty = all scales are 1.
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))
@@ -134,7 +134,7 @@ def recognized(
 ) -> dict[str, list[int]]:
     """Returns the indices of the joints that may correspond to each SMPL joint.
 
-    The correspondence is determined by the most similar known skeleton.
+    The most similar known skeleton determines the correspondence.
 
     Args:
         names: joint names by index.
@@ -153,9 +153,10 @@ def recognized(
 def matched(
     source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, int], list[str]]:
-    """Returns the indices of a character's joints, by SMPL joint, and the missing joints.
+    """Returns the index of the character's joint for each SMPL joint, and the missing joints.
 
-    Only required joints are reported as missing. Each SMPL joint has at most one index.
+    Joints are reported as missing only if they are required. Raises `UserError` if there are
+    several candidates for an SMPL joint.
     """
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
@@ -172,9 +173,9 @@ def matched(
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """A character's skeleton in its rest pose, y up, facing +z, in its own unit."""
+    """A character's skeleton in its rest pose, y up, facing +z, in the unit of the character."""
 
-    # The skeleton; `fitted` replaces its neutral rotations for a motion
+    # The skeleton, whose neutral rotations `fitted` replaces for a motion
     rig: Rig
     # For each SMPL joint, the index of the character's joint
     map: Mapping[str, int]
@@ -199,7 +200,7 @@ def rest_pose(
     """Returns a rest pose, turned so that y is up and +z is ahead.
 
     Args:
-        source: name of the character for error messages.
+        source: the character as it is named in error messages.
         names: names of the J joints.
         parents: index of each joint's parent.
         positions: (J, 3), in world coordinates with any unit and direction.
@@ -213,8 +214,8 @@ def rest_pose(
     def middle(name: str) -> np.ndarray:
         return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
 
-    # First, the pose must be usable: limbs have a length, the trunk and the legs are upright, and
-    # left and right joints are at different points.
+    # The pose must be usable: limbs have a length, the trunk and the legs are upright, and left and
+    # right joints are at different points.
     trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
     up = np.array(vertical)
     shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)
@@ -268,7 +269,7 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with neutral rotations, in which its limbs have the directions of SMPL's limbs at rest.
+    """Returns the skeleton with neutral rotations that give its limbs SMPL's directions at rest.
 
     `offsets` (22, 3) are the offsets of SMPL's joints from their parents at rest.
     """
@@ -324,9 +325,9 @@ def follow(
         Rotations (F, J, 3, 3) and positions (F, J, 3) of the character, and its skeleton.
     """
     # All joints take the rotations of the body, relative to the rest poses. The hips follow the
-    # scaled path. Legs with different proportions would then hover or sink. Therefore, each leg is
-    # bent until its toes or its ankle reach the scaled position, at the character's own height
-    # above the floor.
+    # scaled path. If the legs have different proportions, the feet would then hover or sink.
+    # Therefore, each leg is bent until its toes or its ankle reach the scaled position, at the
+    # character's own height above the floor.
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)
     neutral[JOINT["neck"]] = neutral[JOINT["head"]]
@@ -377,7 +378,7 @@ def follow(
 def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
-    """Returns the position (F, 3) of a knee if the ankle is at `target`, or as close to it as possible.
+    """Returns the knee position (F, 3) if the ankle is at `target` or as close to it as possible.
 
     The knee bends to the same side as before.
     """

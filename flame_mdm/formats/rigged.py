@@ -26,9 +26,10 @@ class Material:
     """A material of a mesh.
 
     Attributes:
-        name: its name.
+        name: the name of the material.
         color: red, green and blue from 0 to 1, as on screens.
-        image: content of a PNG or JPEG file that is multiplied by the color; empty = no image.
+        image: content of a PNG or JPEG file. Its colors are multiplied by `color`. Empty = no
+            image.
     """
 
     name: str
@@ -42,7 +43,7 @@ PALETTE = tuple(
 )
 """Materials of the package's person."""
 CONTACTS = ("LeftFootContact", "RightFootContact")
-"""Properties in .fbx and USD files that indicate whether the left or right foot is planted."""
+"""Properties in .fbx and USD files that state whether the left and right foot are planted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +52,14 @@ class Skin:
 
     Attributes:
         name: the name of the mesh.
-        points: (V, 3) in the coordinates of the mesh. `normals` (V, 3) have length 1.
+        points: (V, 3), vertices in the coordinates of the mesh.
+        normals: (V, 3), unit normals of the vertices.
         triangles: (T, 3), counterclockwise when seen from outside.
         palette: the materials.
         materials: (T,), index in `palette` of each triangle's material.
-        ordered: indices of joints of the skeleton. For a person, joints that follow SMPL's joints
-            come first, in SMPL's order.
-        bones: (V, K), the joints that move a vertex, as indices in `ordered`.
+        ordered: indices of the skeleton's joints that can move the mesh. For a person, joints that
+            follow SMPL's joints come first, in SMPL's order.
+        bones: (V, K), the joints that move each vertex, as indices in `ordered`.
         weights: (V, K), weights of these joints; each row adds up to 1.
         binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
             of each joint.
@@ -92,11 +94,11 @@ class RiggedClip:
         offsets: (J, 3), position of each joint relative to its parent in the rest pose.
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to the parents.
-        moves: positions (F, 3) relative to their parents, for the joints with a moving position.
-        lift: height by which a person is raised above these positions: the thickness of the soles.
+        moves: positions (F, 3) relative to the parent, for each joint whose position changes.
+        lift: the thickness of the soles, by which a person is raised above these positions.
         skins: the meshes; () if no person fits the motion.
-        scales: (J,), units of the parent per unit of each joint.
-        root: index of the joint on the floor above the hips; -1 = no such joint.
+        scales: (J,), scale of each joint: units of its parent per unit of the joint.
+        root: index of the joint on the floor that is the parent of the hips; -1 = no such joint.
         contacts: (F, 2), whether the left and the right toes are planted; (0, 2) = unknown.
     """
 
@@ -117,7 +119,7 @@ class RiggedClip:
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the world positions (F, J, 3) and world rotations (F, J, 3, 3) of the joints.
 
-        The joints are not lifted. All joints of the skeleton must have the scale 1.
+        The joints are not lifted. All joints of the skeleton must have a scale of 1.
         """
         positions = np.tile(self.offsets, (len(self.turns), 1, 1))
         for joint, moved in self.moves.items():
@@ -131,12 +133,12 @@ class RiggedClip:
         return positions, turns
 
     def part(self, frames: slice, name: str, contacts: np.ndarray) -> "RiggedClip":
-        """Returns part of the clip under a new name, with the contacts (F, 2) of its frames."""
+        """Returns some frames of the clip under a new name, with their `contacts` (F, 2)."""
         moves = {joint: moved[frames] for joint, moved in self.moves.items()}
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
     def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Returns the changes of each of `CONTACTS`: frames (K,) and new values (K,).
+        """Returns the frames (K,) in which each of `CONTACTS` changes, and the new values (K,).
 
         The first frame is always included. The result is empty if the contacts are unknown.
         """
@@ -151,7 +153,7 @@ class RiggedClip:
     def on_path(self, path: np.ndarray, heading: np.ndarray) -> "RiggedClip":
         """Moves an in-place clip along a path.
 
-        The root moves. If there is no root on the floor, the hips move.
+        The path moves the root or, if the skeleton has no root on the floor, the hips.
 
         Args:
             path: (F, 2), x and z.
@@ -202,9 +204,9 @@ class ContactEvent(NamedTuple):
 
 
 def contact_events(contacts: np.ndarray, fps: float) -> list[ContactEvent]:
-    """Returns the moments at which the left and the right foot land on and leave the floor, sorted by time.
+    """Returns the moments at which a foot is planted on the floor or lifted, sorted by time.
 
-    `contacts` are (F, 2).
+    `contacts` (F, 2) state whether the left and the right toes are planted.
     """
     events = []
     for foot, flags in zip(("left", "right"), contacts.T, strict=True):
@@ -229,7 +231,7 @@ def rigged(
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
-        fitted: the body of the person, whose toes bend as in pictures. None = no skin.
+        fitted: the body of the person, whose toes bend as in rendered images. None = no skin.
         root_motion: whether the root on the floor follows the hips and their direction. Otherwise,
             it stays in place.
 
@@ -268,10 +270,10 @@ def rigged(
 def _with_root_motion(
     turns: np.ndarray, hips: np.ndarray, skeleton: Rig
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-    """Transfers the path and the direction of the hips on the floor to the root above the hips.
+    """Transfers the horizontal path and the heading of the hips to the root, their parent.
 
-    The direction is the heading of the hips relative to the axes of the first frame, a rotation
-    about the vertical axis.
+    The heading is the direction of the hips about the vertical axis, relative to their direction in
+    the rest pose.
     """
     root, joint = skeleton.parents[skeleton.hips], skeleton.hips
     above = skeleton.turns[root]
@@ -309,8 +311,8 @@ def _skin(body: FittedBody, rig: Rig) -> Skin:
     count = len(skinned)
     binds[:count, :3] = rig.neutral[skinned].mT @ np.concatenate([stored, moves], -1)
 
-    # Joints without vertices keep their position relative to their parents, because three.js reads
-    # it from the pose of the mesh.
+    # Joints without vertices keep their positions relative to their parents, because three.js reads
+    # these positions from the pose of the mesh.
     worlds = np.tile(np.eye(4), (len(rig.joints), 1, 1))
     worlds[skinned] = np.linalg.inv(binds[:count])
     local = np.tile(np.eye(4), (len(rig.joints), 1, 1))

@@ -14,7 +14,8 @@ def read(path: Path, animation: str | None = None) -> AnimatedNodes:
     """Reads an animation, given by its name or 1-based number; None = the first animation.
 
     Raises:
-        UserError: As in the readers for both formats.
+        UserError: If the file is damaged or contains no such animation. See the readers of both
+            formats for further errors.
     """
     reader = fbx_scene if path.suffix.lower() == ".fbx" else glb_animation
     return reader.read(path, animation)
@@ -27,11 +28,11 @@ def animations(path: Path) -> list[str]:
 
 
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
-    """Returns a joint name per node, as in the layouts of skeletons.
+    """Returns a joint name for each node, as in the layouts of skeletons.
 
-    If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the tip
-    of a bone is called `NAME.end`, like the end site of a bone in a BVH file. This also applies if
-    the name of the tip is the name of the bone with a different ending.
+    If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the
+    tip of a bone is called `NAME.end`, like the end site of a bone in a BVH file, whichever suffix
+    it has in the file.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

@@ -2,7 +2,7 @@
 # The modules of usd-core come from C++ and have no types.
 """Writes a motion with its skeleton and skin as a Universal Scene Description (UsdSkel) file.
 
-Files are .usda, .usdc or .usdz. Source: Pixar, "UsdSkel",
+The file may be .usda, .usdc or .usdz. Source: Pixar, "UsdSkel",
 https://openusd.org/release/api/usd_skel_page_front.html. Writing requires the usd-core package
 (extra `usd`).
 """
@@ -56,7 +56,7 @@ def write(path: Path, clip: RiggedClip) -> None:
 
 
 def _paths(clip: RiggedClip) -> list[str]:
-    """Returns the joints as paths from the root. See `_name` for the names in a path."""
+    """Returns the paths of the joints from the root. Paths consist of names as in `_name`."""
     paths: list[str] = []
     for name, parent in zip(clip.joints, clip.parents, strict=True):
         paths.append(f"{paths[parent]}/{_name(name)}" if parent >= 0 else _name(name))
@@ -109,7 +109,7 @@ def _skeleton(stage: Any, clip: RiggedClip) -> None:
         values = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in turns[frame]]
         rotations.Set(Vt.QuatfArray(values), frame)
         translations.Set(Vt.Vec3fArray.FromNumpy(moved[frame].astype("f4")), frame)
-    # Booleans are held until the next sample, so only frames in which they change are written.
+    # Booleans are held until the next sample, so only the frames in which they change are written.
     for name, (frames, planted) in clip.contact_changes().items():
         contact = animation.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.Bool, custom=True)
         for frame, value in zip(frames.tolist(), planted.tolist(), strict=True):
@@ -163,10 +163,10 @@ def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
     """Declares the bounding box of the person in each frame, computed from the joints."""
     from pxr import UsdGeom, Vt
 
-    positions, _ = clip.world()  # scales are ignored: the box only has to be large enough
+    positions, _ = clip.world()  # scales are ignored, because the box only has to be large enough
     positions[..., 1] += clip.lift
-    # Distance in meters from joints to the farthest point of the surface, at the tips of hands and
-    # head
+    # Distance in meters from a joint to the farthest point of the surface around it, at the tips of
+    # the hands and the head
     margin = 0.25
     boxes = UsdGeom.Boundable(root.GetPrim()).CreateExtentAttr()
     for frame, points in enumerate(positions):

@@ -3,8 +3,8 @@
 Source: VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A
 .vrma file is a .glb file without a mesh that declares which nodes are the bones of a humanoid. Its
 rest pose is VRM's T-pose: limbs along the axes, feet straight ahead, soles on the floor. Programs
-apply the rotations relative to this pose, and scale the path of the hips by the ratio of the two
-hip heights.
+apply the rotations relative to this pose, and scale the path of the hips by the ratio of the
+avatar's hip height to the hip height in the file.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ LIMBS = {"shoulder": (1, 0, 0), "elbow": (1, 0, 0), "hip": (0, -1, 0), "knee": (
 def rest_rig(poses: Poses) -> Rig:
     """Returns VRM's humanoid in its T-pose, with the bone lengths of a body.
 
-    Its axes are the world axes.
+    The axes of its joints are the world axes.
     """
     names = {joint: bone for bone, joint in HUMANOID.items()}
     offsets = poses.offsets.numpy().copy()
@@ -65,7 +65,7 @@ def rest_rig(poses: Poses) -> Rig:
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a clip whose skeleton comes from `rest_rig`."""
+    """Writes a clip whose skeleton was created by `rest_rig`."""
     binary = Binary()
     turns = quaternions(np.concatenate([clip.rest[None], clip.turns]))[1:]
     curves = [("rotation", node, turns[:, node]) for node in range(len(clip.joints))]

@@ -1,9 +1,9 @@
 """Atomic writes, hashes, locks, and safe reading of files from other people.
 
-A file that may come from other people is first read or checked with this module. The file must be a
-regular file of limited size, and the sizes that it declares must match its bytes. Functions that
-read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a regular
-file, or if its content is rejected.
+Files that may come from other people are first read or checked with this module. Such a file must
+be a regular file of limited size, and the sizes that it declares must match its bytes. Functions
+that read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a
+regular file or if its content is rejected.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ TEXT_LIMIT = 512 * MEBIBYTE
 The largest known file, which contains BABEL's annotations, is 175 MiB.
 """
 YAML_LIMIT = MEBIBYTE // 4
-"""Maximum size of a YAML file, because parsing is slow.
+"""Maximum size of a YAML file. It is low, because parsing YAML is slow.
 
 Recipes, skeletons, protocols and table specs are far smaller.
 """
@@ -48,13 +48,13 @@ YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2
 ARRAYS_LIMIT = 128 * MEBIBYTE
 """Total size that is always permitted for the arrays in a compressed file.
 
-Beyond this size, arrays may have at most `INFLATION` times the size of the file. Motion data is
-compressed by a factor of less than 10.
+Larger arrays may have at most `INFLATION` times the size of the file. Compression reduces motion
+data by a factor of less than 10.
 """
 INFLATION = 20
 # Beginning of a pointer file, which replaces a file in Git LFS
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
-POINTER_LIMIT = 1024  # pointer files are smaller than this number of bytes
+POINTER_LIMIT = 1024  # pointer files have fewer bytes than this
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 """Errors raised by `zipfile` for damaged, encrypted and unusually compressed archives."""
@@ -71,17 +71,18 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
     """Yields a temporary path next to `path` that is renamed to `path` at the end.
 
     A failure leaves no files behind. The temporary name is unique, so that several processes can
-    write the same file. The last process wins. A link at `path` is replaced, but its target is not
-    changed. Temporary files that killed processes left in the folder are removed before this
-    process writes its first file there.
+    write the same file, and the last one wins. A link at `path` is replaced, but its target is not
+    changed. Before this process writes its first file in the folder, temporary files that killed
+    processes left there are removed.
 
     Args:
         path: file to write.
         within: folder that contains `path` and that other people may have filled. Links must not
             lead out of it.
 
-    Raises `UserError` if a link leads out of `within`, if `path` is a pipe or a device, or if the
-    file cannot be written, for example because the disk is full.
+    Raises:
+        UserError: If a link leads out of `within`, if `path` is a pipe or a device, or if the file
+            cannot be written, for example because the disk is full.
     """
     path = Path(path)
     if within is not None:
@@ -97,11 +98,11 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
 @contextmanager
 def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Yields a temporary folder. At the end, either all of its files or none are moved to the folder `path`.
+    """Yields a temporary folder whose files are moved to the folder `path` at the end.
 
-    If `path` exists, files with the same names are replaced, and all other files are kept.
-    Temporary folders that killed processes left behind are removed. Links must not lead out of the
-    folder `within`. The errors are described in `atomic_write`.
+    Either all files are moved or none. If `path` exists, files with the same names are replaced,
+    and all other files are kept. Temporary folders that killed processes left behind are removed.
+    Links must not lead out of the folder `within`. Errors are the same as in `atomic_write`.
     """
     path = Path(path)
     if within is not None:
@@ -149,7 +150,7 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _remove_abandoned_once(folder: Path) -> None:
-    """Removes files that killed processes left behind, before the first file of this process.
+    """Removes files that killed processes left behind, once per folder and process.
 
     Listing the folder for each of thousands of files would take too long.
     """
@@ -158,7 +159,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Returns the reason why a file could not be written, and the free space if the disk may be full."""
+    """Describes why a file could not be written, with the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -173,7 +174,7 @@ def write_failure(error: BaseException, path: Path) -> str:
 def made_folder(folder: Path) -> Iterator[None]:
     """Creates a folder and its parents.
 
-    At the end, created folders are removed if they are empty.
+    When the context ends, the created folders are removed if they are empty.
     """
     created = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
@@ -203,7 +204,10 @@ def write_json(
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` that lacks it, and converts `errors` to `UserError`."""
+    """Adds the name of a file to every `UserError` that lacks it.
+
+    The exceptions in `errors` are converted to `UserError`, with `prefix` before their message.
+    """
     try:
         yield
     except UserError as error:
@@ -262,7 +266,13 @@ def sha256(path: str | Path) -> str:
 
 
 def regular_file(path: str | Path, limit: int | None = None) -> int:
-    """Returns the size in bytes, at most `limit`, of a regular file or of a link's target."""
+    """Returns the size in bytes of a regular file or of the target of a link.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        UserError: If it cannot be read, is not a regular file, has more than `limit` bytes, or is a
+            Git LFS pointer.
+    """
     try:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -290,7 +300,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
 
 
 def _begins(path: str | Path, content: bytes) -> bool:
-    """Whether a readable file begins with `content`."""
+    """Returns whether a file is readable and begins with `content`."""
     try:
         with Path(path).open("rb") as file:
             return file.read(len(content)) == content
@@ -299,7 +309,10 @@ def _begins(path: str | Path, content: bytes) -> bool:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns the content of a UTF-8 text file of at most `limit` bytes. Raises `UserError` for other files."""
+    """Returns the content of a UTF-8 text file of at most `limit` bytes.
+
+    Raises `UserError` for all other files.
+    """
     regular_file(path, limit)
     with (
         naming(path, UnicodeDecodeError, prefix="not a UTF-8 text file: "),
@@ -315,7 +328,10 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON string. Raises `ValueError` for content that `read_json` rejects."""
+    """Returns the content of a JSON string.
+
+    Raises `ValueError` for content that `read_json` rejects.
+    """
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
@@ -323,7 +339,7 @@ def parse_json(text: str | bytes) -> Any:
     try:
         content = json.loads(text, parse_constant=refuse)
         if "\\u" in (text if isinstance(text, str) else text.decode()):
-            # Encoding fails for a lone surrogate, which could not be written again
+            # Encoding fails for a lone surrogate, which could not be written to a file again
             json.dumps(content, ensure_ascii=False).encode()
     except RecursionError:
         raise ValueError("nested too deeply") from None
@@ -351,7 +367,8 @@ def read_yaml(path: str | Path) -> Any:
 def read_package_yaml(path: Path) -> Any:
     """Returns the plain content of a YAML file that is part of the package.
 
-    LibYAML is fifteen times as fast as `read_yaml`, which checks files from other people.
+    It uses LibYAML, which is fifteen times as fast as `read_yaml` but does not apply the checks for
+    files from other people.
     """
     import yaml
 
@@ -361,7 +378,7 @@ def read_package_yaml(path: Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of nodes of a YAML file after expanding its aliases, or infinity for cycles."""
+    """Returns the number of nodes in a YAML file with expanded aliases, or infinity for cycles."""
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
@@ -382,7 +399,7 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 def read_npz(
     source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file, or of a seekable open file, by name.
+    """Returns the arrays in an .npz file or a seekable open file, by name.
 
     Args:
         source: the file.
@@ -410,10 +427,10 @@ def read_npz(
 
 
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file. `mmap` maps the file read-only, and requires a path.
+    """Returns the array in an .npy file.
 
-    Raises `UserError` if the file is damaged, contains objects, or exceeds the limits of this
-    module.
+    `mmap` maps the file read-only instead of reading it, and requires a path. Raises `UserError` if
+    the file is damaged, contains objects, or exceeds the limits of this module.
     """
     import numpy as np
 
@@ -443,7 +460,7 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
-    """Returns the number of elements of an .npy file.
+    """Returns the number of elements in the array of an .npy file.
 
     The header of the file must match its `size` in bytes.
     """
@@ -475,11 +492,11 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 
 @contextmanager
 def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip archive for reading. Raises `UserError` if it has more than `MAX_MEMBERS` members.
+    """Opens a zip archive for reading, and raises `UserError` if it has too many members.
 
-    `zipfile` reads the directory of the archive at once, and creates an object for each entry, even
-    if the archive declares a smaller number of entries. Therefore, the size of the directory is
-    also limited.
+    The limit is `MAX_MEMBERS`. The size of the archive's directory is also limited, because
+    `zipfile` reads it at once and creates an object for each entry, even if the archive declares
+    fewer entries.
     """
     directory = _DirectoryReader(file)
     with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
@@ -507,7 +524,7 @@ class _DirectoryReader:
 
     def read(self, size: int = -1) -> bytes:
         if self.limit is not None and size > self.limit:
-            check_members(size)  # the directory has as many entries as bytes at most
+            check_members(size)  # the directory has at most as many entries as bytes
         return self.file.read(size)
 
 

@@ -1,7 +1,7 @@
 """Paths for writing safely in a folder that other people may have filled.
 
-Links must not lead out of the folder. A file that is written in place must have only one name.
-Temporary names are unique.
+Links must not lead out of the folder. A file that is written in place must not have a second name
+(hard link). Temporary names are unique.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SECOND_NAME = (
 WANDB_LINKS = re.compile(r"wandb/(latest-run|debug[\w-]*\.log|[\w-]+/logs/debug[\w-]*\.log)")
 """Links that wandb creates from a run directory to its logs.
 
-wandb replaces them, and writes a resumed run to another folder.
+wandb replaces these links, and writes a resumed run to another folder.
 """
 
 _tokens: set[str] = set()
@@ -36,7 +36,7 @@ _tokens: set[str] = set()
 
 
 def check_within(path: str | Path, root: str | Path) -> None:
-    """Raises `UserError` if links on the way to a path in the folder `root` lead out of that folder."""
+    """Raises `UserError` if links along a path in the folder `root` lead out of that folder."""
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
@@ -45,11 +45,11 @@ def check_within(path: str | Path, root: str | Path) -> None:
 
 
 def check_tree(folder: Path) -> None:
-    """Checks a folder from somebody else before libraries write into it.
+    """Checks a folder from someone else before libraries write into it.
 
-    Libraries open files in place. Raises `UserError` if the folder contains a link that leads out
-    of the folder, a pipe, a device, or a file with a second name (hard link), through which a file
-    outside the folder would be changed.
+    Libraries open files in place, so they could change files outside the folder. Raises `UserError`
+    if the folder contains a pipe, a device, a link that leads out of the folder, or a file with a
+    second name (hard link).
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -72,8 +72,8 @@ def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
     Writing in place would also change the target of a link, so links are not followed. Raises
-    `UserError` if the path is a link, is not a regular file, or is a file with a second name (hard
-    link).
+    `UserError` if the path is a link, if it is not a regular file, or if the file has a second name
+    (hard link).
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -111,7 +111,7 @@ def temporary_beside(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _machine() -> str:
-    """Returns eight hexadecimal digits that identify the host and, in a container, its process namespace."""
+    """Returns eight hexadecimal digits that identify the host and its process namespace."""
     numbering = ""
     with suppress(OSError):  # a system without /proc
         numbering = str(Path("/proc/self/ns/pid").readlink())
@@ -123,11 +123,11 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
 
     Args:
         folder: folder of the temporary files and folders.
-        path: the file or folder whose temporary files are removed. None = the temporary files of all
-            files and folders.
-        is_locked: whether this process holds the lock that writers of such files need. If it does,
-            files of processes on other machines are also removed. Otherwise, these files remain,
-            because their processes may be alive.
+        path: the file or folder whose temporary files are removed. None = all temporary files in
+            the folder.
+        is_locked: whether this process holds the lock that writers of such files require. If it
+            does, files of processes on other machines are also removed. Otherwise, these files
+            remain, because their processes may still be alive.
     """
     if not folder.is_dir():
         return
@@ -146,7 +146,7 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
 
 
 def _lives(process: int) -> bool:
-    """Whether another process exists on this machine."""
+    """Returns whether another process exists on this machine."""
     if process == os.getpid():
         return False
     try:
@@ -159,7 +159,7 @@ def _lives(process: int) -> bool:
 
 
 def _remove(path: Path) -> None:
-    """Removes a temporary file or folder. For a link, only the link itself is removed."""
+    """Removes a temporary file, folder or link. The target of a link is not removed."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

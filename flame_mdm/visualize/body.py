@@ -1,4 +1,4 @@
-"""Figures and bodies for players and pictures. A body is a mesh that is skinned to a motion."""
+"""Figures and bodies for players and pictures; a body is a mesh that is skinned to a motion."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ HELPERS = tuple(
     for side in ("left", "right")
     for name, share in TWISTED.items()
 )
-"""Joint and share of the twist for each bone after the 22 joints."""
-# The joint at which each bone begins
+"""Joint of each helper bone, and its share of the twist. These bones follow the 22 joints."""
+# Joint at which each bone begins
 ANCHORS = (
     *range(len(SMPL22)),
     *(joint for joint, _ in HELPERS),
@@ -49,8 +49,8 @@ class Figure:
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
         text: the caption or the name of the action, or "" if there is neither.
-        id: name of the motion: the name of a clip or file, or the text and the sample number, which
-            together determine the noise.
+        id: name of the motion. This is the name of a clip or file or, for a generated motion, the
+            text and the sample number, which together determine the noise.
         contacts: (F, N) bool, True = this joint of `skeleton.feet` is on the floor; None = unknown.
     """
 
@@ -64,15 +64,14 @@ class Figure:
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
         """Returns the fitted body and "", or None and the reason why no body fits.
 
-        If no body fits, a skeleton is drawn instead.
-
-        `body` is the mesh to fit; None = the mannequin. Fitting requires the joint rotations.
+        `body` is the mesh to fit; None = the mannequin. Fitting requires the joint rotations. If no
+        body fits, a skeleton is drawn instead.
         """
         return None, "its joint rotations are unknown"
 
 
 def target(path: str | Path, motions: Sequence[Figure]) -> Path:
-    """Returns the path as a `Path`. Raises `UserError` if there are no motions to write to it."""
+    """Returns the path as a `Path`, and raises `UserError` if there are no motions to write."""
     if not motions:
         raise UserError(f"{path}: no motions to show")
     return Path(path)
@@ -89,9 +88,9 @@ def head(skeleton: Skeleton) -> int | None:
 
 
 def radii(skeleton: Skeleton) -> list[float]:
-    """Returns the radius of the body, in meters, around each joint.
+    """Returns the radius of the body around each joint, in meters.
 
-    The radius increases with the number of the joint's descendants.
+    It increases with the number of descendants of the joint.
     """
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
@@ -102,16 +101,18 @@ def radii(skeleton: Skeleton) -> list[float]:
 class Mesh:
     """A closed mesh in its stored pose, an A-pose with the pelvis at the origin.
 
-    `tools/mannequin.py` writes it.
+    The mesh of the mannequin is written by `tools/mannequin.py`.
 
     Attributes:
-        points: (V, 3) in meters; `normals` (V, 3), `colors` (V, 3) from 0 to 255.
-        weights: (V, 28) weights for SMPL's 22 joints and for `HELPERS`. At most four weights per
-            point are nonzero.
+        points: (V, 3), vertices in meters.
+        normals: (V, 3), unit normals of the vertices.
+        colors: (V, 3), colors of the vertices, from 0 to 255.
+        weights: (V, 28), weights of SMPL's 22 joints and of `HELPERS`. At most four weights per
+            vertex are nonzero.
         triangles: (T, 3), counterclockwise as seen from outside.
         turns: (28, 3, 3), world rotation of each bone from SMPL's rest pose to the stored pose.
         rest: (22, 3), position of each joint relative to its parent in SMPL's rest pose.
-        sole: height of the toe joints above the soles.
+        sole: height in meters of the toe joints above the soles.
     """
 
     def __init__(self, path: Path) -> None:
@@ -159,7 +160,7 @@ def read_body(name: str) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class FittedBody:
-    """A body with the bone lengths of a clip, and its motion. F = number of frames, B = 28 bones."""
+    """A body with the bone lengths of a clip, and its motion in F frames, with B = 28 bones."""
 
     mesh: Mesh
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the
@@ -170,7 +171,7 @@ class FittedBody:
     joints: np.ndarray
     # (V, 3), points of the mesh in this pose
     points: np.ndarray
-    # (22, 3, 3), rotation of each part of the mesh at rest: soles are flat, the head is upright
+    # (22, 3, 3), rotation of each part of the mesh at rest, with flat soles and an upright head
     neutral: np.ndarray
     # (F, B, 3, 3), rotation of each bone from the stored pose to each frame
     turns: np.ndarray
@@ -180,7 +181,7 @@ class FittedBody:
     lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the vertices and normals (V, 3) of a frame, computed by linear blend skinning."""
+        """Returns the vertices and normals (V, 3) in a frame, computed by linear blend skinning."""
         turns = self.turns[frame]
         moves = self.starts[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
         blended = self.mesh.weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)

@@ -1,4 +1,4 @@
-"""HTML player for motions: a single file that opens from disk and needs no network."""
+"""HTML player for motions: a single file that opens from disk and requires no network."""
 
 import base64
 import html
@@ -53,22 +53,23 @@ def player_page(
     marks: Sequence[Sequence[tuple[int, int, str, str]]] = (),
     body: Mesh | None = None,
 ) -> str:
-    """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
+    """Returns a self-contained HTML page that plays motions side by side in 3D.
 
-    If no body fits a motion, a skeleton is shown, and the caption states the reason. Positions are
-    rounded to millimeters, or to 1/65534 of the span of a motion.
+    All motions share one clock and one camera. If no body fits a motion, a skeleton is shown, and
+    the caption states the reason. Positions are rounded to millimeters or, in motions that span
+    more than 65.5 m, to 1/65534 of the span.
 
     Args:
         motions: the motions. Their skeletons, lengths and frame rates may differ.
         title: heading of the page.
         about: HTML of a collapsible section below the heading of the page. Any text in it must
             already be escaped.
-        columns: motions per row; 0 = as many as fit into the window.
+        columns: number of motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
-        beside: for each motion, the id of an earlier motion next to which it is shown, such as
-            its original; "" = none.
-        marks: for each motion, spans to mark on the timeline: first frame, end (exclusive), kind
-            and description.
+        beside: for each motion, the id of an earlier motion next to which it is shown, such as the
+            original of an edited motion; "" = none.
+        marks: for each motion, the spans to mark on the timeline, each given by its first frame,
+            its end (exclusive), its kind and a description.
         body: the body to draw; None = the mannequin.
     """
     blank = [""] * len(motions)
@@ -97,7 +98,7 @@ def player_page(
 def packed_motion(motion: Figure, begin: int = 0) -> dict[str, Any]:
     """Returns the frames of a motion for the player, starting at `begin`.
 
-    Earlier frames only influence the rotations.
+    Earlier frames influence only the rotations.
     """
     return _packed(motion, "", "", (), None, begin)
 
@@ -142,7 +143,8 @@ def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
     """Returns the proportions of a body, and a 32-bit quaternion for each frame and bone.
 
     The quaternions are exact to about 0.1 degrees. The two highest bits state which of x, y, z and
-    w is largest. The three other components, from -0.71 to 0.71, follow with 10 bits each.
+    w is largest. They are followed by the three other components, from -0.71 to 0.71, with 10 bits
+    each.
     """
     quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(1)

@@ -25,15 +25,15 @@ LINE = (205, 211, 219)
 TEXT = (28, 36, 48)
 FAINT = (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
-# Objects closer to the camera than this, in meters, are not drawn
+# Objects that are closer to the camera than this, in meters, are not drawn
 NEAR = 0.3
-# Angles of the camera, which is in front of the body, to its left, and above it
+# Angles in radians of the camera, which is in front of the body, to its left, and above it
 YAW, PITCH = 0.6, 0.24
 TOWARD = np.array(
     [math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)]
 )
 RIGHT = np.array([math.cos(YAW), 0, -math.sin(YAW)])
-# Code of the HD color space, which players assume for large videos that declare no color space
+# Code of the HD color space, which players assume for large videos that do not declare theirs
 BT709 = 1
 SMOOTH = 2  # images are drawn larger by this factor and then downscaled
 
@@ -41,12 +41,12 @@ SMOOTH = 2  # images are drawn larger by this factor and then downscaled
 def write_gif(
     path: str | Path, motions: Sequence[Figure], size: int = 256, body: Mesh | None = None
 ) -> None:
-    """Writes a looping animation of motions side by side, with captions below.
+    """Writes a looping animation of motions side by side, with a caption below each.
 
-    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second. Therefore,
-    the frame rate is the highest frame rate of the motions, divided by the smallest integer that
-    results in 50 or less. For example, 60 fps becomes 30, and 120 fps becomes 40. A motion that
-    ends earlier holds its last frame. `body` is the body to draw; None = the mannequin.
+    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second, so the frame
+    rate is the highest frame rate of the motions, divided by the smallest integer that results in
+    50 or less. For example, 60 fps becomes 30, and 120 fps becomes 40. A motion that ends earlier
+    holds its last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -56,8 +56,8 @@ def write_gif(
         image.quantize(palette=palette, dither=Image.Dither.NONE)
         for image in _video(motions, fps, size, body)
     ]
-    # GIF durations are in hundredths of a second. Times are rounded instead of durations, so that
-    # errors do not accumulate.
+    # GIF durations are in hundredths of a second. The times of the frames are rounded instead of
+    # the durations, so that errors do not accumulate.
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     options = {"append_images": images[1:], "duration": (10 * np.diff(times)).tolist(), "loop": 0}
     with atomic_write(path) as temporary:
@@ -81,7 +81,7 @@ def write_mp4(
         av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file,
     ):
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
-        stream.thread_count = 1  # with one thread, the bytes do not depend on the number of cores
+        stream.thread_count = 1  # with one thread, the file does not depend on the number of cores
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = BT709
         for image in _video(motions, fps, size, body):
@@ -104,7 +104,7 @@ def contact_sheet(
     size: int = 192,
     body: Mesh | None = None,
 ) -> None:
-    """Writes one PNG with a row per motion.
+    """Writes one PNG image with a row per motion.
 
     A row has `frames` poses of `size` pixels, equally spaced in time, and a caption.
     """
@@ -148,7 +148,7 @@ def thumbnail(motion: Figure, height: int = 120) -> bytes:
 def _palette() -> Image.Image:
     """Returns one palette for all frames, so that colors do not flicker.
 
-    The palette contains all colors, and their blends at smoothed edges.
+    The palette contains all colors, and the blends between them at smoothed edges.
     """
     drawn = np.array(
         [*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT]
@@ -167,7 +167,7 @@ def _palette() -> Image.Image:
 def _video(
     motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
 ) -> Iterator[Image.Image]:
-    """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
+    """Yields one image of all panels every 1 / fps seconds, and shows a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]
@@ -236,8 +236,8 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
     for parent, joint in motion.skeleton.edges:
         _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 255)
     dark = dark.filter(ImageFilter.BoxBlur(size / 192))
-    # The part is enlarged with a margin, so that its edge is the same as if the whole image were
-    # enlarged.
+    # The part is enlarged together with a margin, so that its edge looks as if the whole image had
+    # been enlarged.
     if box := dark.getbbox():
         left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
         dark = dark.crop((left, top, right, bottom)).resize(
@@ -263,7 +263,10 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
 
 
 def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns a function that projects points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth."""
+    """Returns a function that projects points (N, 3) in meters.
+
+    Its results (N, 4) are x, y, pixels per meter and depth.
+    """
 
     def project(points: np.ndarray) -> np.ndarray:
         offset = points - center
@@ -291,8 +294,8 @@ def _rasterize(
 
     Colors are interpolated between the corners. The image is (height, width, 3) uint8. `at` (V, 2)
     are pixel coordinates, y down; `depth` (V,) are distances from the camera; `colors` (V, 3) are
-    from 0 to 255. Triangles (T, 3) that are seen from inside, and therefore clockwise, are not
-    drawn.
+    from 0 to 255. Triangles (T, 3) that are seen from inside, and whose corners therefore appear
+    clockwise, are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
@@ -383,7 +386,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns at most three lines of a caption, and a fourth line if a skeleton is drawn."""
+    """Returns at most three lines of a caption, plus a line if a skeleton is drawn."""
     lines, font = [""], _font(size)
     # The caption has room for three lines
     for word in shortened(motion.text or motion.id, width).split():
@@ -398,7 +401,7 @@ def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> li
 
 
 def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:
-    """Draws lines of text on an image that has room for `lines` lines."""
+    """Draws lines of text on an image with room for `lines` lines."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)

@@ -122,9 +122,9 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
-    """Returns the axis-angle vectors (F, 72) for SMPL's joints.
+    """Returns the axis-angle vectors (F, 72) of SMPL's joints.
 
-    If the file contains no hands, the vectors for the hands are 0.
+    The vectors of the hands are 0 if the file contains no hands.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:

@@ -1,10 +1,10 @@
 """ASF/AMC motion capture files (Acclaim, CMU): one file per skeleton, and one per motion.
 
 An ASF file lists the bones of a subject. For each bone, it contains the direction and the length in
-the standing rest pose, in world coordinates, as well as the axes C in which the bone turns and its
-degrees of freedom. An AMC file contains the angles of these degrees of freedom in each frame. If M
-is the rotation given by these angles, the bone turns by C M C^-1 relative to its parent. In an
-order such as XYZ, x is applied first: C = Rz Ry Rx.
+the standing rest pose, in world coordinates, as well as the coordinate axes C in which the bone
+turns and its degrees of freedom. An AMC file contains the angles of these degrees of freedom in
+each frame. If M is the rotation given by these angles, the bone turns by C M C^-1 relative to its
+parent. In an order such as XYZ, x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def skeleton_of(path: Path) -> Path:
     )
     if chosen is None:
         raise UserError(
-            f"{path}: there is no skeleton {candidates[1].name} next to it. AMC files need their ASF file"
+            f"{path}: there is no skeleton {candidates[1].name} next to it. Put the ASF file into the same folder"
         )
     return chosen
 

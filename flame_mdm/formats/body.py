@@ -26,7 +26,7 @@ WIDER = (0.8, 1.25)
 LONGER = (0.4, 2.5)
 # Limits on the length scale of all other parts, relative to the scale of the limbs
 TALLER = (0.6, 1.6)
-ORTHONORMAL = 0.1  # maximum error in the dot products of the rows of a rotation matrix
+ORTHONORMAL = 0.1  # maximum error in the dot products of a rotation matrix's rows
 LIMBS = tuple(
     JOINT[f"{side}_{name}"]
     for side in ("left", "right")
@@ -113,7 +113,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 def local_rotations(body: FittedBody) -> np.ndarray:
     """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents.
 
-    The bend of the toes is included.
+    These rotations include the bend of the toes.
     """
     count = len(SMPL22)
     world = body.turns[:, :count] @ body.mesh.turns[:count] @ body.neutral.mT
@@ -161,7 +161,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _check_rotations(world: np.ndarray) -> None:
-    """Raises `UserError` if a matrix in (F, 22, 3, 3) is not finite or not nearly a rotation."""
+    """Raises `UserError` if a matrix in (F, 22, 3, 3) is not finite or far from a rotation."""
     products = world @ world.mT
     near = (np.abs(products - np.eye(3)) < ORTHONORMAL).all((2, 3))
     mirrored = (np.cross(world[..., 0, :], world[..., 1, :]) * world[..., 2, :]).sum(-1) < 0

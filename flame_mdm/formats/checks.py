@@ -85,7 +85,7 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
 def jump(joints: np.ndarray, fps: float) -> str:
     """Returns a message if the pelvis or a leg moves faster than people do, or "" otherwise.
 
-    `joints` are (F, 22, 3).
+    `joints` (F, 22, 3) are in meters.
     """
     ankles = joints[:, [_NUMBER["left_ankle"], _NUMBER["right_ankle"]]] - joints[:, :1]
     # A body that shakes for one frame does not jump, but a leg can flip within a single frame.

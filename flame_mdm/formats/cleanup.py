@@ -58,8 +58,8 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 
     Args:
         motion: the motion.
-        contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor. Default:
-            estimated from the joints.
+        contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor. None = the
+            contacts are estimated from the joints.
 
     Example:
         >>> motion = Motion(joints=np.zeros((3, 22, 3)), fps=20)
@@ -89,7 +89,8 @@ def cleanup(
     toe, but at most y = 0.
 
     Args:
-        joints: (F, J, 3) in meters, y up. Motions with fewer than 4 frames are returned unchanged.
+        joints: (F, J, 3), joint positions in meters, y up. Motions with fewer than 4 frames are
+            returned unchanged.
         fps: frames per second.
         skeleton: skeleton of the joints.
         contacts: (F, N), probabilities that each of `skeleton.feet` stays on the floor until the
@@ -97,7 +98,7 @@ def cleanup(
             estimated from the height and speed of the toes.
 
     Returns:
-        Joints (F, J, 3) float32.
+        The new joint positions (F, J, 3), float32.
     """
     # Joint paths are smoothed, and bones are set to their median lengths. Then, the body is moved
     # over the ground so that its feet in contact stand still on average. The remaining sliding is
@@ -209,7 +210,8 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
     """Returns the confidence (F - 1, 2) in [0, 1] that each toe stays on the floor.
 
-    The confidence of a frame refers to the time until the next frame. `toes` are (F, 2, 3).
+    The confidence of a frame refers to the time until the next frame. `toes` (F, 2, 3) are the
+    positions of the toes.
     """
     # A toe is on the floor if it is both low and slow. The faster the body travels, the faster a
     # toe may slide, because feet in generated motions are carried along with the body.
@@ -288,12 +290,12 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 
 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
-    """Moves the foot of a leg by `shift` (F, 3). Hands are moved in the same way.
+    """Moves the foot of a leg, or the hand of an arm, by `shift` (F, 3).
 
-    `leg` contains hip, knee, ankle and other joints of the foot.
+    `leg` contains the hip, the knee, the ankle and other joints of the foot.
     """
     # This is two-bone inverse kinematics. The new ankle is on the line from the hip to the
-    # requested position, as far as the leg can reach. Thigh, shin and this line are a triangle,
+    # requested position, as far as the leg can reach. Thigh, shin and this line form a triangle,
     # which determines the position of the knee along the line. The knee stays on the same side of
     # the line.
     hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)

@@ -49,7 +49,7 @@ LIMITS = {
     ),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
-"""For each fault: its limit, the unit of the limit, and a description.
+"""The limit of each fault, the unit of the limit, and a description.
 
 docs/motion-faults.md reports the share of real clips with each fault.
 """
@@ -67,7 +67,7 @@ THIGH = 0.17
 class Fault(NamedTuple):
     """A fault of a joint or of the body in frames `start` to `end` (exclusive).
 
-    `worst` is in the unit of the limit.
+    `worst` is the worst value in these frames, in the unit of the limit.
     """
 
     kind: str
@@ -204,7 +204,7 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
     bones.
 
     Args:
-        joints: (F, J, 3) in meters.
+        joints: (F, J, 3), joint positions in meters.
         names: names of the joints.
         side: "left" or "right".
 

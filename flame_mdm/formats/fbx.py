@@ -68,7 +68,7 @@ class Record:
     """A record of an FBX file.
 
     Attributes:
-        name: the name, such as "Model".
+        name: name of the record, such as "Model".
         properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int as
             a 64-bit integer and a float as a double. `Int` and `Short` are stored as shorter
             integers.

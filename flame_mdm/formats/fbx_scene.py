@@ -73,7 +73,7 @@ class Curve:
 
     Attributes:
         times: (K,) in seconds, increasing.
-        values: (K,).
+        values: (K,), value at each of these times.
         flags: (K,), interpolation from each key to the next.
         slopes: (K, 2), slopes per second of cubic segments, after each key and before the next key.
     """

@@ -20,7 +20,7 @@ from flame_mdm.formats.fbx_scene import TICKS, TIME_MODES
 from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.formats.rigged import CONTACTS, Material, RiggedClip, Skin
 
-# The files are in centimeters
+# Units of length per meter, because the files are in centimeters
 PER_METER = 100
 # `TimeMode` for a frame rate that is stored in `CustomFrameRate`
 CUSTOM_RATE = 14
@@ -193,7 +193,7 @@ class _Writer:
         return poses
 
     def _material(self, material: Material) -> int:
-        """Adds a material and, if it has one, its image. Returns the id."""
+        """Adds a material and, if it has one, its image. Returns the id of the material."""
         number, record = self._object("Material", material.name, "")
         record.add("Version", Int(102))
         record.add("ShadingModel", "lambert")
@@ -287,7 +287,10 @@ class _Writer:
 
 
 def _degrees(turns: np.ndarray) -> np.ndarray:
-    """Converts rotations (F, J, 3, 3) to angles (F, J, 3) about x, y and z in degrees, without jumps."""
+    """Converts rotations (F, J, 3, 3) to continuous Euler angles (F, J, 3) in degrees.
+
+    The angles are about x, y and z.
+    """
     angles = continuous_euler(torch.from_numpy(turns), [EULER] * turns.shape[1])
     return np.degrees(angles.flip(-1).numpy())
 
@@ -306,7 +309,7 @@ def _vector(
 
 
 def _model(record: Record, offset: np.ndarray, before: np.ndarray, scale: float = 1.0) -> Record:
-    """Adds the transform of a model at rest. Returns the record of its properties."""
+    """Adds the transform of a model at rest, and returns the record of its properties."""
     record.add("Version", Int(232))
     properties = record.add("Properties70")
     properties.add("P", "RotationActive", "bool", "", "", Int(1))

@@ -45,7 +45,7 @@ LIMIT = 512 * MEBIBYTE
 DOCUMENT_LIMIT = 16 * MEBIBYTE
 # Maximum number of nodes, and of items in any other list
 MAX_NODES, MAX_ITEMS = 4096, 65_536
-# Largest coordinate or matrix entry that is read
+# Maximum absolute value of a coordinate or matrix entry
 LARGEST = 1e9
 HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
 """Extensions that a character may require, because they do not change nodes, skins or bounds."""
@@ -167,9 +167,12 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A skin: indices of its K joints, inverse bind matrices, and corners of its meshes.
+    """A skin of a file.
 
-    Matrices are (K, 4, 4) or (0, 4, 4). Corners are (C, 3).
+    Attributes:
+        joints: indices of the K joints.
+        binds: (K, 4, 4), inverse bind matrices, or (0, 4, 4) if the file contains none.
+        corners: (C, 3), corners of the bounding boxes of the skinned meshes.
     """
 
     joints: list[int]
@@ -280,7 +283,7 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
 
 
 def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
-    """Returns the corners (8, 3) of the bounding box of a part of a mesh."""
+    """Returns the corners (8, 3) of the box that bounds a part of a mesh."""
     accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
     if {len(accessor.min), len(accessor.max)} != {3}:
         raise ValueError("a mesh has no bounds for its positions")

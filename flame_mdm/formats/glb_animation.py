@@ -92,8 +92,8 @@ class Track:
 
     Attributes:
         times: (K,) in seconds, increasing.
-        values: (K, C).
-        interpolation: interpolation between the keys.
+        values: (K, C), value at each of these times.
+        interpolation: method of interpolation between the keys, such as "LINEAR".
         slopes: (2, K, C), slopes per second before and after each key, for CUBICSPLINE only.
     """
 

@@ -14,9 +14,9 @@ VERTICES, INDICES = 34962, 34963  # values of a buffer view's target in glTF
 def write(path: Path, clip: RiggedClip, text: str) -> None:
     """Writes a clip with one node per joint, including the skin of the person if the clip has one.
 
-    `text` is stored in the file. The node `lifted` above the joints is raised by the thickness of
-    the soles, so that the person stands on the soles. In a rig with a root on the floor, the hips
-    are raised instead, so that the root stays on the floor.
+    `text` is stored in the file. The node `lifted`, which is the parent of the joints, is raised by
+    the thickness of the soles, so that the person stands on the soles. In a rig with a root on the
+    floor, the hips are raised instead, so that the root stays on the floor.
     """
     offsets, moves, lift = clip.offsets, clip.moves, clip.lift
     if clip.root >= 0:

@@ -27,14 +27,14 @@ UP = {
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-# Minimum, maximum and usual length of an adult's leg, in meters: hip to knee to ankle
+# Minimum, maximum and usual length of an adult's leg in meters, from hip to knee to ankle
 LEG, USUAL_LEG = (
     (0.6, 1.2),
     0.83,
 )
 # Minimum leg length of a child in meters, at the age of about one year
 CHILD = 0.25
-# Minimum length of a foot in meters, ankle to toes
+# Minimum length of a foot in meters, from ankle to toes
 FOOT = 0.02
 # The joints are not in the assumed order if the lengths of left and right limbs differ by more than
 # this ratio
@@ -53,7 +53,7 @@ UNITS = {  # in meters
     "the unit of CMU's recordings": 0.0564444,
 }
 
-# A joint in the file, or weights for several joints whose weighted mean is used
+# A joint in the file, or several joints with the weights of their mean
 Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
@@ -76,7 +76,7 @@ class Layout(BaseModel):
     fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None
     # Whether the files contain mirrored motion, in which case the sign of x is changed
     mirrored: bool = False
-    # Whether bodies may be children
+    # Whether the people in the files may be children
     children: bool = False
     _name: str = PrivateAttr("own map")
     _bones: dict[str, str] = PrivateAttr(default_factory=dict)
@@ -115,7 +115,7 @@ class Layout(BaseModel):
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
-        """Returns the layout with a different map and the name of a supported layout."""
+        """Returns the layout with a different map, under the name of a supported layout."""
         layout = self.model_copy(update={"map": dict(map)})
         layout._name = name
         return layout
@@ -123,7 +123,7 @@ class Layout(BaseModel):
     def ending(self, **ends: str) -> dict[str, Source]:
         """Returns a map in which some SMPL joints are the end sites of their parents.
 
-        Each keyword argument is joint=parent, for example for the toes.
+        Each keyword argument names such a joint and its parent, for example foot="ankle".
         """
         return {
             side + joint: f"{self.map[side + parent]}.end"
@@ -247,7 +247,7 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout of a file from `read_tree`, and the names of its joints in this layout.
+    """Returns the layout of a file that `read_tree` has read, and the names of its joints.
 
     `fields` override the fields of the supported layout. If arrays with this skeleton are in
     meters, BVH files are assumed to be in centimeters, as written by `flame_mdm.formats`.
@@ -294,7 +294,7 @@ def layout_name(layout: Layout) -> str:
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
     """Returns the supported layout for joints with these names, overridden by `fields`.
 
-    The map of the layout uses these names. Names are matched as in `flame_mdm.formats.names`.
+    The map of this layout uses the `names`, which are matched as in `flame_mdm.formats.names`.
 
     Raises:
         UserError: If no layout fits, or if a name could refer to several joints.
@@ -390,9 +390,9 @@ def read_skeleton(path: Path) -> dict[str, Any]:
 
 
 def leg_length(joints: np.ndarray) -> float:
-    """Returns the mean length in meters of the left leg, hip to knee to ankle.
+    """Returns the mean length in meters of the left leg, from hip to knee to ankle.
 
-    `joints` (F, 22, 3) are SMPL's joints.
+    `joints` (F, 22, 3) are the positions of SMPL's joints.
     """
     return _bone(joints, "left_hip", "left_knee") + _bone(joints, "left_knee", "left_ankle")
 
@@ -408,7 +408,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
     Args:
         joints: (F, 22, 3), positions of SMPL's joints in meters.
         unit: meters per unit of length in the file.
-        children: whether bodies may be children.
+        children: whether the people may be children.
         doubt: a line about another problem with the motion, to be added to the error message.
 
     Raises:

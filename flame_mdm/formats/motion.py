@@ -266,7 +266,7 @@ def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
 
 
 def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> Motion:
-    """Returns the motion of a body with known rotations."""
+    """Returns the motion of a body whose rotations are known."""
     return Motion(poses.joints().float().numpy(), fps, SMPL22, text, id, poses)
 
 
@@ -424,7 +424,10 @@ LARGE_ERROR = 10
 
 
 def _error(motion: Motion, poses: Poses) -> str:
-    """Describes how far joints with constant bone lengths are from the joints of the motion."""
+    """Describes the errors of joint positions with constant bone lengths.
+
+    Errors are distances from the joints of the motion.
+    """
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()
     line = f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-# Marks of the left and of the right side in names
+# Marks of the left and the right side in names
 SIDES = (("left", "l"), ("right", "r"))
 # Minimum number of joints that share a prefix; skeletons without hands have about 20 joints
 SHARED = 10
@@ -29,7 +29,7 @@ class Match(NamedTuple):
         skeleton: key of the skeleton.
         numbers: indices of the joints to which each name in the skeleton may refer. A name with
             several indices is ambiguous.
-        missing: names of the skeleton that match no joint.
+        missing: names in the skeleton that match no joint.
     """
 
     skeleton: str
@@ -62,7 +62,7 @@ def spellings(name: str, opposite: str) -> list[str]:
 
 
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
-    """Returns a mapping from each spelling (see `spellings`) to its name.
+    """Returns a mapping from each spelling of a name (see `spellings`) to the name.
 
     A spelling that two names share refers to the name that is spelled exactly like it.
 

@@ -75,8 +75,9 @@ CLOTHES = {
 def load_body(name: str) -> Mesh:
     """Returns a body by its name.
 
-    A name is "mannequin", a file, or "anny" with shape parameters, such as "anny gender=1 age=0.9".
-    Creating the first Anny body takes about 90 seconds. Each body is saved in the user's cache.
+    The name is "mannequin", a file, or "anny" with shape parameters, such as "anny gender=1
+    age=0.9". Creating the first Anny body takes about 90 seconds. Each body is saved in the user's
+    cache.
 
     Raises:
         UserError: If the file is damaged, a shape parameter is invalid, or Anny is not installed.

@@ -72,7 +72,7 @@ class Poses:
     def resampled(self, rate: float, fps: float) -> "Poses":
         """Returns the motion at `fps` instead of `rate` frames per second.
 
-        Rotations are interpolated on the sphere, and the path of the pelvis with cubic splines.
+        Rotations are interpolated on the sphere, and the path of the pelvis by cubic splines.
         """
         if math.isclose(rate, fps):
             return self
@@ -91,8 +91,8 @@ class BoneRotations:
     Attributes:
         poses: the rotations, on a body with the bones of the file. None if the file contains no
             usable rotations.
-        reason: why the rotations of the file cannot be used. "" if they can be used, or if the file
-            contains no rotations.
+        reason: why the rotations in the file cannot be used, or "" if they can be used or the file
+            contains none.
     """
 
     poses: Poses | None = None
@@ -111,7 +111,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
     from pelvis to chest. All other joints, including head, hands and toes, follow their parent.
 
     Args:
-        joints: (F, 22, 3) in the order of `SMPL22`, in meters, y up.
+        joints: (F, 22, 3), joint positions in the order of `SMPL22`, in meters, y up.
         fps: frames per second.
 
     Raises:
@@ -134,7 +134,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
 
 
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
-    """Returns the offsets (22, 3) and quaternions (F, 22, 4) of `solve`, without checks.
+    """Returns the results of `solve` as offsets (22, 3) and quaternions (F, 22, 4), without checks.
 
     Both results have the same precision as the joints. The function has no data-dependent branches
     and solves similar joints in a single batch, so that its ONNX graph is small.
@@ -220,7 +220,7 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
 def _twist(
     group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float
 ) -> Tensor:
-    """Returns quaternions (F, G, 4) that rotate limbs about their axes until hinges match.
+    """Returns quaternions (F, G, 4) that rotate limbs about their axes until their hinges match.
 
     Args:
         group: the G joints at which the limbs begin.
@@ -252,7 +252,7 @@ def _twist(
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
-    """Smooths (F, N) over time with a Gaussian whose standard deviation is `frames`."""
+    """Smooths values (F, N) over time with a Gaussian whose standard deviation is `frames`."""
     reach = int(4 * frames + 0.5)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / frames) ** 2).to(x)
     padded = torch.cat([x[:1].expand(reach, -1), x, x[-1:].expand(reach, -1)])

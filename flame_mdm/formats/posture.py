@@ -26,9 +26,9 @@ def complete(
     Joint positions determine neither the pitch of the head nor the bend of the toes.
 
     Args:
-        joints: (F, 22, 3) in meters.
+        joints: (F, 22, 3), joint positions in meters.
         offsets: (22, 3), positions of the joints relative to their parents in the rest pose.
-        world: (F, 22, 3, 3), world rotations.
+        world: (F, 22, 3, 3), world rotations of the joints.
 
     Returns:
         The rotation (22, 3, 3) of each body part in the rest pose, the world rotations (F, 22, 3,
@@ -96,7 +96,7 @@ def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Returns the position of the toes of a flat foot relative to the ankle, at rest."""
+    """Returns the rest position of the toes of a flat foot, relative to the ankle."""
     # The foot is flat in the frames in which ankle and toes are lowest together
     height = ankle[:, 1] + toe[:, 1]
     flat = height <= height.min() + STANDING
@@ -109,7 +109,7 @@ def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.nda
 def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
     """Returns the rotations (F, 3, 3) of the toes relative to a foot.
 
-    `foot` (F, 3, 3) are the world rotations of the foot.
+    `foot` (F, 3, 3) contains the world rotations of the foot.
     """
     low, high, most = TOES
     down = np.clip(np.arcsin(np.clip(-foot[:, 1, 2], -1, 1)), 0, most)

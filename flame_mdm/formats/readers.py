@@ -1,7 +1,7 @@
-"""The reader for motion files. Writers are in `flame_mdm.formats.motion`.
+"""The reader for motion files; the writers are in `flame_mdm.formats.motion`.
 
-`docs/formats.md` describes the files. Commands, data sets and Python all use this reader, so that a
-file always has the same skeleton, frame rate and checks.
+`docs/formats.md` describes the files. Commands, data sets and the Python API all use this reader,
+so that a file is always read with the same skeleton, frame rate and checks.
 """
 
 import math
@@ -86,7 +86,7 @@ class Doubts:
 
     @property
     def lines(self) -> list[str]:
-        """The doubts as lines to print."""
+        """The messages, one line each."""
         return [line for line in (self.lying, self.jump) if line]
 
 
@@ -133,7 +133,7 @@ def read(
             rotations, such as AMASS's files.
         up: the up axis of the file: y, z or -y.
         resample_to: target frame rate; None = the frame rate of the file. Rotations are
-            interpolated on the sphere, joints and translations with cubic splines.
+            interpolated on the sphere, and joint positions and translations by cubic splines.
         animation: name or 1-based number of an animation in an FBX or GLB file; None = the first
             animation.
 
@@ -501,7 +501,7 @@ def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """Returns a translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes.
 
-    `axes` rotates the axes of the file to y up.
+    `axes` (3, 3) rotates the axes of the file to y up.
     """
     if torch.equal(axes, AMASS_AXES):
         return translation, turns

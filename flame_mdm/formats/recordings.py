@@ -9,7 +9,7 @@ AT_60: frozenset[str] = frozenset(
     read_package_yaml(Path(__file__).with_suffix(".yaml"))["cmu_at_60"]
 )
 """Subjects and individual recordings that CMU captured at 60 frames per second."""
-# Skeletons in CMU's recordings and in their conversions
+# Skeletons of CMU's recordings and of their conversions
 CMU_SKELETONS = (
     "CMU",
     "CMU ASF",

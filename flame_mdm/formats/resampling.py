@@ -14,7 +14,8 @@ from flame_mdm.errors import UserError
 RATES = (0.1, 1000.0)
 # Maximum number of frames in a motion: 70 minutes at 120 frames per second
 MAX_FRAMES = 500_000
-# Maximum number of frames times joints of a tree: one hour with 57 joints at 120 frames per second
+# Maximum number of frames times joints in a tree of joints: one hour with 57 joints at 120 frames
+# per second
 MAX_POSITIONS = 25_000_000
 # Number of frames times joints that is accepted in files of any size; reading so many takes 300 MB
 # of memory

@@ -95,8 +95,8 @@ def preset(name: str | None, poses: Poses) -> Rig:
                     _RigJoint(label, parent, joint, rest[joint], posed[joint] @ local, local)
                 )
             else:
-                # A joint that SMPL lacks lies between its parent and the next SMPL joint, at a
-                # fraction of the distance. It does not rotate.
+                # A joint that SMPL lacks lies at a fraction of the distance from its parent to the
+                # next SMPL joint, and does not rotate.
                 above = joints[parent]
                 following = next(ours for _, ours in names[number:] if isinstance(ours, str))
                 distance = rest[JOINT[side + following]] - above.position
@@ -170,8 +170,8 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
     Programs can therefore interpolate the angles.
 
     Args:
-        matrices: (F, J, 3, 3), the rotations.
-        orders: order of the axes of each joint, such as "ZXY".
+        matrices: (F, J, 3, 3), rotation matrices.
+        orders: order of the Euler angles of each joint, such as "ZXY".
 
     Returns:
         Angles (F, J, 3).

@@ -40,7 +40,7 @@ REACH = 0.999  # maximum distance from hip to ankle, as a fraction of the straig
 class Rig:
     """A skeleton with J joints in its rest pose, in meters, y up, facing +z."""
 
-    # Names; parents precede their children
+    # Names of the joints; parents precede their children
     joints: tuple[str, ...]
     # Index of each joint's parent, or -1 for a root
     parents: tuple[int, ...]
@@ -115,9 +115,9 @@ class Rig:
         return turned
 
     def assembled(self, world: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-        """Returns positions (F, J, 3) of joints with world rotations (F, J, 3, 3).
+        """Returns the positions (F, J, 3) of joints with the world rotations `world` (F, J, 3, 3).
 
-        The pelvis is at `pelvis` (F, 3).
+        `pelvis` (F, 3) is the position of the pelvis.
         """
         positions, hips = np.tile(self.positions, (len(world), 1, 1)), self.hips
         for joint, parent in enumerate(self.parents):
@@ -177,7 +177,7 @@ class RestPose:
 
     # The skeleton, whose neutral rotations `fitted` replaces for a motion
     rig: Rig
-    # For each SMPL joint, the index of the character's joint
+    # Index of the character's joint for each SMPL joint
     map: Mapping[str, int]
     # Height of the lowest point in the rest pose
     floor: float
@@ -203,9 +203,9 @@ def rest_pose(
         source: the character as it is named in error messages.
         names: names of the J joints.
         parents: index of each joint's parent.
-        positions: (J, 3), in world coordinates with any unit and direction.
-        turned: (J, 3, 3), rotations in these coordinates.
-        joints: index of the character's joint by SMPL joint.
+        positions: (J, 3), joint positions in world coordinates with any unit and orientation.
+        turned: (J, 3, 3), joint rotations in these coordinates.
+        joints: index of the character's joint for each SMPL joint.
         lowest: points in these coordinates that include the lowest point.
         vertical: (3,), the up direction in these coordinates.
     """
@@ -275,8 +275,8 @@ def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
     """
     # Each bone of a limb is turned from the character's rest pose to SMPL's. First its direction is
     # matched, then its twist, so that knees and elbows bend about the same axis. A limb that is
-    # clearly bent at rest shows this axis. In a straight limb, knees are assumed to bend backwards,
-    # and elbows forward.
+    # clearly bent at rest shows this axis. If a limb is straight, its knee is assumed to bend
+    # backwards, or its elbow to bend forward.
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
         for (start, middle, end), bend in (
@@ -322,7 +322,8 @@ def follow(
         world: (F, 22, 3, 3), world rotations of the body parts.
 
     Returns:
-        Rotations (F, J, 3, 3) and positions (F, J, 3) of the character, and its skeleton.
+        The world rotations (F, J, 3, 3) and the positions (F, J, 3) of the character's joints, and
+        the character's skeleton.
     """
     # All joints take the rotations of the body, relative to the rest poses. The hips follow the
     # scaled path. If the legs have different proportions, the feet would then hover or sink.

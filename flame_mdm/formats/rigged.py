@@ -55,7 +55,7 @@ class Skin:
         points: (V, 3), vertices in the coordinates of the mesh.
         normals: (V, 3), unit normals of the vertices.
         triangles: (T, 3), counterclockwise when seen from outside.
-        palette: the materials.
+        palette: the materials of the mesh.
         materials: (T,), index in `palette` of each triangle's material.
         ordered: indices of the skeleton's joints that can move the mesh. For a person, joints that
             follow SMPL's joints come first, in SMPL's order.
@@ -63,8 +63,10 @@ class Skin:
         weights: (V, K), weights of these joints; each row adds up to 1.
         binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
             of each joint.
-        colors: (V, 3) from 0 to 255, as on screens; (0, 3) if only the materials have colors.
-        uvs: (V, 2), positions in the images, from the lower left corner; (0, 2) without images.
+        colors: (V, 3), colors of the vertices from 0 to 255, as on screens; (0, 3) if only the
+            materials have colors.
+        uvs: (V, 2), positions of the vertices in the images, from the lower left corner; (0, 2) if
+            there are no images.
     """
 
     name: str
@@ -96,7 +98,7 @@ class RiggedClip:
         turns: (F, J, 3, 3), rotations relative to the parents.
         moves: positions (F, 3) relative to the parent, for each joint whose position changes.
         lift: the thickness of the soles, by which a person is raised above these positions.
-        skins: the meshes; () if no person fits the motion.
+        skins: the skinned meshes; () if no person fits the motion.
         scales: (J,), scale of each joint: units of its parent per unit of the joint.
         root: index of the joint on the floor that is the parent of the hips; -1 = no such joint.
         contacts: (F, 2), whether the left and the right toes are planted; (0, 2) = unknown.
@@ -156,7 +158,7 @@ class RiggedClip:
         The path moves the root or, if the skeleton has no root on the floor, the hips.
 
         Args:
-            path: (F, 2), x and z.
+            path: (F, 2), x and z in meters.
             heading: (F,), rotations about the vertical axis in radians; positive angles turn to
                 the left.
         """
@@ -197,9 +199,9 @@ class ContactEvent(NamedTuple):
 
     time: float  # seconds
     frame: int
-    # Left or right
+    # Side of the foot: left or right
     foot: str
-    # Plant or lift
+    # What happens: plant or lift
     event: str
 
 

@@ -56,7 +56,7 @@ def write(path: Path, clip: RiggedClip) -> None:
 
 
 def _paths(clip: RiggedClip) -> list[str]:
-    """Returns the paths of the joints from the root. Paths consist of names as in `_name`."""
+    """Returns the path of each joint from the root, which consists of names from `_name`."""
     paths: list[str] = []
     for name, parent in zip(clip.joints, clip.parents, strict=True):
         paths.append(f"{paths[parent]}/{_name(name)}" if parent >= 0 else _name(name))

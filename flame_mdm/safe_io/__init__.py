@@ -40,7 +40,7 @@ The largest known file, which contains BABEL's annotations, is 175 MiB.
 YAML_LIMIT = MEBIBYTE // 4
 """Maximum size of a YAML file. It is low, because parsing YAML is slow.
 
-Recipes, skeletons, protocols and table specs are far smaller.
+Recipes, skeletons, protocols and table specifications are far smaller.
 """
 # Maximum number of keys and values in a YAML file after its aliases are expanded
 YAML_NODES = 100_000
@@ -52,7 +52,7 @@ Larger arrays may have at most `INFLATION` times the size of the file. Compressi
 data by a factor of less than 10.
 """
 INFLATION = 20
-# Beginning of a pointer file, which replaces a file in Git LFS
+# Beginning of a pointer file, which Git LFS stores instead of the file itself
 GIT_LFS = b"version https://git-lfs.github.com/spec/"
 POINTER_LIMIT = 1024  # pointer files have fewer bytes than this
 
@@ -223,11 +223,11 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
     """Holds a lock file that names the process and the host.
 
     Yields the name of a dead process that left the file behind, or "". If another process holds the
-    lock, `busy` is called with the name of that process. `busy` either raises an error or returns.
-    If it returns, this function waits for the lock. `advice` is part of the warning for file
-    systems without locks. The operating system releases the lock when the process ends for any
-    reason. The lock is a POSIX record lock, which also works between hosts on NFS and Lustre,
-    unlike the locks of `filelock`. Windows has no such locks.
+    lock, `busy` is called with the name of that process. Unless `busy` raises an error, this
+    function then waits for the lock. `advice` is part of the warning for file systems without
+    locks. The operating system releases the lock when the process ends for any reason. The lock is
+    a POSIX record lock. Unlike the locks of `filelock`, it also works between hosts on NFS and
+    Lustre, but it does not exist on Windows.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:

@@ -81,7 +81,7 @@ def open_in_place(path: Path) -> IO[str]:
     except OSError as error:
         if path.is_symlink():
             raise UserError(
-                f"{path}: a link, which is not followed for writing. Remove it"
+                f"{path}: a link, and links are not followed for writing. Remove it"
             ) from error
         raise
     status = os.fstat(descriptor)

@@ -51,7 +51,8 @@ class Figure:
         text: the caption or the name of the action, or "" if there is neither.
         id: name of the motion. This is the name of a clip or file or, for a generated motion, the
             text and the sample number, which together determine the noise.
-        contacts: (F, N) bool, True = this joint of `skeleton.feet` is on the floor; None = unknown.
+        contacts: (F, N) bool, whether each joint of `skeleton.feet` is on the floor; None =
+            unknown.
     """
 
     joints: np.ndarray
@@ -166,8 +167,8 @@ class FittedBody:
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the
     # clip
     fit: np.ndarray
-    # (22, 3), joints of the stored pose with the bone lengths of the clip and the pelvis at the
-    # origin
+    # (22, 3), joint positions of the stored pose with the bone lengths of the clip and the pelvis
+    # at the origin
     joints: np.ndarray
     # (V, 3), points of the mesh in this pose
     points: np.ndarray

@@ -29,7 +29,7 @@ from flame_mdm.visualize.body import (
 def write_player(
     path: str | Path, motions: Sequence[Figure], title: str = "Motions", **options: Any
 ) -> None:
-    """Writes an HTML page that plays motions in any browser, without a network.
+    """Writes an HTML page that plays motions in any browser and requires no network.
 
     Args:
         path: the .html file.
@@ -142,9 +142,9 @@ def _packed(
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
     """Returns the proportions of a body, and a 32-bit quaternion for each frame and bone.
 
-    The quaternions are exact to about 0.1 degrees. The two highest bits state which of x, y, z and
-    w is largest. They are followed by the three other components, from -0.71 to 0.71, with 10 bits
-    each.
+    The quaternions are accurate to about 0.1 degrees. The two highest bits state which of x, y, z
+    and w is largest. They are followed by the three other components, from -0.71 to 0.71, with 10
+    bits each.
     """
     quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(1)

@@ -292,10 +292,10 @@ def _rasterize(
 ) -> None:
     """Draws triangles into an image. Each pixel shows the nearest triangle.
 
-    Colors are interpolated between the corners. The image is (height, width, 3) uint8. `at` (V, 2)
-    are pixel coordinates, y down; `depth` (V,) are distances from the camera; `colors` (V, 3) are
-    from 0 to 255. Triangles (T, 3) that are seen from inside, and whose corners therefore appear
-    clockwise, are not drawn.
+    Colors are interpolated between the corners. The image is (height, width, 3) uint8. The vertices
+    have pixel coordinates `at` (V, 2), y down, distances from the camera `depth` (V,), and `colors`
+    (V, 3) from 0 to 255. Triangles (T, 3) that are seen from inside, and whose corners therefore
+    appear clockwise, are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)

@@ -344,7 +344,7 @@ REFUSED = {
     "text": (b"hello", "not an FBX file"),
     "ascii": (
         b"; FBX 7.7.0 project file\nFBXHeaderExtension:  {\n",
-        "in ASCII. Export it as binary FBX",
+        "this is an ASCII FBX file. Export it as binary FBX",
     ),
     "old": (header(6100), r"FBX version 6\.1, but only version 7"),
     "header alone": (header(), "damaged"),

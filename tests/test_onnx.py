@@ -204,6 +204,34 @@ def test_the_runner_states_the_shortest_and_the_longest_motion() -> None:
     assert len(sampler_without_graphs(**start).generate(seconds=4.5)) == 90
 
 
+def test_an_export_compares_the_same_inputs_each_time_and_leaves_the_random_state(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drawn: list[Tensor] = []
+
+    def collect(graph: onnx.Graph, path: Path, half: bool) -> None:
+        drawn.extend(value.double() for value in graph.examples.values())
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(onnx, "write_graph", collect)
+    model = flame_mdm.load("quickstart")
+    for number, seed in enumerate((1, 2)):
+        torch.manual_seed(seed)
+        state = torch.get_rng_state()
+        onnx.write_folder(model, tmp_path / str(number))
+        assert torch.equal(torch.get_rng_state(), state)
+    first, second = drawn[: len(drawn) // 2], drawn[len(drawn) // 2 :]
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_the_runner_draws_the_noise_of_a_sentence_for_another_caption() -> None:
+    passes = {"steps": [[0, 0, 0, 1, 0, 0, 0]], "reads": "none"}
+    as_typed = sampler_without_graphs(**passes).generate("typed")
+    read = sampler_without_graphs(**passes).generate("caption", text="typed")
+    np.testing.assert_array_equal(read, as_typed)
+    assert not np.array_equal(sampler_without_graphs(**passes).generate("caption"), as_typed)
+
+
 def test_noise_of_the_runner_depends_on_prompt_sample_and_seed() -> None:
     passes = {"steps": [[0, 0, 0, 1, 0, 0, 0]]}  # the last step keeps the noise
     first = sampler_without_graphs(**passes).generate("a")

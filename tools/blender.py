@@ -6,8 +6,10 @@ The wheels for onnxruntime come from the package index.
 
 from __future__ import annotations
 
+import json
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -16,11 +18,13 @@ from importlib.metadata import requires, version
 from pathlib import Path
 
 from flame_mdm.checkpoints.onnx_export import RUNNER, export_onnx
+from flame_mdm.conditions import language
 from flame_mdm.errors import UserError, did_you_mean, say
 from flame_mdm.formats import names, posture, rig
 from flame_mdm.formats.characters import known_skeletons
 from flame_mdm.representations import skeleton
-from flame_mdm.safe_io import atomic_write, write_json, write_text
+from flame_mdm.safe_io import atomic_write, read_package_yaml, write_json, write_text
+from flame_mdm.sampling.motion_request import USUAL_SECONDS
 
 SOURCE = Path(__file__).with_suffix("")
 PYTHON = "3.11"
@@ -31,12 +35,14 @@ PLATFORMS = {
     "macos-arm64": ("macosx_14_0_arm64",),
 }
 """Blender's platform names -> the tags of their wheels."""
+LANGUAGE = Path(str(language.__file__)).parent
 MODULES = (
     RUNNER,
     *(
         Path(str(module.__file__))
         for module in (skeleton, names, posture, rig, sys.modules[UserError.__module__])
     ),
+    *sorted(LANGUAGE.glob("[!_]*.py")),
 )
 """Modules that the extension contains unchanged. They require only numpy."""
 
@@ -63,14 +69,9 @@ def build(model: str, out: Path, target: str) -> None:
         fetch_wheels(folder / "wheels", target)
         export_onnx(model, folder / "model", half=True)
         (folder / "model" / RUNNER.name).unlink()
-        for path in (*MODULES, SOURCE / "__init__.py"):
-            # Inside Blender, the extension is imported under a different package name
-            code = re.sub(
-                r"from flame_mdm\.(\w+\.)*(\w+) import",
-                r"from .\2 import",
-                path.read_text(encoding="utf-8"),
-            )
-            write_text(folder / path.name, code)
+        for path in (*MODULES, *sorted(SOURCE.glob("*.py"))):
+            write_text(folder / path.name, relative_imports(path.read_text(encoding="utf-8")))
+        write_language(folder)
         write_json(folder / "skeletons.json", known_skeletons(), indent=None)
         wheels = ", ".join(
             f'"./wheels/{path.name}"' for path in sorted((folder / "wheels").iterdir())
@@ -83,6 +84,26 @@ def build(model: str, out: Path, target: str) -> None:
         with atomic_write(out) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
             for path in sorted(path for path in folder.rglob("*") if path.is_file()):
                 packed.write(path, path.relative_to(folder))
+
+
+def relative_imports(code: str) -> str:
+    """Returns a module's code with imports from the folder of the extension.
+
+    Inside Blender, the extension is imported under a different package name, and all its modules
+    are in one folder.
+    """
+    code = code.replace("from flame_mdm.conditions.language import", "from . import")
+    return re.sub(r"from flame_mdm\.(\w+\.)*(\w+) import", r"from .\2 import", code)
+
+
+def write_language(folder: Path) -> None:
+    """Writes the tables with which the extension interprets sentences."""
+    for path in LANGUAGE.glob("*.yaml"):
+        text = json.dumps(read_package_yaml(path), ensure_ascii=False)
+        write_text(folder / f"{path.stem}.json", text)
+    for name in ("word_vectors.npz", "word_vectors.md"):
+        shutil.copy(LANGUAGE / name, folder)
+    write_json(folder / "constants.json", {"usual_seconds": USUAL_SECONDS})
 
 
 def fetch_wheels(folder: Path, target: str) -> None:
@@ -122,7 +143,7 @@ if __name__ == "__main__":
     try:
         target = sys.argv[1] if sys.argv[1:] else this_machine()
         path = Path(f"build/flame_mdm-{target}.zip")
-        build("quickstart", path, target)
+        build("package", path, target)
         say(f"written: {path}. In Blender: Edit > Preferences > Get Extensions > Install from Disk")
     except UserError as error:
         say(f"error: {error}", error=True)

@@ -281,7 +281,12 @@ class Sampler:
         return unknown
 
     def generate(
-        self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0
+        self,
+        prompt: str = "",
+        seconds: float | None = None,
+        seed: int = 0,
+        sample: int = 0,
+        text: str | None = None,
     ) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action.
 
@@ -289,6 +294,9 @@ class Sampler:
         distinguishes several motions for one text. `seconds` is 3 by default, or the model's
         maximum if that is lower. For a model that continues frames, the maximum is 600. Raises
         `ValueError` for an invalid length or an unknown action, or if the result is not finite.
+
+        `text` is the sentence that selects the noise, if it differs from the caption `prompt`:
+        `flame_mdm.generate` draws noise for the sentence as typed.
         """
         content = self.content
         fps = content["fps"]
@@ -300,7 +308,8 @@ class Sampler:
         if not 2 <= frames <= longest:
             raise ValueError(f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds")
 
-        condition, name = self._condition(prompt), f"{prompt}#{sample}"
+        condition = self._condition(prompt)
+        name = f"{prompt if text is None else text}#{sample}"
         if "start" not in content:
             padded = max(frames, content["padded_frames"])
             inputs = condition | {"lengths": np.array([frames])}

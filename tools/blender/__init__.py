@@ -12,6 +12,7 @@ from bpy.props import BoolProperty, FloatProperty, IntProperty, PointerProperty,
 from mathutils import Matrix, Quaternion
 
 from .posture import complete, rotations_about, world_rotations
+from .reading import Reader
 from .rig import Rig, follow, matched, recognized, rest_pose
 from .runner import Sampler
 from .skeleton import SMPL22
@@ -30,14 +31,16 @@ class Sampled:
     """A sampled motion for SMPL's joints: positions, rotations and offsets.
 
     Attributes:
-        unknown: words in the sentence that the model does not know.
+        summary: the actions as the model understood them, such as "walks forward".
+        warnings: differences between the sentence and the motion, one line each.
     """
 
     joints: np.ndarray
     world: np.ndarray
     offsets: np.ndarray
     fps: float
-    unknown: list[str]
+    summary: str
+    warnings: list[str]
 
 
 @cache
@@ -45,18 +48,48 @@ def sampler() -> Sampler:
     return Sampler(FOLDER / "model")
 
 
+@cache
+def reader() -> Reader:
+    return Reader(sampler().content)
+
+
+def usual_seconds() -> float:
+    """Returns the length of a motion if the user states none and the sentence no count."""
+    content = sampler().content
+    constants = json.loads((FOLDER / "constants.json").read_text(encoding="utf-8"))
+    return min(constants["usual_seconds"], content["max_frames"] / content["fps"])
+
+
 def sample(sentence: str, seconds: float, seed: int, in_place: bool) -> Sampled:
-    """Samples a motion. Raises `ValueError` for a sentence or length that the model does not know."""
-    model = sampler()
-    unknown = model.unknown(sentence)
-    joints = model.decode(model.generate(sentence, seconds, seed))
+    """Samples a motion.
+
+    Args:
+        sentence: the actions to show. The extension samples the first of several actions.
+        seconds: length of the motion. 0 = as long as the sentence needs.
+        seed: seed of the noise.
+        in_place: whether to remove the path of the hips over the floor.
+
+    Raises:
+        ValueError: If the sentence names no action that the model knows, or the length is invalid.
+    """
+    model, reading = sampler(), reader().read(sentence)
+    warnings = reading.warnings()
+    if len(reading.captions) > 1:
+        warnings.append(f"several actions: only the first is sampled, '{reading.captions[0]}'")
+    text = sentence if len(reading.captions) == 1 else reading.texts[0]
+    counted = reading.seconds()[0] if reading.steps else None
+    usual = usual_seconds()
+    length = seconds or min(usual, usual if counted is None else counted)
+    joints = model.decode(model.generate(reading.captions[0], length, seed, text=text))
     if in_place:
         joints[..., [0, 2]] -= joints[:, :1, [0, 2]] - joints[:1, :1, [0, 2]]
     offsets, quaternions = (values.astype(float) for values in model.rotations(joints))
     sine = np.linalg.norm(quaternions[..., 1:], axis=-1)
     axes = quaternions[..., 1:] / np.maximum(sine, 1e-9)[..., None]
     world = world_rotations(rotations_about(axes, 2 * np.arctan2(sine, quaternions[..., 0])))
-    return Sampled(joints.astype(float), world, offsets, model.content["fps"], unknown)
+    return Sampled(
+        joints.astype(float), world, offsets, model.content["fps"], reading.summary(), warnings
+    )
 
 
 # Armatures ------------------------------------------------------------------------------------------------------------
@@ -213,7 +246,14 @@ class Settings(bpy.types.PropertyGroup):
         "sentence": StringProperty(
             name="", description="What the person does", default="a person walks forward"
         ),
-        "seconds": FloatProperty(name="Seconds", default=3, min=0.1, step=10, precision=1),
+        "seconds": FloatProperty(
+            name="Seconds",
+            description="0: as long as the sentence needs",
+            default=0,
+            min=0,
+            step=10,
+            precision=1,
+        ),
         "seed": IntProperty(
             name="Seed", description="A different seed gives a different motion", default=0
         ),
@@ -277,9 +317,9 @@ class Generate(bpy.types.Operator):
                 bpy.data.armatures.remove(made.data)
             self.report({"ERROR"}, str(error).strip().splitlines()[0])
             return {"CANCELLED"}
-        if motion.unknown:
-            self.report({"WARNING"}, f"Never seen in training: {', '.join(motion.unknown)}")
-        self.report({"INFO"}, f"{(made or armature).name}: {frames} frames")
+        for warning in motion.warnings:
+            self.report({"WARNING"}, warning)
+        self.report({"INFO"}, f"{(made or armature).name}: {motion.summary}, {frames} frames")
         return {"FINISHED"}
 
     def execute(self, context):

@@ -231,7 +231,7 @@ BAD = {
     ),
     "cells": (
         lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"),
-        r"line 2: the row needs one cell per column",
+        r"line 2: the row must have one cell per column",
     ),
     "split": (
         lambda f: write_table(f, [{"id": "one", "split": "dev"}]),

@@ -25,29 +25,33 @@ Value = TypeVar("Value")
 
 @dataclass
 class Clip:
-    """One motion of a data set, which is written into a store."""
+    """One motion of a data set, with the captions and labels that are written to the store."""
 
     # Unique name. The name of a mirrored copy is `M` + the name of its original.
     id: str
-    # Input to the representation, at its frame rate. Joint representations take positions (F, J, 3)
-    # in meters, y up, in the joint order of the skeleton.
+    # Raw motion that the representation encodes, at the frame rate of the representation.
+    # Representations of joints encode positions (F, J, 3) in meters, with y up, in the joint order
+    # of their skeleton.
     motion: np.ndarray
-    # Descriptions of the entire motion. Empty for data sets that only have action labels.
+    # Descriptions of the entire motion. The list is empty for data sets that have only action
+    # labels.
     captions: list[str]
     # Split. Mirrored copies and cuts of a take are in the same split as the take.
     split: Split
     # The take that the clip comes from. All clips from one source are in the same split.
     source: str
-    # Index into the data set's `actions`, or None
+    # Index of the action label in the data set's `actions`, or None if the clip has no label
     action: int | None = None
-    # Exact facts about the motion as JSON values, such as side, count and direction, or tagged
-    # words
+    # Exact facts about the motion, such as its side, count and direction, as JSON values. The text
+    # data sets also keep the tagged words of their captions here.
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    # Name of a representation, if the release contains its features. `motion` (F, D) is then stored
-    # unchanged. Empty if `motion` is raw.
+    # Name of the representation if the release contains encoded features instead of raw motions.
+    # `motion` (F, D) then consists of these features and is stored unchanged. Empty if `motion` is
+    # raw.
     encoded: str = ""
-    # (first, length): the part of the motion that is the clip. Consecutive clips with the same
-    # array object share its frames in the store. Only for representations with one row per frame.
+    # First frame and length of the part of the motion that forms the clip. None = the entire
+    # motion. Consecutive clips with the same array object share its frames in the store. Windows
+    # require a representation with one row per frame.
     window: tuple[int, int] | None = None
     # Joint positions (F', J, 3) in meters at the frame rate of the recording, for protocols that
     # compare motions at that rate.
@@ -58,7 +62,7 @@ class Clip:
 
 
 class MotionSource(ABC):
-    """A data set in its published form."""
+    """Base class for readers of data sets in their published form."""
 
     name: str
     # Whether the data set takes its name from `data.name`, because the files are the user's own
@@ -139,10 +143,10 @@ class MotionSource(ABC):
         return []
 
     def changed(self, store: Path) -> list[str]:
-        """Returns a line if files were added or changed after the store was prepared.
+        """Returns lines about files that were added or changed after the store was prepared.
 
         Args:
-            store: a file in the store.
+            store: a file of the store. Data files with a later modification time count as changed.
         """
         return []
 
@@ -174,7 +178,7 @@ class MotionSource(ABC):
         return [f"error: {failure}" for failure in self.failures]
 
     def check(self, fps: float) -> list[str]:
-        """Returns lines to print about existing and missing files. Does not prepare the data.
+        """Returns lines to print about existing and missing files, without preparing the data.
 
         Args:
             fps: frames per second.
@@ -182,7 +186,7 @@ class MotionSource(ABC):
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def suit(self, representation: "Representation") -> None:  # noqa: B027 (most sources yield one kind of motion)
-        """Configures the source for a representation, so that `clips` yields raw motions for it.
+        """Configures the source so that `clips` yields raw motions for a representation.
 
         Raises:
             UserError: If the options do not fit the representation.
@@ -191,7 +195,7 @@ class MotionSource(ABC):
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns the mean and std (D,) that are published with encoded features.
 
-        Returns None if they must be computed from the training clips.
+        The result is None if they must be computed from the training clips.
         """
         return None
 
@@ -217,7 +221,7 @@ class MotionSource(ABC):
 def advice_on_splits(source: MotionSource) -> str:
     """Returns advice, with a leading space, for a split without clips.
 
-    The advice is "" for a published data set, because its splits are fixed.
+    The advice is "" for published data sets, because their splits are fixed.
     """
     return " Add a `split` column to captions.csv" if source.named_by_recipe else ""
 
@@ -234,7 +238,7 @@ def required(path: Path, get_it: str) -> Path:
 
 
 def some(names: Iterable[str]) -> str:
-    """Returns the first five of the sorted names, and the number of the remaining names."""
+    """Lists the first five of the sorted names, followed by the number of the remaining names."""
     first = sorted(names)
     return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
 
@@ -257,7 +261,7 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 
 
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
-    """Returns the split of each block of `size` consecutive clips, drawn with a hash of `name`.
+    """Draws the split of each block of `size` consecutive clips with a hash of `name`.
 
     Neighboring clips may be similar, so all clips of a block are in the same split. `val` and
     `test` are fractions of the blocks. Each split gets at least one block.

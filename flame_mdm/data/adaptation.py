@@ -1,6 +1,6 @@
-"""Data for adaptation: one half of each batch consists of the user's clips.
+"""Data for adaptation: half of each batch consists of the user's clips.
 
-The other half consists of clips of motions that the model already knows.
+The other half consists of clips that the model already knows.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,8 @@ DRIFT = 0.05
 """Maximum rise of the floor, in meters, from the first to the last second of a clip."""
 FLOAT = 0.1
 """Maximum median height of the body above the floor, in meters."""
-# Maximum number of known clips per split. They are evenly spaced in the model's data.
+# Maximum number of known clips per split. They are selected at even intervals from the data that
+# the model was trained on.
 PRIOR = {
     "train": 2000,
     "val": 64,
@@ -38,7 +39,7 @@ class Lesson(MotionSource):
     """Clips in the user's folder, with mirrored copies, and clips that the model already knows.
 
     All clips in the folder are used for training unless the caption table says otherwise. Clips are
-    normalized with the statistics of the known clips' store.
+    normalized with the statistics of the store that contains the known clips.
 
     Args:
         path: the user's motion folder.
@@ -80,7 +81,7 @@ class Lesson(MotionSource):
     def suit(self, representation: Representation) -> None:
         """Configures the user's clips for a representation.
 
-        The clips of the store are already features.
+        The store's clips are already encoded.
         """
         self.folder.suit(representation)
 
@@ -89,11 +90,11 @@ class Lesson(MotionSource):
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips, whose captions name their style, then the clips of the store.
+        """Yields the user's clips, whose captions name the style, followed by the clips of the store.
 
         Raises:
             UserError: If one of the user's motions cannot be read. The folder contains only a few
-                motions, so none of them is left out.
+                motions, so unreadable motions are not skipped.
         """
         for clip in self.folder.clips(fps):
             yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
@@ -112,7 +113,7 @@ def styled(caption: str, name: str) -> str:
 def check_clips(path: str | Path, fps: float) -> None:
     """Checks the motions in a folder before training.
 
-    Prints the skeletons of the motions, and the parts of them that were left out.
+    Prints the skeletons of the motions, and which of their parts were left out.
 
     Raises:
         UserError: If a motion cannot be read, its floor rises, or its body floats.
@@ -130,16 +131,17 @@ def check_clips(path: str | Path, fps: float) -> None:
 
 
 def fault_of(joints: np.ndarray, fps: float) -> str:
-    """Returns how far the floor of a clip rises, or how high its body floats.
+    """Returns a message if the floor of a clip rises, or if the body floats above the floor.
 
-    The result is "" within the limits `DRIFT` and `FLOAT`.
+    The message is "" if the clip is within the limits `DRIFT` and `FLOAT`.
 
     Args:
-        joints: (F, J, 3) in meters, y up.
+        joints: (F, J, 3) joint positions in meters, with y up.
         fps: frames per second.
     """
-    # The floor at a given time is the lowest joint within a window of one second. A jump is
-    # shorter, so it does not raise the floor. Height 0 is the lowest joint of the entire clip.
+    # The height of the floor at a given time is the height of the lowest joint within a window of
+    # one second. Jumps are shorter, so they do not raise the floor. Heights are measured from the
+    # lowest joint of the entire clip.
     floor = minimum_filter1d(joints[..., 1].min(1), round(fps), mode="nearest")
     rise, height = floor[-1] - floor[0], np.median(floor) - floor.min()
     if rise > DRIFT:
@@ -182,7 +184,7 @@ class LessonData(MotionDataModule):
         return [np.flatnonzero(~is_kept), np.flatnonzero(is_kept)]
 
     def counts(self, store: Store) -> list[str]:
-        """Returns a line with the numbers of training clips in both halves."""
+        """Returns a line with the number of training clips in each half."""
         taught, kept = map(len, self.halves())
         return [
             f"clips: {taught} from {self.source.name}, including mirrored copies; {kept} that the model already knows"

@@ -1,6 +1,6 @@
 """Reader for zip and tar archives of motion data.
 
-Only regular files are read, with size limits.
+Only regular files are read, and their size is limited.
 """
 
 import bz2
@@ -62,8 +62,8 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
     """Returns `path` if it is a folder, or a temporary folder with the `members` of the archive.
 
-    The temporary folder is removed together with `owner`. In this folder, the deepest subfolder
-    that contains all members is returned.
+    The temporary folder is removed when `owner` is garbage-collected. The result is its deepest
+    subfolder that contains all members.
 
     Raises:
         UserError: For the same reasons as `members`, and if a member would be unpacked outside
@@ -123,19 +123,19 @@ def _tar_members(
             if not member.isdir() and is_wanted(member.name):
                 if not member.isreg() or member.issparse():
                     raise UserError(
-                        f"{member.name}: it is a link or another special file, not a regular file"
+                        f"{member.name} is a link or another special file, not a regular file"
                     )
                 _check_size(member.name, member.size)
                 yield member.name, archive.extractfile(member).read()
-            # Otherwise, a million empty members would take a gigabyte
+            # Otherwise, a million empty members would take a gigabyte of memory
             archive.members = []
-            # Otherwise, each member would copy these shared values
+            # Otherwise, these shared values would be copied for each member
             archive.pax_headers = {}
 
 
 def _check_size(name: str, size: int) -> None:
     if size > MEMBER_LIMIT:
-        raise UserError(f"{name}: its size, {size:,} bytes, is too large for a motion")
+        raise UserError(f"{name} has {size:,} bytes, which is too large for a motion")
 
 
 class _Member(tarfile.TarInfo):
@@ -146,19 +146,19 @@ class _Member(tarfile.TarInfo):
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:
-            raise UserError(f"{self.name}: it is a sparse file")
+            raise UserError(f"{self.name} is a sparse file, which is not supported")
         if self.type in _HEADERS and self.size > HEADER_LIMIT:
             raise UserError(f"a header has a size of {self.size:,} bytes, which is too large")
         return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _proc_gnusparse_10(self, *_: Any) -> None:
-        raise UserError(f"{self.name}: it is a sparse file")
+        raise UserError(f"{self.name} is a sparse file, which is not supported")
 
 
 class _Bounded:
-    """Reader for the content of a compressed file with a size of `packed` bytes.
+    """Reader that limits how far a compressed file of `packed` bytes may expand.
 
-    It refuses to read implausibly large amounts of data.
+    It refuses to return an implausibly large amount of data.
     """
 
     def __init__(self, file: IO[bytes], packed: int):

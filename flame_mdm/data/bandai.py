@@ -38,17 +38,18 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""Name of the joint in the files for each SMPL joint. spine1 lies between Hips and Spine."""
+"""For each SMPL joint, the name of the corresponding joint in the files. spine1 lies between Hips and Spine.
+"""
 
 _LEFT, _UP, _FORWARD = np.eye(3)
 _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # direction of SMPL's left foot
 
 
 def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Returns orthonormal columns.
+    """Returns a matrix with orthonormal columns.
 
-    They are the direction of x, the component of y that is perpendicular to x, and their cross
-    product.
+    The columns are the direction of x, the direction of the component of y that is perpendicular to
+    x, and the cross product of both.
     """
     first = x / np.linalg.norm(x)
     third = np.cross(first, y) / np.linalg.norm(np.cross(first, y))
@@ -69,9 +70,10 @@ def _sloping(degrees: float) -> np.ndarray:
 
 
 # Directions of each joint's local axes (columns) when the body is in SMPL's rest pose: standing
-# straight, with flat feet, arms out and palms down. In this pose, all SMPL rotations are the
-# identity. The bones of arms and legs lie on the x axis and have the directions of SMPL's rest
-# pose. Knees and elbows bend about y. `docs/bandai.md` explains how the axes were measured.
+# straight with flat feet, with the arms stretched out and the palms down. In this pose, all SMPL
+# rotations are the identity. The bones of arms and legs lie on the x axis and have the directions
+# of SMPL's rest pose. Knees and elbows bend about y. `docs/bandai.md` explains how the axes were
+# measured.
 REST = {
     "Hips": _axes(_UP, -_LEFT),
     **dict.fromkeys(("Spine", "Chest", "Neck", "Head"), _axes(_UP, _FORWARD)),
@@ -92,11 +94,10 @@ WORDS = read_package_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styl
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
-"""Number of published takes per style in data set 2, by content.
+"""For each content of data set 2, the number of published takes per style.
 
-The styles are in the order of `STYLES_2`.
-
-Splits are drawn from these numbers, so that they do not depend on which files exist.
+The styles are in the order of `STYLES_2`. Splits are drawn from these numbers, so that they do not
+depend on which files exist.
 """
 
 WRONG_SIDE, SIDES = WORDS["wrong_side"], WORDS["sides"]
@@ -109,7 +110,7 @@ HELD_OUT = frozenset(
 """Combinations of content and style that never occur in training with the compositional split."""
 GET_IT = (
     "the data sets are published at https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC "
-    "BY-NC 4.0): clone it, then run `make prepare` with SOURCE=/path/to/the/clone"
+    "BY-NC 4.0): clone the repository, then run `make prepare` with SOURCE=/path/to/the/clone"
 )
 FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
@@ -118,7 +119,7 @@ class Take(NamedTuple):
     """One BVH file.
 
     `content` is the action that the actor performs. For the takes in `WRONG_SIDE`, it differs from
-    the file name.
+    the content in the file name.
     """
 
     file: Path
@@ -129,7 +130,7 @@ class Take(NamedTuple):
 
 
 class Bandai(MotionSource):
-    """Both data sets on SMPL's skeleton. Captions are generated from content and style.
+    """Both data sets, converted to SMPL's skeleton, with captions for content and style.
 
     Args:
         path: a clone of the original repository, a folder that contains the BVH files at any
@@ -140,8 +141,8 @@ class Bandai(MotionSource):
         workers: number of processes; 0 = one per core.
         exclude: file names of takes to leave out, without extension.
         split: "takes" holds out takes whose combinations of content and style occur in training.
-            "compositional" holds out the combinations `HELD_OUT`. In training, their contents and
-            styles then occur only in other combinations.
+            "compositional" holds out the combinations in `HELD_OUT`, so that their contents and
+            styles occur in training only in other combinations.
     """
 
     name = "bandai"
@@ -177,9 +178,10 @@ class Bandai(MotionSource):
         return {"takes": one + two, "takes of data set 1": one, "takes of data set 2": two}
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields each take. In the training split, each take is followed by its mirrored copy.
+        """Yields all takes. With `mirror`, each training take is followed by its mirrored copy.
 
-        The attributes are content, style, dataset and, if a side moves, side.
+        The attributes of a clip are `content`, `style` and `dataset`, and also `side` if the
+        content has a side.
         """
         convert_one = partial(convert, fps=fps, kind=self.motion)
         motions = in_order(convert_one, [take.file for take in self.takes], self.workers)
@@ -249,8 +251,8 @@ def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
     """Converts a take to an SMPL motion (F, 75) float32 in AMASS's axes, z up.
 
-    A frame contains the position of the pelvis in meters and the axis-angle vectors of 24 joints.
-    The hands (22 and 23) do not rotate.
+    Each frame contains the position of the pelvis in meters and the axis-angle vectors of 24
+    joints. The hands (22 and 23) do not rotate.
 
     Args:
         skeleton: skeleton of the file.
@@ -306,12 +308,13 @@ def captions(content: str, style: str, side: str) -> list[str]:
 def split_of(dataset: int, content: str, style: str, number: int, rule: str = "takes") -> Split:
     """Returns the split of a take. The split depends only on the take's name.
 
-    Neighboring takes are similar, so blocks of five takes are in one split. Data set 1 contains
-    only one take of most combinations, so each combination is in one split. The normal takes of
-    walk-turn-left and -right overlap in time across names. All these takes are used for training.
+    In data set 2, neighboring takes are similar, so each block of five takes is kept in one split.
+    Data set 1 contains only one take of most combinations, so each combination is kept in one
+    split. The takes of walk-turn-left and walk-turn-right in normal style overlap in time, so all
+    of them are used for training.
 
-    With the rule "compositional", the combinations `HELD_OUT` are the test split. The other takes
-    that would be in the test split under the rule "takes" are used for training.
+    With the rule "compositional", the combinations in `HELD_OUT` form the test split. All other
+    takes that the rule "takes" assigns to the test split are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -343,8 +346,8 @@ def _take(file: Path, rule: str) -> Take:
 
 
 def prompts() -> list[str]:
-    """Returns fixed prompts, worded like the captions.
+    """Returns the prompts of this data set's recipes, which are worded like the captions.
 
-    The recipes of this data set generate samples for these prompts.
+    During training, samples are generated for these prompts.
     """
     return WORDS["prompts"]

@@ -20,7 +20,8 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields the rows of a caption table.
 
-    A row consists of its file and line, for error messages, and its cells by column.
+    Each row is a pair of its location (file and line), which error messages name, and its cells by
+    column.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in
@@ -39,7 +40,7 @@ def table_rows(
             where = f"{path}, line {rows.line_num}"
             if None in row or None in row.values():
                 raise UserError(
-                    f"{where}: the row needs one cell per column. Put quotes around text that contains a comma"
+                    f"{where}: the row must have one cell per column. Put quotes around text that contains a comma"
                 )
             yield where, {name: cell.strip() for name, cell in row.items()}
 
@@ -57,13 +58,14 @@ def drawn_splits(
 ) -> dict[str, Split]:
     """Returns the split of each motion, which is either stated in the table or drawn.
 
-    Splits are drawn with a hash of the source, so that all motions from a source are in one split.
-    If no motion is drawn for training, the source with the highest hash in the largest split is
-    moved to training. With `SPLITTABLE` or more motions, val and test are filled in the same way.
+    Splits are drawn with a hash of the source, so that all motions from the same source are in the
+    same split. If no motion is drawn for training, the source with the highest hash in the largest
+    split is moved to training. With `SPLITTABLE` or more motions, val and test are filled in the
+    same way.
 
     Args:
         sources: source of each motion, by name.
-        stated: split of each motion in the table, by name, or None if the table states no split.
+        stated: split of each motion, by name, or None if the table states no split for the motion.
     """
     of_sources: dict[str, Split] = {sources[name]: split for name, split in stated.items() if split}
     free = sorted(set(sources.values()) - set(of_sources))

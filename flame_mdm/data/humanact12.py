@@ -33,9 +33,9 @@ BLOCK = 10
 class HumanAct12(MotionSource):
     """The clips in `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
-    The file names neither subjects nor recordings. The project's own split (70 % train, 10 % val,
-    20 % test of each action) keeps neighboring clips together. The published split uses all clips
-    both for training and for testing, as in the papers.
+    The file does not identify subjects or recordings. The project's own split (70 % train, 10 %
+    val, 20 % test of each action) keeps neighboring clips together. The published split uses all
+    clips both for training and for testing, as in the papers.
     """
 
     name = "humanact12"
@@ -89,7 +89,9 @@ class HumanAct12(MotionSource):
             zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)
         ):
             with naming(
-                f"{path}: clip {number}", *NO_NUMBERS, prefix="does not consist of numbers: "
+                f"{path}: clip {number}",
+                *NO_NUMBERS,
+                prefix="contains values that are not numbers: ",
             ):
                 pose = np.asarray(poses, np.float32)
                 joint = np.asarray(joints, np.float32)
@@ -110,8 +112,9 @@ def read_unconstrained(path: Path) -> np.ndarray:
     """Reads the reference motions for unconstrained generation.
 
     Sources: Tevet et al. 2023, section 4.3; Raab et al. 2022. The array in
-    `humanact12_unconstrained_modi_struct.npy` is (N, 15 or more, 3, F). The result (N, F, 15, 3)
-    float32 contains SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
+    `humanact12_unconstrained_modi_struct.npy` has the shape (N, 15 or more, 3, F). The result (N,
+    F, 15, 3) float32 contains the positions of SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1,
+    4, 7, 2, 5, 8.
     """
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
@@ -123,7 +126,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
 
 def find(path: Path, name: str) -> Path:
-    """Returns `path`, or the file with this name in `path` or a subfolder.
+    """Returns `path` if it is a file, or the file called `name` in this folder or a subfolder.
 
     The error for a missing file states where the data set is published.
     """
@@ -132,18 +135,20 @@ def find(path: Path, name: str) -> Path:
             return file
     raise FileNotFoundError(
         f"{path}: no {name}; the data set is published with ACTOR (https://github.com/Mathux/ACTOR, prepare/"
-        "download_datasets.sh): unpack it, then run `make prepare` with SOURCE=/path/to/the/folder"
+        "download_datasets.sh): unpack the archive, then run `make prepare` with SOURCE=/path/to/the/folder"
     )
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns the named lists in a pickled dictionary. Checks that they have equal length."""
+    """Returns the named lists in a pickled dictionary, which must have equal lengths."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (
             f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
         )
-        raise UserError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
+        raise UserError(
+            f"{path}: must contain a dictionary with {', '.join(names)}, but contains {kind}"
+        )
     lists = [data[name] for name in names]
     are_lists = all(isinstance(values, list | tuple) or np.ndim(values) for values in lists)
     if not are_lists or len(set(map(len, lists))) > 1:

@@ -28,16 +28,17 @@ class KIT(T2MFolder):
     representation = "humanml-legacy-kit21"
     fps = 12.5
     shortest = 24
-    get_it = "get KIT-ML as processed for text-to-motion, linked at https://github.com/EricGuo5513/HumanML3D"
+    get_it = "download KIT-ML as processed for text-to-motion, which is linked at https://github.com/EricGuo5513/HumanML3D"
 
 
 class KITTemos(MotionSource):
     """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
 
     The recordings have 100 frames per second, of which every eighth frame is used. Source:
-    Petrovich, Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. Training and validation
-    leave out motions of fewer than 10 or more than 500 frames. The test split keeps all motions,
-    but only their first captions. Ghosh et al.'s test clips have the attribute `ghosh_test`.
+    Petrovich, Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. The training and
+    validation splits leave out motions of fewer than 10 or more than 500 frames. The test split
+    keeps all motions, but only the first caption of each. The attribute `ghosh_test` states whether
+    a clip is in Ghosh et al.'s test split.
 
     `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
     contains TEMOS's lists of these numbers.
@@ -134,7 +135,7 @@ class KITTemos(MotionSource):
             yield clip
 
     def counts(self) -> dict[str, int]:
-        """Returns the numbers of motions, captions and names per split."""
+        """Returns the numbers of motions and captions, and the number of names in each split."""
         texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))
         splits = list(read_splits(self.splits, "", self.get_it).values())
         counts = {split: splits.count(split) for split in SPLITS} | {
@@ -160,6 +161,6 @@ def read_joints(path: Path, step: int = 8) -> np.ndarray:
         rows = np.loadtxt(lines, delimiter=",", ndmin=2)
         if rows.shape[1] != 64 or not len(rows) or not np.isfinite(rows).all():
             raise UserError(
-                f"rows have shape {rows.shape}. Expected a row number and 63 finite coordinates each"
+                f"rows have shape {rows.shape}, but each row must contain its number and 63 finite coordinates"
             )
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)

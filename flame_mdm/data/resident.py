@@ -23,15 +23,14 @@ from flame_mdm.representations import Representation
 SHARE = 4
 CHUNK = 1 << 16  # number of frames that are copied at once, so that copying takes little memory
 # Number of batches whose crops are drawn together. This takes less host time than drawing them one
-# by one, and on a GPU, it needs only one copy for all of them.
+# by one, and it requires only one copy to a GPU.
 PLANNED = 16
 
 
 def free_memory(device: torch.device) -> int:
     """Returns the free memory of a device in bytes.
 
-    For devices other than GPUs, this is the memory that is available from the system or the
-    container.
+    For devices other than GPUs, this is the memory that the system or the container has available.
     """
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
@@ -52,10 +51,10 @@ def free_memory(device: torch.device) -> int:
 
 
 def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
-    """Returns features (N + 1, D) on a device: the frames of a store, then a row of zeros.
+    """Copies the frames of a store to a device and adds a row of zeros, which is used as padding.
 
-    The zeros are used as padding. The frames are normalized unless the representation adapts clips
-    that were cut. In this case, they are normalized later.
+    The features (N + 1, D) are already normalized, unless the representation adapts the features of
+    cut clips. In this case, each batch is normalized after it is adapted.
     """
     features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
     mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
@@ -68,7 +67,7 @@ def resident_features(store: Store, representation: Representation, device: torc
 
 
 def adapts_cuts(representation: Representation) -> bool:
-    """Returns whether a representation adapts the features of clips that were cut; see `rebase`."""
+    """Returns whether a representation adapts the features of cut clips in its method `rebase`."""
     return type(representation).rebase is not Representation.rebase
 
 
@@ -80,8 +79,8 @@ class ResidentLoader:
     Args:
         clips: clips of the split.
         batches: the draws that make up each batch.
-        features: (N + 1, D), see `resident_features`.
-        multiple: batches are padded to multiples of this number of frames.
+        features: (N + 1, D), as returned by `resident_features`.
+        multiple: number of frames. The length of each batch is padded to a multiple of it.
     """
 
     def __init__(
@@ -124,8 +123,8 @@ class ResidentLoader:
         start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)
         frames = self.frames[: max(padded)]
         mask = frames < lengths[:, None]
-        # Past its last frame, a clip repeats this frame. Past the end of a sample, all entries are
-        # 0.
+        # A sample that extends past the end of its clip repeats the last frame. After the end of
+        # the sample, all entries are 0.
         rows_of_frames = torch.minimum(start[:, None] + frames, last[:, None]).masked_fill(
             ~mask, len(self.features) - 1
         )

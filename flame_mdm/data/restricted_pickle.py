@@ -1,13 +1,13 @@
 """Restricted reader for pickles.
 
-This module reads arrays, numbers, text, lists, tuples and dictionaries with text keys. A pickle can
-refer to any function and have it called. This reader calls no function. It keeps the arguments and
-the state of each object, and creates arrays from the bytes among them. NumPy's own functions are
-not used for this, because a wrong byte in a dtype makes them crash.
+The reader supports arrays, numbers, text, lists, tuples, and dictionaries with text keys. A pickle
+can name any function and have it called when it is loaded. This reader never calls these functions:
+it only records the arguments and the state of each object, and creates arrays from the recorded
+bytes. NumPy's own functions are not used for this, because a wrong byte in a dtype makes them crash.
 
-Python's C unpickler allocates any amount of memory that a file declares, even for a file of ten
-bytes. Therefore, this reader is based on the Python version of the unpickler. No read may request
-more bytes than are left in the file. Content that a pickle repeats is counted at each repetition.
+Python's C unpickler allocates as much memory as a file declares, even if the file has only ten
+bytes. Therefore, this reader is based on the Python version of the unpickler, and never reads more
+bytes than are left in the file. Content that a pickle repeats counts toward the size limit each time.
 """
 
 import pickle
@@ -23,13 +23,13 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-# Each value counts as this number of bytes. Otherwise, a file of a few bytes could repeat a list
-# endlessly.
+# Number of bytes that each value adds to the expanded size. If values counted as nothing, a file of
+# a few bytes could repeat a list endlessly.
 VALUE = 512
 
 
 class _Object:
-    """An object of a pickle. Nothing is loaded or called to create it."""
+    """An object that a pickle describes. Nothing is imported or called to create it."""
 
     state: Any = None
 
@@ -44,18 +44,18 @@ ARRAY, SCALAR, BUFFER, BYTES = ALLOWED = (
     "_codecs.encode",
 )
 KINDS = {name: type(name, (_Object,), {}) for name in (*ALLOWED, "numpy.ndarray", "numpy.dtype")}
-"""All globals that a pickle may refer to, and the class of their objects."""
+"""All globals that a pickle may refer to, and the class that represents objects of each."""
 BASES = (
     "copy_reg._reconstructor",
     "copyreg._reconstructor",
     "__builtin__.object",
     "builtins.object",
 )
-"""Globals with which old protocols create an object of a class"""
+"""Globals with which old protocols create an object of a class."""
 
 
 class _Dictionary(dict[str, Any]):
-    """A dictionary with text keys.
+    """A dictionary that accepts only text keys.
 
     Keys of other types could be chosen so that they all have the same hash.
     """
@@ -69,8 +69,7 @@ class _Dictionary(dict[str, Any]):
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    `opaque` contains prefixes of names. An object whose global has such a name is read as its
-    state.
+    `opaque` contains prefixes of global names. An object of such a global is replaced by its state.
     """
 
     stack: list[Any]
@@ -94,10 +93,10 @@ class _Unpickler(pickle._Unpickler):
         return self.file.read(size)
 
     def find_class(self, module_name: str, global_name: str, /) -> type[_Object]:
-        """Returns the class of objects of a permitted global.
+        """Returns the class that represents objects of a permitted global.
 
         Raises:
-            UnpicklingError: For all other globals.
+            UnpicklingError: If the global is not permitted.
         """
         name = f"{module_name}.{global_name}".replace("numpy._core.", "numpy.core.")
         if name in KINDS:
@@ -105,8 +104,8 @@ class _Unpickler(pickle._Unpickler):
         if self.opaque and name.startswith((*self.opaque, *BASES)):
             return _Object
         raise pickle.UnpicklingError(
-            f"it refers to {name[:200]}, but only arrays, numbers, text and plain containers are read (anything "
-            "else could run code); download the file from its owners"
+            f"it refers to {name[:200]}, but only arrays, numbers, text and plain containers are read, because "
+            "anything else could run code. Download the file from its original source"
         )
 
     def plain(self, value: Any) -> Any:
@@ -168,12 +167,12 @@ class _Unpickler(pickle._Unpickler):
         for key, value in zip(items[::2], items[1::2], strict=True):
             self.stack[-1][key] = value
 
-    # Python's version allocates the declared size before it reads
+    # Python's version allocates the declared size before it reads any data
     def _load_bytearray8(self) -> None:
         self.append(bytearray(self.read(struct.unpack("<Q", self.read(8))[0])))
 
     def _refuse_set(self) -> None:
-        raise pickle.UnpicklingError("it contains a set, but no data set has one")
+        raise pickle.UnpicklingError("it contains a set, which no supported data set uses")
 
     dispatch = pickle._Unpickler.dispatch | {
         pickle.BUILD[0]: _load_build,
@@ -187,8 +186,8 @@ class _Unpickler(pickle._Unpickler):
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle with protocol 0 to 5.
 
-    Objects whose names begin with one of `opaque` are also permitted. They are replaced by their
-    state.
+    Objects of globals whose names begin with one of the prefixes in `opaque` are also permitted.
+    They are replaced by their state.
 
     Raises:
         UserError: If the file is damaged, or refers to other globals.

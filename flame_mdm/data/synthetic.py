@@ -36,12 +36,13 @@ MIN_SECONDS, MAX_SECONDS = 2.0, 3.0
 CAPTIONS = 8
 # With actions="all", the fraction of clips that show two simultaneous actions
 SIMULTANEOUS = 0.08
-# Fraction of clips that show a part of a cycle, such as two steps of a walk
+# Fraction of clips that show only a part of a cycle, such as two steps of a walk
 CYCLIC = 0.04
-# Seconds of motion before and after such a part, in which the body starts and stops
+# Seconds of motion that are generated before and after such a part, so that the body can start and
+# stop, and are then cut off
 MARGIN = 1.0
-# Fraction of the training clips with captions that omit attributes. Captions of val and test state
-# all attributes, so that every attribute can be measured.
+# Fraction of the training clips whose captions omit attributes. Captions of validation and test
+# clips state all attributes, so that every attribute can be evaluated.
 PARTIAL = 0.25
 # Attributes that every caption states
 ALWAYS = ("action", "while")
@@ -57,8 +58,8 @@ VERB = re.compile(r"((?:\w+ly )?)<([^>]*)>")
 def content() -> dict[str, Any]:
     """Returns the grammars of both groups of actions as one grammar.
 
-    Caption entries that list several keys are split into one entry per key. Verb forms are stored
-    by their infinitive. `core_verbs` contains the infinitives of the core actions.
+    Caption entries that list several keys are split into one entry per key. The forms of each verb
+    are stored under its infinitive. `core_verbs` contains the infinitives of the core actions.
     """
     grammar = read_package_yaml(Path(__file__).with_name("synthetic.yaml"))
     more = read_package_yaml(Path(__file__).with_name("synthetic_more.yaml"))
@@ -84,10 +85,10 @@ def content() -> dict[str, Any]:
 def draw_captions(
     rng: np.random.Generator, attributes: Attributes, count: int, incomplete: bool = False
 ) -> tuple[list[str], Attributes]:
-    """Draws `count` different captions for a clip. Also returns the attributes that they state.
+    """Draws `count` different captions for a clip, and returns them with the attributes they state.
 
-    If `incomplete`, all captions omit the same attributes, provided that the grammar contains such
-    captions.
+    If `incomplete` is True, all captions omit the same attributes, provided that the grammar
+    contains such captions.
     """
     everything = {
         name
@@ -147,7 +148,7 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
 def _template(rng: np.random.Generator, attributes: Attributes) -> str:
     """Returns a template for captions.
 
-    For simultaneous actions, the templates of both actions are inserted into it.
+    For simultaneous actions, it combines the templates of both actions.
     """
     grammar = content()
     if "while" not in attributes:
@@ -179,7 +180,8 @@ def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str,
 def entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
     """Returns the entry for the action and one of its attributes, such as "walk left".
 
-    If there is no such entry, returns the entry for the action, or None.
+    If there is no such entry, the result is the entry for the action alone, or None if that is also
+    missing.
     """
     action = str(attributes["action"])
     keys = [f"{action} {value}" for value in attributes.values()] + [action]
@@ -191,7 +193,10 @@ def _one(rng: np.random.Generator, choices: Any) -> Any:
 
 
 def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a motion with these attributes at times (F,) in seconds."""
+    """Returns the joint positions (F, 22, 3) of a motion with these attributes.
+
+    The times `t` (F,) are in seconds.
+    """
     margin = round(MARGIN / (t[1] - t[0])) if attributes.get("ends") == "cycle" else 0
     times = np.arange(len(t) + 2 * margin) * (t[1] - t[0]) if margin else t
     body = Body(rng, times, entry(content()["widths"], attributes))
@@ -207,10 +212,11 @@ def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> 
 
 
 class Synthetic(MotionSource):
-    """Clips of the 22 SMPL joints, y up. Each clip shows one action.
+    """Procedural motions of SMPL's 22 joints, with y up and with captions.
 
-    A clip starts at the origin and faces +z. Clip number n is a function of the seed, n, and the
-    group of actions.
+    Each clip shows one action or, with `actions="all"`, sometimes two actions at once. The body
+    starts at the origin and faces +z. Clip number n depends only on n, the seed, and the options
+    that select actions.
 
     Args:
         clips: number of clips.
@@ -220,9 +226,9 @@ class Synthetic(MotionSource):
             actions, and parts of cycles.
         core_share: if `actions` is "all", the fraction of clips that are drawn from the 22 core
             actions, as with "core". All other clips are drawn from all actions.
-        often: names of actions that `often_share` of the clips show, each equally often. Models
-            learn quick, small and rare motions last.
-        often_share: fraction of the clips that show an action of `often`.
+        often: names of actions to show more often, each with the same probability. This helps with
+            quick, small and rare motions, which models learn last.
+        often_share: fraction of the clips whose action is drawn from `often`.
     """
 
     name = "synthetic"
@@ -286,7 +292,8 @@ class Synthetic(MotionSource):
         seconds = rng.uniform(max(MIN_SECONDS, repeating, ACTIONS[action].seconds), MAX_SECONDS)
         name = f"synthetic_{'all_' if self.everything else ''}{self.seed}_{index:06d}"
         motion = _joints(rng, np.arange(round(seconds * fps) + 1) / fps, attributes)
-        # Words have their own generator, so that a change to the grammar changes no motion.
+        # Captions are drawn with a separate generator, so that changes to the grammar do not change
+        # the motions.
         return self.described(
             name, motion, attributes, np.random.default_rng((self.seed, index, 1))
         )
@@ -294,9 +301,10 @@ class Synthetic(MotionSource):
     def described(
         self, name: str, motion: np.ndarray, attributes: Attributes, words: np.random.Generator
     ) -> Clip:
-        """Returns the clip for a motion (F, 22, 3).
+        """Returns the clip for a motion (F, 22, 3), including its captions.
 
-        `words` draws the captions of the clip, and its name determines its split.
+        The captions are drawn with the generator `words`. The split depends on the name of the
+        clip.
         """
         split = hashed_split(name, val=5, test=10)
         incomplete = split == "train" and words.random() < PARTIAL
@@ -345,7 +353,7 @@ def _check_often(often: Sequence[str], share: float, actions: Mapping[str, Actio
     if not often or not 0 < share <= 1:
         raise UserError(
             f"synthetic: often={list(often)}, often_share={share}: expected names of actions, and a "
-            "number above 0, up to 1"
+            "number above 0 and at most 1"
         )
 
 
@@ -364,9 +372,9 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 
 
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
-    """Returns the joints (F, 22, 3) of a three-second motion with at least the given attributes.
+    """Returns joint positions (F, 22, 3) of a three-second motion with the given attributes.
 
-    For example, these may be the attributes of a prompt.
+    The attributes may be incomplete, like the attributes of a prompt. Missing attributes are drawn.
     """
     name = str(attributes["action"])
     drawn = attributes

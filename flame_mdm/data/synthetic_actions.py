@@ -2,7 +2,8 @@
 
 `CORE` contains the actions of the data set `synthetic`. `MORE` contains the actions that
 `Synthetic(actions="all")` adds. `CYCLES` contains the actions whose clips may begin and end in the
-middle of the action. `BASES` and `GESTURES` are combined in clips of two simultaneous actions.
+middle of the action. Clips of two simultaneous actions combine an action of `BASES` with an action
+of `GESTURES`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,16 +23,17 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 
 
 class Action(NamedTuple):
-    """An action, and the attributes of its clips in addition to its name."""
+    """An action: its motion, its frequency, and the attributes of its clips."""
 
     # Moves a body at times (F,) in seconds, according to the attributes
     motion: Callable[[Body, np.random.Generator, np.ndarray, Attributes], None]
     # Frequency of the action, relative to the other actions
     share: float = 1
-    # Values of each attribute, either equally likely or with probabilities. Attributes are drawn in
-    # this order. `speed` is drawn only for the direction forward.
+    # Possible values of each attribute: either a list of equally likely values, or a mapping from
+    # values to probabilities. Attributes are drawn in this order. `speed` is drawn only for the
+    # direction forward.
     values: Mapping[str, Sequence[str | int] | Mapping[str, float]] = {}
-    # Minimum duration
+    # Minimum duration in seconds
     seconds: float = 0.0
     # Whether the motion is played backwards
     reverse: bool = False
@@ -174,7 +176,7 @@ GESTURES = {
 
 
 def drawn_from(rng: np.random.Generator, actions: Mapping[str, Action]) -> str:
-    """Draws the name of an action. `share` determines the frequencies."""
+    """Draws the name of an action, with probabilities proportional to `share`."""
     shares = np.array([action.share for action in actions.values()], float)
     return str(rng.choice(list(actions), p=shares / shares.sum()))
 

@@ -1,4 +1,4 @@
-"""Synthetic clips for models that continue frames: a motion that follows the end of another motion."""
+"""Synthetic clips for models that continue frames: motions that follow the end of another motion."""
 
 from collections.abc import Sequence
 
@@ -10,18 +10,19 @@ from flame_mdm.data.synthetic_actions import ACTIONS, move
 from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.data.synthetic_motions.joining import frames_of, join
 
-# Duration of the motion that the captions describe
+# Shortest and longest duration, in seconds, of the motion that the captions describe
 SECONDS = 1.8, 2.4
-# Duration of the visible end of the previous motion. In the shortest clips, it has just the frames
-# that a model continues, so that the model learns to follow a new text at once.
+# Shortest and longest duration, in seconds, of the end of the previous motion that a clip shows.
+# The shortest duration covers just the frames from which a model continues, so that the model
+# learns to follow a new text at once.
 EARLIER_SECONDS = 1.0, 1.2
 # Fraction of clips in which the previous motion shows the same action
 AGAIN = 0.25
-# Fraction of clips in which the person stands before the motion
+# Fraction of clips in which the person stands still before the motion
 RESTING = 0.25
 # Fraction of clips in which the person stands up before a motion that begins in a standing posture
 FROM_THE_FLOOR = 0.15
-# Maximum duration, in seconds, of the overlap of both motions
+# Maximum duration, in seconds, of the overlap between the two motions
 OVERLAP = 0.45
 # Motions that have no natural end. Clips show up to 6 seconds of such a motion without its end, so
 # that a stream keeps moving until its text changes.
@@ -33,10 +34,11 @@ ENDLESS = (
 )
 # Maximum duration of an endless motion, in seconds
 LONGEST = 6.0
-# Duration in seconds of the end of an endless motion, which is cut off
+# Duration, in seconds, of the part that is cut off at the end of an endless motion, in which the
+# body comes to rest
 STOPPING = 0.9
-# Posture at the beginning of actions that do not begin in a standing posture, and at the end of
-# actions that do not end in a standing posture
+# Initial posture of the actions that do not begin in a standing posture, and final posture of the
+# actions that do not end in one
 STARTS = {
     **dict.fromkeys(("rise", "seated", "type"), "seated"),
     **{"get up": "lying", "crawl": "on all fours", "push-ups": "a plank"},
@@ -46,22 +48,22 @@ ENDS = {
     **dict.fromkeys(("lie", "fall"), "lying"),
     **{"kneel": "kneeling", "crawl": "on all fours", "push-ups": "a plank"},
 }
-# Action with which a standing person gets into each posture. Played backwards, the person stands
-# up.
+# Action with which a standing person gets into each posture. When the action is played backwards,
+# the person stands up.
 WAYS_DOWN = {"seated": "sit", "lying": "lie", "kneeling": "kneel"}
 HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothing follows them
 
 
 class SyntheticSequences(Synthetic):
-    """Clips that begin with the end of a previous motion, followed by the motion of the captions.
+    """Clips that show the end of a previous motion, followed by the motion that the captions describe.
 
-    The previous motion is any other action, the same action again, or standing. The motion of the
-    captions begins before the body is back at rest. Sitting, lying and kneeling people stand up
-    first. Motions such as walking continue until the end of the clip.
+    The previous motion is a different action, the same action, or standing still. The described
+    motion begins before the body comes to rest. People who sit, lie or kneel stand up first.
+    Motions such as walking continue until the end of the clip.
 
     Args:
         clips: number of clips.
-        seed: seed of the clips; 0 or more.
+        seed: seed of the clips, which must be 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
         often: see `Synthetic`.
         often_share: see `Synthetic`.
@@ -98,9 +100,9 @@ class SyntheticSequences(Synthetic):
 
 
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
-    """Returns the body of a clip.
+    """Returns a body that moves through an entire clip.
 
-    The body shows the end of a previous motion, a transition to the required posture, and the
+    The clip consists of the end of a previous motion, a transition to the required posture, and the
     motion itself.
     """
     action = str(attributes["action"])
@@ -165,7 +167,7 @@ def _moved(
     action = ACTIONS[str(attributes["action"])]
     shortest = max(SECONDS[0], 0.35 + 0.8 * int(attributes.get("count", 0)), action.seconds)
     seconds = rng.uniform(shortest, max(shortest, SECONDS[1]))
-    # A circle has a fixed angle, so it would become wider with more time.
+    # A walk along a circle covers a fixed angle, so a longer walk would widen the circle.
     circle = attributes.get("direction") in ("clockwise", "counterclockwise")
     endless = attributes["action"] in ENDLESS and not whole and not circle
     if endless:

@@ -30,8 +30,8 @@ MAX_TOKENS = 20
 class Description(NamedTuple):
     """One line of a text file.
 
-    The line describes the motion from `begin` to `end`, in seconds. Both are 0 for the entire
-    motion.
+    The line describes the motion from `begin` to `end`, in seconds. Both are 0 if the line
+    describes the entire motion.
     """
 
     caption: str
@@ -43,7 +43,7 @@ class Description(NamedTuple):
 class Cut(NamedTuple):
     """One item of the data set: a part of a motion with its descriptions.
 
-    The part consists of the frames `start` to `start + length`.
+    The part consists of `length` frames, beginning with frame `start`.
     """
 
     id: str
@@ -54,9 +54,10 @@ class Cut(NamedTuple):
     def clip(
         self, motion: np.ndarray, split: Split, source: str, encoded: str = "", **facts: str
     ) -> Clip:
-        """Returns the clip of a motion.
+        """Returns the clip that this cut selects from a motion.
 
-        `facts` are attributes in addition to the tokens. Empty facts are left out.
+        `facts` are additional attributes. The attribute `tokens` is left out if a description has
+        none.
         """
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
         attributes = facts | ({"tokens": tokens} if all(tokens) else {})
@@ -86,9 +87,9 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion with `frames` frames, in the published order.
 
-    The description of a part yields a separate item, NAME@from-to. A second description of the same
-    part yields the item NAME@from-to#2. As in the published code, a motion that is too short or too
-    long yields no items, even if parts of it would fit.
+    Each description of a part yields a separate item called NAME@from-to. A second description of
+    the same part yields the item NAME@from-to#2. As in the published code, a motion that is too
+    short or too long yields no items, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
@@ -139,10 +140,11 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 
 
 class T2MFolder(MotionSource):
-    """A processed folder. Cuts and mirrored copies are in the same split as their motion.
+    """Reader for a folder in the layout shown above.
 
-    The attribute `tokens` contains the words with their parts of speech, one list per caption. A
-    mirrored copy has its own name, by which it can be excluded.
+    Cuts and mirrored copies are in the same split as their motion. The attribute `tokens` contains
+    the words with their parts of speech, one list per caption. Mirrored copies have names of their
+    own, so they can be excluded separately.
     """
 
     representation: str  # name of the representation of the features in the folder
@@ -212,13 +214,16 @@ class T2MFolder(MotionSource):
         mean, std = (self._array(f"{name}.npy", 1).astype(np.float32) for name in ("Mean", "Std"))
         if mean.shape != std.shape or not np.isfinite(mean).all() or not (std > 0).all():
             raise UserError(
-                f"{self.path}: Mean.npy {mean.shape} is not a mean, or Std.npy {std.shape} is not "
-                "a positive standard deviation"
+                f"{self.path}: Mean.npy {mean.shape} and Std.npy {std.shape} must contain a finite mean "
+                "and a positive standard deviation of the same shape"
             )
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the statistics listed in `published.yaml`, which do not count mirrored copies."""
+        """Returns the numbers that `published.yaml` lists.
+
+        Motions, texts and words are counted without mirrored copies.
+        """
         texts = [
             text for name, texts in self.texts.items() if not name.startswith("M") for text in texts
         ]
@@ -240,7 +245,7 @@ class T2MFolder(MotionSource):
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")
-        # A file whose name begins with a dot was left unfinished by a killed process
+        # A file whose name begins with a dot is an unfinished file of a killed process
         return {path.stem for path in files if not path.name.startswith(".")}
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:
@@ -257,7 +262,7 @@ class T2MFolder(MotionSource):
         return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        """Counts motions without items by reason, or the captions of a motion that are left out."""
+        """Counts a motion without items under its reason, or the captions of it that are left out."""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:

@@ -29,7 +29,7 @@ TRAIN_SUBJECTS = (
 """Training subjects of the cross-subject protocol: 51 of 118. The other 67 are used for testing."""
 # Number of training subjects that the project's own split uses for validation
 VAL_SUBJECTS = 5
-# Minimum length of a training clip: three quarters of 60
+# Minimum number of frames in a training clip: three quarters of the 60 frames of a sample
 MIN_FRAMES = 45
 # Index of the mid-hip joint among VIBE's 49 joints; ACTOR uses it as the root
 ROOT = 8
@@ -40,7 +40,7 @@ NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 
 class Video(NamedTuple):
-    """Fields in a video's file name. `index` is its position in the lists."""
+    """Fields in a video's file name. `index` is the position of the video in the published lists."""
 
     index: int
     id: str
@@ -68,7 +68,7 @@ class UESTC(MotionSource):
     def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Names of the actions.
 
-        They are read from the data, because models need the number of actions early.
+        They are read before any clip, because models require the number of actions.
         """
         return tuple(self._lines("action_classes.txt"))
 
@@ -108,7 +108,7 @@ class UESTC(MotionSource):
 
     @cached_property
     def used(self) -> list[Video]:
-        """The videos that are used. From side 2, only views 0 to 7 are used."""
+        """The videos that are used: all views of side 1, and views 0 to 7 of side 2."""
         return [video for video in self.videos if video.side == 1 or video.view < 8]
 
     def _lines(self, name: str) -> list[str]:
@@ -128,7 +128,9 @@ class UESTC(MotionSource):
             raise UserError(f"{path.parent}: {sizes}")
         self.leave_out("videos of view 8, side 2", count - len(self.used))
         for video in self.used:
-            with naming(f"{path}: {video.id}", *NO_NUMBERS, prefix="does not consist of numbers: "):
+            with naming(
+                f"{path}: {video.id}", *NO_NUMBERS, prefix="contains values that are not numbers: "
+            ):
                 pose, joint, camera = (
                     np.asarray(column[video.index], np.float64) for column in columns
                 )
@@ -164,15 +166,15 @@ class UESTC(MotionSource):
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:
     """Converts VIBE's estimates to a raw motion (F, 75) float32.
 
-    VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y =
-    the shift. The depth z follows from the scale: at z = f / (s w / 2), a camera with focal length
-    f shows the body at that size, in an image that is w pixels wide. Videos of side 2 are rotated
-    about the vertical axis by their view.
+    VIBE estimates a weak-perspective camera, which consists of a scale s and a shift. ACTOR's code
+    uses the shift as the x and y of the body, and computes the depth from the scale: z = f / (s w /
+    2) for a camera with focal length f and an image that is w pixels wide. Videos of side 2 are
+    rotated about the vertical axis by the angle of their view.
 
     Args:
         pose: (F, 72), axis-angle vectors.
-        root: (F, 3), root position relative to the body.
-        camera: (F, 4), scales sx (used) and sy, followed by the shift.
+        root: (F, 3), position of the root relative to the body.
+        camera: (F, 4), the scales sx and sy, of which only sx is used, followed by the shift.
         video: the fields of the video's file name.
 
     Returns:

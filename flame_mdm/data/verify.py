@@ -26,18 +26,19 @@ STILL_DISTANCE = 0.01
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
-    """Hashes and scans the store of a data set, and writes a report as `verify.json`.
+    """Checks the hashes and the content of a prepared data set, and writes a report.
 
-    The report is written into the folder of the store.
+    The report is the file `verify.json` in the folder of the store.
 
     Returns:
-        The report: data set, hashes of the `files`, `figures` with the published figures, numbers
-        of captions and actions, lengths, `still` clips, `duplicates`, differences between
-        statistics, and `excluded` clips.
+        The content of the report: the data set, the hashes of its `files`, its `figures` next to
+        the published ones, the numbers of captions and clips per action, the lengths of the clips,
+        clips that are `still` or `duplicates`, deviations of the stored statistics, and `excluded`
+        clips.
 
     Raises:
         FileNotFoundError: If the data set is not prepared.
-        UserError: If the store has wrong hashes or numbers that are not finite.
+        UserError: If a hash does not match, or if a number is not finite.
     """
     store = data.open()
     store.verify()
@@ -111,7 +112,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns the figures in a report that differ from the published ones, and the differences."""
+    """Returns one line for each figure in a report that differs from the published figure."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()
@@ -126,7 +127,8 @@ def deviations(content: dict[str, Any]) -> list[str]:
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
     """Returns the numbers for the store and its raw data, next to the published ones.
 
-    If a number exists for both, the number of the raw data is returned.
+    A number that exists for both is listed twice: the number for the store is then called `NAME of
+    the store`.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}

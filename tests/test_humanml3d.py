@@ -464,7 +464,7 @@ def body_of_55_joints(root):
         (truncate_archive, r"KIT\.tar\.bz2: damaged archive, download it again: "),
         (
             archive_without_recording,
-            r"BMLrub\.tar\.bz2: 1 recordings are missing in the archive, such as BioMotionLab",
+            r"BMLrub\.tar\.bz2: 1 recordings are missing from the archive, such as BioMotionLab",
         ),
         (
             lambda r: set_in_file(r, trans=np.full((360, 3), np.nan)),

@@ -89,7 +89,7 @@ def test_a_license_that_forbids_the_use_is_refused_before_motions_are_read(
     people: Path, license: str, words: str
 ):
     (people / "captions.csv").write_text(CAPTIONS.replace("CC0", license))
-    with pytest.raises(UserError, match=f"parts.people: has motions with {words}"):
+    with pytest.raises(UserError, match=f"parts.people contains motions with {words}"):
         mixture(people).count()
     assert mixture(people, use="research").count() == 12
 

@@ -90,7 +90,7 @@ class Lesson(MotionSource):
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips, whose captions name the style, followed by the clips of the store.
+        """Yields the user's clips with the style in their captions, then the clips of the store.
 
         Raises:
             UserError: If one of the user's motions cannot be read. The folder contains only a few

@@ -29,9 +29,7 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 ARCHIVE = re.compile(r"(.+)\.tar(\.bz2|\.xz|\.gz)?")
 RELEASE = "not a motion from AMASS's SMPL+H G release, which is the one to download"
-GET_IT = (
-    "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
-)
+GET_IT = "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them in this folder"
 
 
 def _plain(name: str) -> str:
@@ -64,7 +62,7 @@ class Recording(NamedTuple):
         Recordings at 59.94 or 250 Hz then have about `fps` frames per second.
 
         Raises:
-            UserError: If the recording is slower than `fps`.
+            UserError: If the recording has fewer than `fps` frames per second.
         """
         step = int(self.fps / fps)
         if step < 1:
@@ -78,9 +76,9 @@ class Recording(NamedTuple):
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:
-        """Returns FLAME's parameters, (F, 75) float32.
+        """Returns the parameters (F, 75) float32 that FLAME uses.
 
-        A frame contains the translation and the axis-angle vectors of 24 joints.
+        Each frame contains the translation and the axis-angle vectors of 24 joints.
         """
         return np.concatenate([self.translation, self.poses[:, :72]], 1).astype(np.float32)
 
@@ -88,10 +86,10 @@ class Recording(NamedTuple):
 def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
-    Returns None if the path belongs to no subset. A subset may have different names in index files,
-    archives and folders; they all map to the same key. Case is ignored, and spaces are replaced by
-    underscores, as in later releases. A file from the SMPL-X release has the same key as the SMPL+H
-    file.
+    Returns None if the path does not belong to a subset. A subset may have different names in index
+    files, archives and folders; they all map to the same key. Case is ignored, and spaces are
+    replaced by underscores, as in later releases. A file from the SMPL-X release has the same key
+    as the SMPL+H file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -187,7 +185,7 @@ class Amass:
     ) -> Iterator[tuple[str, Result]]:
         """Applies a function to recordings in worker processes.
 
-        Yields (key, result), sorted by key.
+        Yields pairs (key, result), sorted by key.
 
         Args:
             arguments: argument of the function for each recording, by the recording's key.
@@ -196,8 +194,8 @@ class Amass:
             workers: number of processes; 0 = one per core.
         """
         self.check(arguments)
-        # A task is a single recording. If a subset is not unpacked, a task is its entire archive,
-        # which can only be read from the beginning.
+        # Each task is a single recording. For a subset that is not unpacked, the task is the entire
+        # archive, because an archive can only be read from the beginning.
         tasks: list[tuple[Path, dict[str, Argument]]] = []
         for subset, keys in groupby(sorted(arguments), _subset_of):
             of_subset = {key: arguments[key] for key in keys}
@@ -205,8 +203,8 @@ class Amass:
                 tasks += [(self.files[key], {key: argument}) for key, argument in of_subset.items()]
             else:
                 tasks.append((self.archives[subset], of_subset))
-        # Reading an archive takes minutes. Therefore, the number of workers is always set: they
-        # start immediately, instead of after some work in this process.
+        # Reading an archive takes minutes. Therefore, the number of workers is always set, so that
+        # they start immediately and not only after some work in this process.
         for results in in_order(
             partial(_run, function), tasks, min(workers or cores(), len(tasks))
         ):
@@ -246,5 +244,5 @@ def _members(archive: Path, keys: Collection[str]) -> Iterator[tuple[str, str, b
         if not left:
             return
     raise UserError(
-        f"{archive}: {len(left)} recordings are missing in the archive, such as {min(left)}"
+        f"{archive}: {len(left)} recordings are missing from the archive, such as {min(left)}"
     )

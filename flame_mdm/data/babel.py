@@ -22,7 +22,7 @@ from flame_mdm.safe_io import naming, read_json
 FPS = 20.0
 # Number of frames in a clip, and number of frames between the starts of windows for the same label
 LENGTH, STRIDE = 128, 10
-# Words, categories, start and end
+# Words, categories, start and end of a label
 Segment = tuple[str, list[str] | None, float | None, float | None]
 GET_IT = "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare SOURCE=/path/to/it`"
 
@@ -60,13 +60,13 @@ class Babel(MotionSource):
 
     Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
     start) to floor(20 end) - 1. A label that is longer than a clip yields one window every `STRIDE`
-    frames. If a label is shorter than a clip, the clip continues past the end of the label. The
-    label is left out if the motion ends before the clip.
+    frames. If a label is shorter than a clip, the clip continues past the end of the label, and the
+    label is left out if the motion is too short for the clip.
 
     Both splits use BABEL's entire train part for training, and 20 % of its val part for testing.
     The project's own split draws 20 % of the motions, not of the clips, so that no motion is in
-    both val and test. FLAME's split takes every fifth clip, so overlapping windows are in both val
-    and test.
+    both val and test. FLAME's split uses every fifth clip for testing, so windows in val overlap
+    with windows in test.
 
     Args:
         path: folder of BABEL v1.0.
@@ -90,7 +90,7 @@ class Babel(MotionSource):
         return {"labels": sum(1 for file in files for _ in self._annotations(file))}
 
     def count(self) -> int:
-        """Returns the number of clips. Reads the labels and measures the motions."""
+        """Returns the number of clips, which requires the labels and the lengths of the motions."""
         return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
@@ -115,7 +115,10 @@ class Babel(MotionSource):
 
     @cached_property
     def windows(self) -> list[Window]:
-        """All clips in FLAME's order. Computing them reads the labels and the lengths of the motions."""
+        """All clips in FLAME's order.
+
+        They are computed from the labels and the lengths of the motions.
+        """
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
         measured = self.amass.map(keys, _measure, self.workers)
@@ -194,7 +197,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip for a label, or the reason why there is no clip.
+    """Returns the first frame of each clip for a label, and the reason if there is no clip.
 
     `frames` is the number of frames of the motion.
     """

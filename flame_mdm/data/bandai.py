@@ -38,7 +38,7 @@ JOINTS = {
     name: joint if isinstance(joint := _MAP[name], str) else next(iter(joint))
     for name in SMPL22.joints
 }
-"""For each SMPL joint, the name of the corresponding joint in the files. spine1 lies between Hips and Spine.
+"""For each SMPL joint, the name of the joint in the files. spine1 lies between Hips and Spine.
 """
 
 _LEFT, _UP, _FORWARD = np.eye(3)

@@ -22,7 +22,7 @@ ARRAYS = ("J_regressor", "v_template", "kintree_table", "shapedirs")
 def load_offsets(path: Path) -> tuple[tuple[float, float, float], ...]:
     """Returns the positions of SMPL's 24 joints relative to their parents, in meters.
 
-    The body is the mean shape in the rest pose.
+    The offsets are taken from the mean body shape in the rest pose.
 
     Args:
         path: SMPL's .pkl from https://smpl.is.tue.mpg.de, or an .npz file with the same arrays.

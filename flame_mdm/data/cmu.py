@@ -52,7 +52,7 @@ RATES = (120.0, 60.0)
 SLACK = 0.05
 # Minimum number of feature rows of a clip, as in HumanML3D
 SHORTEST = 40
-# Number of frames after the T-pose in a Daz-friendly file that are blended with it
+# Number of frames after the T-pose that Daz-friendly files blend with it
 BLENDED = 3
 # Columns of the user's caption table
 COLUMNS = (
@@ -75,7 +75,7 @@ _HIP, _KNEE, _ANKLE, _HEAD = (
 ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
 GET_IT = (
     "clone https://github.com/una-dinosauria/cmu-mocap or unpack ASF/AMC files from http://mocap.cs.cmu.edu, clone "
-    "https://github.com/EricGuo5513/HumanML3D, and give SOURCE=/path/to/the/motions "
+    "https://github.com/EricGuo5513/HumanML3D, and set SOURCE=/path/to/the/motions "
     "data.source.captions=/path/to/HumanML3D"
 )
 
@@ -109,9 +109,10 @@ class CMU(MotionSource):
 
     The clips are HumanML3D's clips, recordings with KIT-ML's captions, or motions with the user's
     captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
-    in the test (val) split if a test (val) clip of HumanML3D is cut from it. If HumanML3D has no
-    clip of the recording, the subject determines the split. If there is a table `captions.csv`, its
-    rows are the only captions, and each part of a recording that it lists is one clip.
+    in the split of the HumanML3D clips that are cut from it. If these clips are in several splits,
+    the test split has priority, followed by val. If HumanML3D has no clip of the recording, the
+    subject determines the split. If there is a table `captions.csv`, only its captions are used,
+    and each part of a recording that it lists is one clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -181,7 +182,7 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips from CMU recordings, and the captions and splits by name.
+        """HumanML3D's clips from CMU recordings, and their captions and splits by name.
 
         All of them are empty if the user provides captions.
         """
@@ -207,7 +208,7 @@ class CMU(MotionSource):
     def kit(self) -> list[tuple[str, str, str, float]]:
         """KIT-ML's captions for CMU recordings: id, recording, text and seconds.
 
-        The list is empty if there is no such file.
+        The list is empty if the file with these captions is missing.
         """
         if self.table:
             return []
@@ -294,7 +295,10 @@ class CMU(MotionSource):
         return sum(len(item.cuts(count)) for item, count in zip(items, frames, strict=True))
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of all readable recordings. `findings` lists the recordings that cannot be read."""
+        """Yields the clips of all readable recordings.
+
+        `findings` lists the recordings that cannot be read.
+        """
         self.check_fps(fps, FPS)
         labels = {item.action for items in self.items.values() for item in items}
         self.actions = tuple(sorted(label for label in labels if label is not None))
@@ -377,8 +381,8 @@ def _parts(table: Path) -> dict[str, _Part]:
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
     """Returns the parts of each recording.
 
-    If the table does not state their splits, the splits are drawn by source or, without a source,
-    by subject.
+    Splits that the table does not state are drawn by source or, for parts without a source, by
+    subject.
     """
     sources = {
         name: part.source or f"CMU subject {part.trial.partition('_')[0]}"
@@ -449,9 +453,9 @@ def _recording(key: str) -> str:
 
 
 def _test_captions(path: Path) -> dict[str, list[Description]]:
-    """Returns the captions of each motion in a JSON list of test captions.
+    """Returns the captions of each motion from a JSON list of test captions.
 
-    `segment` is the described part, in seconds.
+    The field `segment` states the start and end of the described part in seconds.
     """
     texts: defaultdict[str, list[Description]] = defaultdict(list)
     with naming(path, KeyError, TypeError, ValueError, prefix="not a list of HumanML3D captions: "):
@@ -469,9 +473,9 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording with `frames` frames.
 
-    Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. The
-    next source is CMU's list. The `header` of the file has the lowest priority, because conversions
-    state 120 for nearly all recordings.
+    Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. They
+    are followed by CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has
+    the lowest priority, because conversions state 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -494,7 +498,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     # The MotionBuilder-friendly conversion lacks one bone of the trunk and one bone of each hand.
-    # Each of these bones is restored from a part of the neighboring bone with which it was merged.
+    # Each of these bones is restored as a fraction of the neighboring bone with which it was
+    # merged.
     if "LHipJoint" in tree.joints:
         offsets, at = tree.offsets.copy(), tree.joints.index
         for child, (share, bone) in FACTS["lost"].items():
@@ -545,7 +550,8 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
 def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
     """Returns a tree with additional joints.
 
-    Each keyword argument is a joint, with its parent and offset (3,).
+    Each keyword is the name of a joint, and its value is the parent and the offset (3,) of the
+    joint.
     """
     return replace(
         tree,
@@ -557,7 +563,7 @@ def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
 
 
 def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.ndarray] | str:
-    """Returns the items of a recording from its first readable file, or the first error."""
+    """Returns the motions of a recording from its first readable file, or the first error."""
     files, evidence, items = task
     errors = []
     for file in files:

@@ -22,18 +22,19 @@ from flame_mdm.seeds import integers, key
 
 # Index of a clip, and number of the batch for which it is drawn (-1 in evaluation)
 Draw = tuple[int, int]
-# Id, features x (F, D), caption and action of a clip, which `collate` takes as input
+# Id, features x (F, D), caption and action of a clip, as expected by `collate`
 Sample = tuple[str, Tensor, str | None, int | None]
-# Draws uniform integers, 0 <= integer < argument. The argument is a number or an array (B,).
+# Draws uniform integers from 0 up to, but not including, the argument, which is a number or an
+# array (B,)
 Below = Callable[[Any], Any]
 
 
 class Crop(ABC):
     """A rule that selects the frames of a training sample from a clip of any length."""
 
-    # Minimum length of a clip
+    # Minimum number of frames in a clip
     min_frames: int
-    # Maximum length of a sample
+    # Maximum number of frames in a sample
     max_frames: int
 
     def longest(self) -> int:
@@ -42,13 +43,13 @@ class Crop(ABC):
 
     @abstractmethod
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Draws the frames of samples, or of one sample.
+        """Draws the first frame and the number of frames of one or more samples.
 
-        Without `below`, the result is deterministic. Past the end of a clip, its last frame is
-        repeated.
+        Without `below`, the result is deterministic. A sample may extend past the end of its clip.
+        In this case, the last frame is repeated.
 
         Args:
-            frames: (B,) number of frames of each clip.
+            frames: (B,) number of frames in each clip.
             below: function that draws random integers.
 
         Returns:
@@ -56,7 +57,7 @@ class Crop(ABC):
         """
 
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        """Returns the indices of the frames selected from a clip of `frames` frames.
+        """Returns the indices of the frames that are selected from a clip of `frames` frames.
 
         Without a generator, the indices are deterministic.
         """
@@ -68,8 +69,8 @@ class Crop(ABC):
 class Units(Crop):
     """The rule for HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
 
-    One time in three, the sample is one unit shorter than the clip allows. If a clip is longer than
-    `max_frames`, the sample is a window at a random position. Without a generator, the longest
+    With probability 1/3, the sample is one unit shorter than the clip allows. If a clip is longer
+    than `max_frames`, the sample is a window at a random position. Without a generator, the longest
     window that starts at the first frame is used.
     """
 
@@ -118,7 +119,7 @@ class Fixed(Crop):
     min_frames: int = 1
 
     def longest(self) -> int:
-        """Returns the number of frames of all samples."""
+        """Returns the number of frames in every sample."""
         return self.frames
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
@@ -131,8 +132,8 @@ class Fixed(Crop):
 class Clips(Dataset[Sample]):
     """The clips of a split that are long enough for the crop rule.
 
-    Each time it is drawn, a clip is cropped and then normalized. `advice` is part of the error
-    message if the split has no clips; see `flame_mdm.data.advice_on_splits`.
+    Each time a clip is drawn, it is cropped and then normalized. `advice` is added to the error
+    message for a split without clips; see `flame_mdm.data.advice_on_splits`.
     """
 
     def __init__(
@@ -180,10 +181,10 @@ class Clips(Dataset[Sample]):
     def draw(
         self, indices: Sequence[int] | np.ndarray, batch: int | Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the first frame, number of frames and caption index (B,) of clips.
+        """Draws the first frame, the number of frames and the caption index (B,) of clips.
 
-        These numbers are functions of (seed, batch, index). In evaluation (batch -1), they are
-        constant.
+        The numbers depend only on the seed, the batch and the index of the clip. In evaluation
+        (batch -1), they are always the same.
 
         Args:
             indices: (B,) indices of the clips.
@@ -199,7 +200,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """Caption index (clips,) of each clip in evaluation, derived from the clip's id."""
+        """Index of the caption used for each clip in evaluation, derived from the id of the clip."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

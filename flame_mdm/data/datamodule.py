@@ -1,7 +1,7 @@
 """Training and evaluation batches from a packed store.
 
-Every batch is a function of (seed, step, rank). Therefore, no generator state is saved, and a
-resumed run sees the same batches as an uninterrupted run.
+Every batch depends only on the seed, the step and the rank. Therefore, no generator state is saved,
+and a resumed run sees the same batches as an uninterrupted run.
 """
 
 import re
@@ -37,9 +37,9 @@ Loader = DataLoader[Sample] | ResidentLoader
 class TrainingBatches(Sampler[list[Draw]]):
     """An endless stream of batches of clips with similar lengths.
 
-    Batch n is a function of (seed, n). Each pass over the data is shuffled and divided into
-    groups of `BUCKETS` batches. Each group is sorted by length to reduce padding. Process `rank`
-    of `world` takes every `world`-th batch.
+    Batch n depends only on n and the seed. Each pass over the data is shuffled and divided into
+    groups of `BUCKETS` batches. Each group is sorted by length to reduce padding. Process `rank` of
+    `world` takes every `world`-th batch.
     """
 
     BUCKETS = 16
@@ -87,19 +87,21 @@ class MotionDataModule(LightningDataModule):
     """Prepares a data set, unless it is already prepared, and provides its batches.
 
     Args:
+        source: reader for the published data set.
         representation: representation that encodes the clips. It receives the statistics of the
             store.
-        root: folder of all prepared data sets.
+        root: folder that contains all prepared data sets.
         name: name of the data set. The name of its folder in `root` starts with this name.
         batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 = load in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
-        resident: whether the data set is kept on the training device. If so, the same batches are
+        seed: seed for the order of the clips, their crops and their captions.
+        resident: whether the data set is kept on the training device. The same batches are then
             gathered on the device, without workers. "auto" = only if the data set takes at most a
             quarter of the free memory.
         pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
-            networks see only a few shapes. Padding never exceeds the longest sample of the crop
-            rule.
+            networks process only a few shapes. No batch is padded beyond the longest sample of the
+            crop rule.
     """
 
     def __init__(
@@ -171,7 +173,8 @@ class MotionDataModule(LightningDataModule):
     def actions(self) -> Sequence[str]:
         """Names of the action labels.
 
-        The names are read from the store if it exists, so that training does not need the raw data.
+        The names are read from the store if it exists, so that training does not require the raw
+        data.
         """
         prepared = (self.folder / "store.json").exists()
         return self.open().info["actions"] if prepared else self.source.actions
@@ -207,7 +210,7 @@ class MotionDataModule(LightningDataModule):
         return store
 
     def counts(self, store: Store) -> list[str]:
-        """Returns lines about the clips of each split that are long enough for the crop rule."""
+        """Returns lines about how many clips of each split are long enough for the crop rule."""
         shortest = self.crop.min_frames
         used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
         short = {split: total - used[split] for split, total in store.info["clips"].items()}
@@ -265,8 +268,8 @@ class MotionDataModule(LightningDataModule):
     def clips(self, split: Split) -> Clips:
         """Returns the clips of a split with their crop rule.
 
-        If a data set was prepared with a published split without test clips (HumanAct12), it is
-        tested on its training clips.
+        If the published split has no test clips, as in HumanAct12, the training clips are used for
+        testing.
         """
         if (
             split == "test"
@@ -284,9 +287,9 @@ class MotionDataModule(LightningDataModule):
         )
 
     def train_dataloader(self) -> Loader:
-        """Returns an endless loader.
+        """Returns an endless loader of training batches.
 
-        For resumed runs, the loader starts at the trainer's current step.
+        In resumed runs, it starts at the trainer's current step.
         """
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0

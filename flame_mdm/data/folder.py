@@ -35,13 +35,13 @@ from flame_mdm.safe_io import naming, read_text
 
 # Minimum number of frames that representations require
 SHORTEST = 3
-# Maximum number of copies of a clip in a balanced set. With more copies, a model would memorize the
-# clip.
+# Maximum number of copies of a clip in a balanced data set. With more copies, a model would
+# memorize the clip.
 MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
-    """A file, and the name of one of its animations, or None for its only animation."""
+    """A motion file and the number of one of its animations, or None if it has only one."""
 
     path: Path
     animation: str | None = None
@@ -68,19 +68,19 @@ class Folder(MotionSource):
     Args:
         path: the folder. Motions may be in subfolders.
         motion: "joints" for representations of joint positions; "smpl" for representations of
-            SMPL's rotations. AMASS files contain rotations, and the bones of BVH files determine
-            them. For other files, rotations are fitted to the joints.
+            SMPL's rotations. Rotations are read from AMASS files and derived from the bones of BVH
+            files. For all other files, they are fitted to the joints.
         mirror: whether a mirrored copy follows each clip of the training split. This requires
             `motion="joints"`.
-        exclude: motions to leave out, by their path in the folder without extension.
+        exclude: paths of motions to leave out, relative to the folder and without extension.
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about as many. Each clip
             occurs at most 16 times. 0 = clips are not repeated.
         license: license of motions whose row in the table states no license. This is a key in
             `licenses.yaml`, or "" if the license is unknown.
-        prefixes: words to insert before captions, each with a list of actions: the word is inserted
-            before the captions of these actions. A model can then distinguish these motions from
-            motions with the same action name in another data set.
+        prefixes: words to insert before captions. Each word is mapped to the actions whose captions
+            it precedes. A model can then distinguish these motions from motions with the same
+            action name in another data set.
     """
 
     name = "folder"
@@ -123,7 +123,7 @@ class Folder(MotionSource):
             self.options["prefixes"] = self.prefixes
         # For each layout, how upright the body is in each motion read so far
         self._uprights: defaultdict[str, list[float]] = defaultdict(list)
-        # Lines about the motions read so far
+        # Notes about the motions read so far, each with the number of motions that it applies to
         self._notes: Counter[str] = Counter()
         # The representation whose raw motions are yielded; see `suit`
         self._representation: Representation | None = None
@@ -157,7 +157,7 @@ class Folder(MotionSource):
 
     @cached_property
     def copies(self) -> dict[str, int]:
-        """Number of times that each motion occurs in the set; see `balance`.
+        """Number of times that each motion occurs in the data set; see `balance`.
 
         A mirrored copy occurs as often as its original.
         """
@@ -172,7 +172,10 @@ class Folder(MotionSource):
         return copies
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of all readable motions. `failures` lists the motions that cannot be read."""
+        """Yields the clips of all readable motions.
+
+        `failures` lists the motions that cannot be read.
+        """
         self.actions = tuple(
             sorted({note.action for note in self.notes.values() if note.action is not None})
         )
@@ -218,14 +221,17 @@ class Folder(MotionSource):
             yield name, attempt.motion
 
     def findings(self) -> list[str]:
-        """Returns lines about the skeletons of the motions read so far, and about the parts that were left out."""
+        """Returns lines about the motions read so far.
+
+        The lines state the skeletons of the motions, and which parts of them were left out.
+        """
         skeletons = [
             f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
         ]
         return skeletons + [f"{count} motions: {note}" for note, count in self._notes.items()]
 
     def check(self, fps: float) -> list[str]:
-        """Reads all captions and motions. Returns lines about skeletons and failures."""
+        """Reads all captions and motions, and returns lines about skeletons and failures."""
         splits = Counter(self.splits[name] for name, _ in self._motions(fps))
         if self.failures:
             return [*self.findings(), *self.failure_lines()]
@@ -251,9 +257,10 @@ class Folder(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, MotionFile]:
-        """Files by their path in the folder without extension, sorted by this path.
+        """Motion files by name, sorted.
 
-        If a file has several animations, each animation is named `PATH/ANIMATION`.
+        The name of a file is its path in the folder, without extension. If a file has several
+        animations, each animation is called `PATH/ANIMATION`.
         """
         files: dict[str, MotionFile] = {}
         for path in motions_in(self.path):
@@ -266,7 +273,7 @@ class Folder(MotionSource):
                 if label in files:
                     other = files[label].path.name
                     raise UserError(
-                        f"{path}: has the same name as {other}. Each motion needs its own name"
+                        f"{path}: has the same name as {other}. Give each motion a unique name"
                     )
                 files[label] = file
         if not files:
@@ -295,7 +302,7 @@ class Folder(MotionSource):
     def notes(self) -> dict[str, Note]:
         """Captions and labels of each motion, from the table and text files.
 
-        Either all motions or none of them must have captions.
+        Either all motions or none of them must have captions. The same applies to actions.
         """
         notes = {name: Note() for name in self.files}
         if os.path.lexists(self.path / TABLE):
@@ -419,7 +426,7 @@ class _Attempt:
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     # Skeleton, unit and frame rate of the file
     layout: str = ""
-    # As in `Recording`
+    # How upright the body is, and notes about the motion, both from the recording
     upright: float = math.nan
     notes: Sequence[str] = ()
 

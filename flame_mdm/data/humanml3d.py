@@ -31,7 +31,8 @@ FPS = 20
 class IndexedClip(NamedTuple):
     """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps.
 
-    `key` is the key of the recording (see `amass.key_of`) or, for a clip from HumanAct12, its file.
+    `key` is the key of the recording (see `amass.key_of`) or, for a clip from HumanAct12, the name
+    of its file.
     """
 
     name: str
@@ -41,7 +42,7 @@ class IndexedClip(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Whether the clip is an entire file from HumanAct12, named by `key`."""
+        """Whether the clip is an entire file from HumanAct12, whose name is `key`."""
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
@@ -102,8 +103,8 @@ class HumanML3D(T2MFolder):
     fps = 20.0
     shortest = 40
     get_it = (
-        "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be created "
-        "from AMASS: docs/humanml3d.md"
+        "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D. docs/humanml3d.md describes how "
+        "to create the motions from AMASS"
     )
 
     def __init__(
@@ -148,7 +149,10 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Files with HumanAct12's joint positions, by name. Empty if the files are missing."""
+        """Files with HumanAct12's joint positions, by name.
+
+        The dictionary is empty if the files are missing.
+        """
         path = self._beside("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
         folder = archives.as_folder(path, self, lambda name: name.endswith(".npy"))
         return {file.stem: file for file in folder.rglob("*.npy")}
@@ -156,7 +160,7 @@ class HumanML3D(T2MFolder):
     def _beside(self, *names: str) -> Path:
         """Returns the first of these names that exists in the folder or next to it.
 
-        If none exists, returns the path of the first name in the folder.
+        If none of them exists, returns the path that the first name would have in the folder.
         """
         candidates = [folder / name for name in names for folder in (self.path, self.path.parent)]
         return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
@@ -214,7 +218,7 @@ class HumanML3D(T2MFolder):
             remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
-        """Writes the mean and std of all motions of any length and split, including mirrored copies."""
+        """Writes the mean and std over all motions of every length and split, with mirrored copies."""
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
         if wrong := [
@@ -222,7 +226,7 @@ class HumanML3D(T2MFolder):
         ]:
             raise UserError(
                 f"{self.path}: these files have the wrong number of features: {some(wrong)}. Delete "
-                "them and prepare again"
+                "them and prepare the data set again"
             )
         count = sum(frames for frames, _ in shapes.values())
         frames = Frames(lambda: (self._load(name).astype(np.float32) for name in shapes), count)
@@ -234,9 +238,9 @@ class HumanML3D(T2MFolder):
 def _from_amass(
     write: partial[None], bodies: dict[str, Body], rows: Sequence[IndexedClip], recording: Recording
 ) -> int:
-    """Writes the clips of a recording.
+    """Writes the features of all clips from a recording, and returns the number of clips.
 
-    As in the published code, every body that is not "male" is treated as female.
+    As in the published code, every gender other than "male" is treated as female.
     """
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
@@ -279,18 +283,19 @@ def _read_joints(path: Path) -> np.ndarray:
 class HumanML3DSMPL(MotionSource):
     """FLAME's version of the data set (Kim et al., AAAI 2023): SMPL parameters of entire clips.
 
-    There is one clip per caption, named NAME#0, NAME#1 ... As in FLAME's code, there are no
-    mirrored copies, length limits or cuts. A caption of a part is used for the entire motion. In
-    five subsets, the first frames of a recording were dropped. Unlike FLAME's code, this class
-    accounts for the dropped frames, so that motion and caption match.
+    There is one clip per caption. The clips of a motion are called NAME#0, NAME#1 and so on. As in
+    FLAME's code, there are no mirrored copies, length limits or cuts, and a caption that describes
+    only a part is used for the entire motion. In five subsets, HumanML3D dropped the first frames
+    of each recording. Unlike FLAME's code, this class accounts for the dropped frames, so that
+    motion and caption match.
 
     Args:
         path: folder of HumanML3D with texts, splits and `index.csv`. No motions are needed.
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
-        humanact12: FLAME's `humanact12_processed.pkl`. Without this file, the clips of HumanAct12
-            are left out.
-        published_split: also train on the validation clips (FLAME's "final"). No clips are then
-            left for validation.
+        humanact12: path of FLAME's `humanact12_processed.pkl`. Without this file, the clips of
+            HumanAct12 are left out.
+        published_split: whether to also train on the validation clips (called "final" in FLAME's
+            code), so that no clips are left for validation.
     """
 
     name = "humanml3d-smpl"
@@ -348,7 +353,7 @@ class HumanML3DSMPL(MotionSource):
             yield from self._from_humanact12(self.humanact12)
 
     def _from_humanact12(self, path: Path) -> Iterator[Clip]:
-        """Yields SMPL poses from HumanAct12.
+        """Yields the clips of HumanAct12 as SMPL poses.
 
         As in FLAME's code, the root position is used as SMPL's translation.
         """

@@ -16,7 +16,7 @@ Use = Literal["any", "research"]
 
 @cache
 def known_licenses() -> dict[str, dict[str, str]]:
-    """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` per license."""
+    """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` of each license."""
     return read_package_yaml(Path(__file__).with_name("licenses.yaml"))
 
 
@@ -32,7 +32,7 @@ class Mixture(MotionSource):
     name = "mixture"
     named_by_recipe = True
     # Increase this number whenever the version of any data set increases, because the motions of
-    # that data set are then also read differently in a mixture
+    # that data set then also change in a mixture
     version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):
@@ -74,19 +74,22 @@ class Mixture(MotionSource):
                     continue
                 label = f"license {license}" if license else "an unknown license"
                 raise UserError(
-                    f"data.source.parts.{name}: has motions with {label}, but data.source.use=any. Leave them out, or "
-                    "set data.source.use=research for a research-only model"
+                    f"data.source.parts.{name} contains motions with {label}, but data.source.use=any. Leave them out, "
+                    "or set data.source.use=research for a research-only model"
                 )
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of each part. Actions with the same name have the same number in all parts."""
+        """Yields the clips of each part.
+
+        Actions with the same name have the same number in all parts.
+        """
         self.check_licenses()
         names: dict[str, int] = {}
         for part in self.parts.values():
             for clip in part.clips(fps):
                 action = None
                 if clip.action is not None:
-                    # The actions of a folder are known only after its first clip.
+                    # The actions of a folder are known only after its first clip has been read.
                     action = names.setdefault(part.actions[clip.action], len(names))
                 yield replace(clip, action=action, license=clip.license or part.license)
             self.excluded.update(part.excluded)
@@ -111,6 +114,6 @@ class Mixture(MotionSource):
             part.suit(representation)
 
     def check(self, fps: float) -> list[str]:
-        """Checks the licenses, and returns the lines of all parts."""
+        """Checks the licenses, and returns the lines that the parts print about their files."""
         self.check_licenses()
         return [line for part in self.parts.values() for line in part.check(fps)]

@@ -1,4 +1,4 @@
-"""Parallel processing of many files in worker processes, with results in order."""
+"""Parallel processing of files in worker processes, which keeps the order of the results."""
 
 import os
 import threading
@@ -19,8 +19,8 @@ from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-# Seconds of work after which processes are started if their number is not set. Starting the
-# processes takes about as long.
+# Seconds of work after which processes are started if their number is not set. Starting them takes
+# about as long.
 PATIENCE = 2.0
 
 
@@ -82,8 +82,8 @@ _pool: _Pool | None = None  # the pool in use, if any
 @contextmanager
 def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     global _pool
-    # Processes are spawned instead of forked, because a fork would copy the locks of this process's
-    # threads, which may have used torch
+    # Processes are spawned instead of forked. A fork would copy locks that the threads of this
+    # process hold, for example if torch was used.
     pool = _pool = _pool or _Pool(
         ProcessPoolExecutor(workers, get_context("spawn"), _start_worker), active_children()
     )
@@ -101,8 +101,8 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             process.join()
         if isinstance(error, BrokenProcessPool):
             raise UserError(
-                "a worker process was killed, perhaps because memory ran out. Use fewer processes "
-                "(with data.source.workers=1, the message also names the file)"
+                "a worker process was killed, perhaps because memory ran out. Use fewer processes. "
+                "With data.source.workers=1, the error message also names the file"
             ) from error
         raise
     finally:

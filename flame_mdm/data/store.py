@@ -64,7 +64,7 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 class Entry:
     """One clip of a store: frames `start` to `start + length` of the packed array.
 
-    `Clip` describes all other fields.
+    All other fields have the same meaning as in `Clip`.
     """
 
     id: Annotated[str, Field(min_length=1)]
@@ -113,8 +113,8 @@ class Store:
         with _intact(contents):
             self.info: dict[str, Any] = read_json(contents)
             check_shape(self.info, Contents)
-        # The fingerprint is part of results. The same clips and options have the same fingerprint
-        # on every machine.
+        # Results contain the fingerprint. It is the same on every machine for the same clips and
+        # options.
         self.fingerprint: str = self.info["fingerprint"]
         self._check("clips.jsonl", "statistics.npz")
         frames, width = self.info["shape"]
@@ -122,7 +122,7 @@ class Store:
             self.features: np.ndarray = read_npy(path, mmap=True)
             if self.features.shape != (frames, width) or self.features.dtype != np.float32:
                 raise ValueError(
-                    f"it has shape {self.features.shape} instead of {(frames, width)}, or is not float32"
+                    f"its shape is {self.features.shape} instead of {(frames, width)}, or it is not float32"
                 )
         self.clips = _entries(self.folder / "clips.jsonl", frames, len(self.info["actions"]))
         with _intact(self.folder / "statistics.npz") as path:
@@ -150,7 +150,7 @@ class Store:
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
         """Returns the joint positions of clips at the frame rate of their recordings.
 
-        Returns None if they are missing for a clip.
+        Returns None if they are missing for any of the clips.
         """
         if "references.npz" not in self.info["sha256"]:
             return None
@@ -182,7 +182,7 @@ class Store:
         ]
 
     def verify(self) -> None:
-        """Checks the hashes of features and references.
+        """Checks the hashes of the features and the references.
 
         The other files were checked when the store was opened.
         """
@@ -211,8 +211,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     lock = folder.with_name(folder.name + ".lock")
     waiting = f"{folder}: another process is preparing it; waiting"
     with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
-        # This process holds the lock, so files of another process that is about to end are also
-        # removed.
+        # This process holds the lock, so temporary files of all other processes can be removed.
         remove_abandoned(folder.parent, folder, is_locked=True)
         remove_abandoned(folder.parent)
         if before or not (folder / "store.json").exists():
@@ -227,7 +226,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 def _replaceable(folder: Path) -> list[Path]:
     """Returns the files of the store in a folder, `store.json` first.
 
-    The list is empty if the folder does not exist, or is empty.
+    The list is empty if the folder is missing or empty.
 
     Raises:
         UserError: If the folder is a link, contains other files but no store, or contains a
@@ -287,7 +286,10 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 def _line(entry: Entry) -> str:
-    """Returns the line of a clip. If it has no license, the key is left out, as in older stores."""
+    """Returns the line of a clip in clips.jsonl.
+
+    If the clip has no license, the key `license` is left out, as in older stores.
+    """
     values = asdict(entry)
     if not entry.license:
         del values["license"]
@@ -299,8 +301,8 @@ def _pack(
 ) -> tuple[list[Entry], int]:
     """Writes the features and references of the data set `name`, clip by clip.
 
-    Returns its clips and number of frames. Consecutive clips with the same motion share the frames
-    of the motion.
+    Returns the entries of the clips and the total number of frames. Consecutive clips with the same
+    motion share the frames of the motion.
 
     Raises:
         UserError: If a clip exceeds its motion, if two clips have the same id, or if clips of the
@@ -354,7 +356,7 @@ def _pack(
 
 
 def _write_header(file: IO[bytes], frames: int, features: int) -> None:
-    """Writes the header of features.npy. NumPy pads it to the same size for any frame count."""
+    """Writes the header of features.npy, which NumPy pads to the same size for any frame count."""
     np.lib.format.write_array_header_1_0(
         file, {"descr": "<f4", "fortran_order": False, "shape": (frames, features)}
     )
@@ -402,9 +404,10 @@ def _encoded(
 
 
 def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.ndarray:
-    """Returns the features of a motion. `named` contains its name, its published representation and the motion.
+    """Returns the features of a motion.
 
-    The representation is "" if the motion was not published as features.
+    `named` consists of the name of the motion, the representation in which it was published, and
+    the motion itself. The representation is "" if the motion is raw.
     """
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
@@ -448,7 +451,7 @@ def _fingerprint(
 
 @contextmanager
 def _intact(path: Path) -> Iterator[Path]:
-    """Yields a path of a store. Errors caused by its content are converted to one `UserError`."""
+    """Yields the path of a file in a store, and converts errors in its content to a `UserError`."""
     try:
         yield path
     except (OSError, ValueError, KeyError) as error:
@@ -460,7 +463,8 @@ def _intact(path: Path) -> Iterator[Path]:
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
-    # Lines are read from the file, because `splitlines` would also split at separators in captions.
+    # Lines are read from the file, because `str.splitlines` would also split captions at Unicode
+    # separators.
     with (
         _intact(path),
         path.open(encoding="utf-8") as lines,
@@ -470,7 +474,8 @@ def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
                 clip: Entry = check_shape(parse_json(line), Entry, strict=False)
                 if clip.start + clip.length > frames:
                     raise ValueError(
-                        f"{clip.id}: frames {clip.start} to {clip.start + clip.length} exceed {frames}"
+                        f"{clip.id}: frames {clip.start} to {clip.start + clip.length} exceed the {frames} "
+                        "frames of the store"
                     )
                 if clip.action is not None and clip.action >= actions:
                     raise ValueError(

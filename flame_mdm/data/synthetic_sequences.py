@@ -55,7 +55,7 @@ HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothin
 
 
 class SyntheticSequences(Synthetic):
-    """Clips that show the end of a previous motion, followed by the motion that the captions describe.
+    """Clips of the end of a previous motion, followed by the motion that the captions describe.
 
     The previous motion is a different action, the same action, or standing still. The described
     motion begins before the body comes to rest. People who sit, lie or kneel stand up first.

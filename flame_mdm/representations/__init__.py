@@ -17,9 +17,9 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set. They can be read in parts, any number of times."""
+    """The frames (N, D) of a data set, which can be read in parts and any number of times."""
 
-    # Returns arrays (F, D) of any length, in the same order each time
+    # Returns arrays (F, D) of arbitrary lengths, in the same order each time
     arrays: Callable[[], Iterable[np.ndarray]]
     count: int
 
@@ -48,10 +48,11 @@ class Representation(nn.Module, ABC):
     Mean and std are buffers, so that sampling does not require the data set.
 
     Args:
-        name: name in stores and checkpoints. Features with different names are never combined.
+        name: name in stores and checkpoints. Features of representations with different names are
+            never combined.
         features: D, the number of features per frame.
         fps: frames per second, 1 to 1000.
-        skeleton: the skeleton of the decoded joints.
+        skeleton: skeleton of the decoded joint positions.
 
     Raises:
         UserError: If `fps` is out of range.
@@ -78,11 +79,12 @@ class Representation(nn.Module, ABC):
     #: Name of a longer representation that begins with these features, so that its features can be
     #: truncated to them.
     part_of: str = ""
-    #: Whether the root is encoded as steps between frames. If so, any window of frames is a motion.
+    #: Whether the root is encoded as steps between frames, so that any window of frames is a valid
+    #: motion.
     relative: bool = True
     #: Columns of the features by name.
     slices: Mapping[str, slice] = {}
-    #: Columns of the pose, without the steps of the root and without velocities and contacts.
+    #: Columns of the pose, which exclude the steps of the root, velocities and contacts.
     pose: slice
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
@@ -110,16 +112,16 @@ class Representation(nn.Module, ABC):
         """
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Returns the rotations (..., F, N, 6) in features (..., F, D) in the data's units.
+        """Returns the 6D rotations (..., F, N, 6) that features (..., F, D) in the data's units contain.
 
-        By default, N = 0.
+        By default, features contain no rotations (N = 0).
         """
         return features.new_zeros(*features.shape[:-1], 0, 6)
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns the mean and std (D,) for normalization, computed from all training frames (N, D).
 
-        Without `slices`, mean and std are 0 and 1.
+        Representations without `slices` are not normalized: their mean is 0 and their std is 1.
         """
         if self.slices:
             return grouped_statistics(features, self.slices.values())
@@ -147,7 +149,7 @@ class Representation(nn.Module, ABC):
         return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
-        """Adapts the features (..., F, D) of clips that were cut, so that they start like complete motions.
+        """Adapts the features (..., F, D) of cut clips, so that they start like complete motions.
 
         By default, the features are returned unchanged.
         """

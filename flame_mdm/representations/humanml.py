@@ -32,7 +32,8 @@ class HumanML(Representation):
     | root_velocity | 2 | x and z of the root's displacement to the next frame, in body coordinates |
     | root_height | 1 | y of the root |
     | positions | 3 (J - 1) | joint positions without the root, in body coordinates: root at x = z = 0, facing +z |
-    | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the previous one: shortest arcs, not SMPL's |
+    | rotations | 6 (J - 1) | 6D rotation (columns) of each bone relative to the previous bone: the
+    shortest arcs, not SMPL's rotations |
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
     | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves until the next frame |
 
@@ -45,12 +46,12 @@ class HumanML(Representation):
     their sum. In the first frame, the heading is 0, although the smoothed heading is not. `turn` is
     half the turn to the right, and changes its sign where the heading crosses 180 degrees. The root
     velocity is in the body coordinates of the next frame. Rotations are world rotations of the
-    bones relative to the inverse heading, also at the shoulders. `decode` is the published
+    bones relative to the inverse heading, also at the shoulders. `decode` equals the published
     decoding. If a bone is exactly opposite to its rest direction, the published code returns NaN.
-    In this implementation, the rotation is a half turn.
+    This implementation returns a half turn instead.
 
-    The variant "clean" has none of these peculiarities. Headings are unwrapped before smoothing.
-    They are also padded point-symmetrically at both ends, which preserves steady turns and the
+    The variant "clean" has none of these peculiarities. Headings are unwrapped and padded
+    point-symmetrically at both ends before they are smoothed, which preserves steady turns and the
     first and last heading. Rotations are computed after the body is turned to +z, and are relative
     to the parent in the skeleton.
 
@@ -166,9 +167,10 @@ class HumanML(Representation):
         return -2.0 if self.legacy else 1.0
 
     def root_steps(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns turns (..., F) and steps (..., F, 2) of the root to the next frame.
+        """Returns the turns (..., F) and steps (..., F, 2) of the root from each frame to the next.
 
-        Turns are in radians to the left. Steps are in meters, to the left of the body and forward.
+        Turns are in radians, positive to the left. A step consists of the distances to the left of
+        the body and forward, in meters.
 
         Args:
             features: (..., F, D) in the data's units.
@@ -179,7 +181,7 @@ class HumanML(Representation):
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns a bool mask (D,) that is True for features of these joints.
 
-        For the lower body, including the root, the mask equals MDM's `HML_LOWER_BODY_MASK`.
+        For the joints of the lower body and the root, the mask equals MDM's `HML_LOWER_BODY_MASK`.
         """
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
@@ -233,7 +235,7 @@ class HumanML(Representation):
         )
 
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
-        """Returns x and z (N, 2) of the direction that the hips and shoulders face.
+        """Returns the x and z (N, 2) of the direction that the hips and shoulders face.
 
         The direction is the cross product of the vertical and the direction to the right. It is
         shorter if the body lies on its side. `hips` is the weight of the hips.
@@ -275,7 +277,7 @@ class HumanML(Representation):
         return rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(relative), "columns")
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns heading (..., F) and position (..., F, 3) of the root in the features' unit."""
+        """Returns the heading (..., F) and the position (..., F, 3) of the root in the features' unit."""
         turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
         heading = self.turn_unit * turn
         x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)

@@ -32,8 +32,8 @@ class Motion272(Representation):
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets of the body in meters, like `ADULT`. The first offset leads from
-            the translation to the pelvis.
+        offsets: (24, 3) offset of each joint from its parent in the rest pose, in meters. The first
+            offset leads from the translation to the pelvis. Default: `ADULT`.
 
     Example:
         >>> representation = Motion272()
@@ -66,7 +66,8 @@ class Motion272(Representation):
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
         """Returns features (F, 272) float32 for joint positions and rotations (F, 22, 3, 3).
 
-        The joint positions (F, 22, 3) and the rotations have y up and face +z.
+        The joint positions are (F, 22, 3). In both, y is up, and the body faces +z in the first
+        frame.
         """
         joints = joints.double() - torch.stack(
             [joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]]
@@ -90,7 +91,7 @@ class Motion272(Representation):
         return torch.cat([*rows, rotation.matrix_to_rot6d(turned, "rows").flatten(1)], 1).float()
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Returns (..., F, 23, 6): the turn of the root, then the rotations of the joints."""
+        """Returns 6D rotations (..., F, 23, 6): the turn of the root, then the rotations of the joints."""
         turn = features[..., None, self.slices["turn"]]
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 
@@ -104,10 +105,10 @@ class Motion272(Representation):
         return local @ inverse + ground[..., None, :]
 
     def poses(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Decodes features (..., F, 272) to SMPL poses, y up.
+        """Decodes features (..., F, 272) to SMPL poses, with y up.
 
-        The poses consist of the pelvis position (..., F, 3) and SMPL's rotations (..., F, 22, 3,
-        3).
+        The poses consist of the position (..., F, 3) of the pelvis and SMPL's rotations (..., F,
+        22, 3, 3).
         """
         inverse, ground = self._root(features)
         turned = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 1:, :], "rows")
@@ -118,9 +119,9 @@ class Motion272(Representation):
         return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns rotations to body coordinates (..., F, 3, 3) and positions (..., F, 3).
+        """Returns rotations (..., F, 3, 3) to body coordinates and ground positions (..., F, 3).
 
-        The positions are the root's x and z, with y = 0.
+        The ground position is the position of the root with y = 0.
         """
         inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1
@@ -141,7 +142,8 @@ class Motion272(Representation):
     def rebase(self, features: Features) -> Features:
         """Resets the velocities and the turn in the first frame of cut clips (..., F, D).
 
-        The velocities are set to zero and the turn to the identity, as in the first frame of any motion.
+        The velocities are set to zero and the turn is set to the identity, as in the first frame of
+        every motion.
         """
         cut = deepcopy(features)
         for name in ("root_velocity", "turn", "velocities"):

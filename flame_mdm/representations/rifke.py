@@ -15,7 +15,7 @@ KNEES_AND_ELBOWS = [
 ]
 """Joints that the published code uses as hips and shoulders.
 
-The published code removes the root, and then applies the original indices of hips and shoulders.
+The published code removes the root, but still uses the original indices of hips and shoulders.
 """
 
 
@@ -89,16 +89,16 @@ class Rifke(Representation):
         )
 
     def floor(self, joints: Tensor) -> Tensor:
-        """Returns the height of the floor below joints (T, 21, 3) in KIT's unit.
+        """Estimates the height of the floor from joint positions (T, 21, 3), all in KIT's unit.
 
-        It is a soft minimum over time of the height of the lowest foot.
+        The estimate is a soft minimum, over time, of the height of the lowest foot.
         """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()
         return least - torch.log(0.5 + torch.exp(least - most))
 
     def heading(self, joints: Tensor) -> Tensor:
-        """Returns the heading (T,) of joints (T, 21, 3) in radians, in (-pi, pi].
+        """Returns the heading (T,), in (-pi, pi] radians, of a body with joint positions (T, 21, 3).
 
         A body with heading 0 faces +z. Positive headings turn toward +x.
         """
@@ -125,7 +125,7 @@ class Rifke(Representation):
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:
-    """Interpolates (T, ...) linearly to ((T - 1) * factor + 1, ...).
+    """Interpolates (T, ...) linearly to ((T - 1) * factor + 1, ...) frames.
 
     TEMOS is evaluated at 100 frames per second, 8 times the rate of the features.
     """

@@ -21,7 +21,8 @@ class Rot6D(Representation):
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets, in meters, of the body used for decoding, like `ADULT`.
+        offsets: (24, 3) offset of each joint from its parent in the rest pose, in meters, for
+            decoding. Default: `ADULT`.
 
     Example:
         >>> representation = Rot6D()
@@ -56,7 +57,7 @@ class Rot6D(Representation):
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, 150) to joint positions (..., F, 24, 3) in meters.
 
-        y is up: the camera coordinates are rotated 180 degrees about x.
+        The camera coordinates are rotated by 180 degrees about x, so that y is up.
         """
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         translation = features[..., 144:147]

@@ -1,9 +1,9 @@
 """Conversions between rotations.
 
-Rotations are axis-angle vectors, quaternions, matrices, two kinds of 6D vectors, or Euler angles.
-Every function accepts any leading batch shape, preserves the dtype and is differentiable.
-Quaternions are (w, x, y, z) and have unit length. Matrices act on column vectors. Angles are in
-radians.
+Rotations are represented by axis-angle vectors, quaternions, matrices, two kinds of 6D vectors, or
+Euler angles. Every function accepts any leading batch shape, preserves the dtype and is
+differentiable. Quaternions have the order (w, x, y, z) and unit length. Matrices act on column
+vectors. Angles are in radians.
 """
 
 from typing import Literal
@@ -17,14 +17,14 @@ from flame_mdm.errors import UserError
 SixD = Literal["rows", "columns"]
 """Which vectors of the matrix a 6D vector contains.
 
-They are the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the first two
-columns (HumanML3D). rows(R) = columns(R^T), so decoding with the wrong convention results in the
-inverse rotation.
+These are either its first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or its first
+two columns (HumanML3D). rows(R) = columns(R^T), so decoding with the wrong convention results in
+the inverse rotation.
 """
 
 
 def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
-    """(..., 3) axis times angle, of any length -> (..., 4)."""
+    """Converts axis-angle vectors (..., 3) of any length to quaternions (..., 4)."""
     angle = torch.linalg.vector_norm(axis_angle, dim=-1, keepdim=True)
     # sinc keeps the value and the gradient exact at angle 0
     return torch.cat(
@@ -33,7 +33,7 @@ def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
 
 
 def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
-    """(..., 4) -> (..., 3) axis times angle. The angle is in [0, pi]."""
+    """Converts quaternions (..., 4) to axis-angle vectors (..., 3) with an angle in [0, pi]."""
     quaternion = standardize(quaternion)
     w, xyz = quaternion[..., :1], quaternion[..., 1:]
     sine = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
@@ -43,7 +43,7 @@ def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """(..., 4) -> (..., 3, 3). Quaternions of other lengths are normalized."""
+    """Converts quaternions (..., 4), of any length other than 0, to matrices (..., 3, 3)."""
     q = quaternion * (2**0.5 / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True))
     w, x, y, z = q.unbind(-1)
     elements = [
@@ -55,7 +55,7 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 4) with w >= 0."""
+    """Converts matrices (..., 3, 3) to quaternions (..., 4) with w >= 0."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
     # These are rows of 4 q q^T. The row of the largest component is well-conditioned.
     outer = [
@@ -71,31 +71,32 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """(..., 3) -> (..., 3, 3)."""
+    """Converts axis-angle vectors (..., 3) to matrices (..., 3, 3)."""
     return quaternion_to_matrix(axis_angle_to_quaternion(axis_angle))
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """(..., 3, 3) -> (..., 3). The angle is in [0, pi]."""
+    """Converts matrices (..., 3, 3) to axis-angle vectors (..., 3) with an angle in [0, pi]."""
     return quaternion_to_axis_angle(matrix_to_quaternion(matrix))
 
 
 def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
-    """(..., 3, 3) -> (..., 6): the first two rows or columns, one after the other."""
+    """Converts matrices (..., 3, 3) to 6D vectors (..., 6): the first two rows or columns."""
     vectors = matrix if convention == "rows" else matrix.mT
     return vectors[..., :2, :].flatten(-2)
 
 
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
-    """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15).
+    """Converts 6D vectors (..., 6), orthonormal or not, to matrices (..., 3, 3).
 
-    Every finite pair of vectors yields a rotation. If one vector has no direction, it is replaced
-    by the basis vector that is least parallel to the other vector. If the vectors are parallel,
-    such a basis vector replaces the second one. Two zero vectors yield the identity.
+    The vectors are orthonormalized with Gram-Schmidt (Zhou et al. 2019, eq. 15). Every finite pair
+    of vectors yields a rotation. If one vector has no direction, it is replaced by the basis vector
+    that is least parallel to the other vector. If the vectors are parallel, such a basis vector
+    replaces the second one. Two zero vectors yield the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
-    # No branches, because neither exported graphs nor torch.func.vmap, used in guidance, can
-    # contain them
+    # There are no branches here, because neither exported graphs nor torch.func.vmap, which
+    # guidance uses, support them
     first, across = _orthogonal(torch.where(degenerate, _completed(rot6d), rot6d))
     second = F.normalize(across, dim=-1)
     rows = torch.stack([first, second, torch.linalg.cross(first, second)], -2)
@@ -105,17 +106,17 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 def is_degenerate(rot6d: Tensor) -> Tensor:
     """Returns a bool tensor (...,) that is True where two vectors (..., 6) define no rotation.
 
-    This is the case if one vector is 0, or if the vectors are parallel. `rot6d_to_matrix` completes
+    This is the case if a vector is 0, or if the vectors are parallel. `rot6d_to_matrix` completes
     such pairs.
     """
     return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
 
 
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns two orthogonal vectors from (..., 6).
+    """Returns two orthogonal vectors from 6D vectors (..., 6).
 
-    The results are the first vector, normalized, and the part of the second vector that is
-    perpendicular to it.
+    These are the normalized first vector, and the part of the second vector that is perpendicular
+    to it.
     """
     first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
     return first, second - (first * second).sum(-1, keepdim=True) * first
@@ -147,7 +148,7 @@ def _shorter(normalized: Tensor) -> Tensor:
 
 
 def _completed(rot6d: Tensor) -> Tensor:
-    """Returns pairs of vectors (..., 6) in which basis vectors replace one or both of the vectors."""
+    """Returns pairs of vectors (..., 6) in which basis vectors replace one vector or both vectors."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
     basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
     replaced = _shorter(first)
@@ -158,9 +159,9 @@ def _completed(rot6d: Tensor) -> Tensor:
 
 
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
-    """Returns Euler angles (..., 3) of matrices (..., 3, 3). The middle angle is in [-pi/2, pi/2].
+    """Converts matrices (..., 3, 3) to Euler angles (..., 3) in radians.
 
-    In gimbal lock, the third angle is 0.
+    The middle angle is in [-pi/2, pi/2]. In gimbal lock, the third angle is 0.
 
     Raises:
         UserError: If `order` is not XYZ, XZY, YXZ, YZX, ZXY or ZYX.
@@ -193,7 +194,7 @@ def standardize(quaternion: Tensor) -> Tensor:
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the Hamilton product (..., 4): first b, then a."""
+    """Returns the Hamilton product (..., 4), which rotates first by b and then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     product = [
@@ -206,7 +207,7 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
 
 
 def inverse(quaternion: Tensor) -> Tensor:
-    """(..., 4) with unit length -> (..., 4)."""
+    """Returns the inverse (..., 4) of unit quaternions (..., 4)."""
     return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
 
 
@@ -218,9 +219,9 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
 
 
 def _scaled(vectors: Tensor) -> Tensor:
-    """Returns vectors scaled so that their largest entry is 1. Zero vectors remain 0.
+    """Scales vectors so that their largest absolute entry is 1. Zero vectors remain 0.
 
-    Squares of tiny vectors then do not underflow.
+    The squares of tiny vectors then do not underflow.
     """
     largest = vectors.abs().amax(-1, keepdim=True)
     return vectors / torch.where(largest > 0, largest, 1.0)
@@ -258,9 +259,10 @@ def between(a: Tensor, b: Tensor) -> Tensor:
 
 
 def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
-    """Returns a rotation on the shorter arc from `a` to `b` (..., 4).
+    """Interpolates between the rotations `a` and `b` (..., 4) along the shorter arc.
 
-    `t` in [0, 1] is a number or has the shape (..., 1). The result is `a` for 0 and `b` for 1.
+    `t` in [0, 1] is a number or has the shape (..., 1). The result is `a` for t = 0 and `b` for t =
+    1.
     """
     dot = (a * b).sum(-1, keepdim=True)
     b = torch.where(dot < 0, -b, b)

@@ -26,14 +26,14 @@ class Skeleton:
     name: str
     # Names in the order of the data. The prefixes `left_` and `right_` mark the sides.
     joints: tuple[str, ...]
-    # Parent of each joint, -1 for the root
+    # Parent of each joint, or -1 for the root
     parents: tuple[int, ...]
     # Kinematic chains of HumanML3D's inverse kinematics
     chains: tuple[tuple[int, ...], ...]
-    # (J, 3), unit vector in the rest direction of the bone that ends in each joint; 0 for the root.
-    # From HumanML3D's `paramUtil.py`.
+    # (J, 3), unit vector in the rest direction of the bone that ends in each joint, or 0 for the
+    # root. The vectors are taken from HumanML3D's `paramUtil.py`.
     raw_offsets: tuple[tuple[int, int, int], ...]
-    # Right hip, left hip, right shoulder, left shoulder. They define the heading.
+    # Indices of the right hip, left hip, right shoulder and left shoulder, which define the heading
     facing: tuple[int, int, int, int]
     # Joints that touch the ground, in the order of HumanML3D's contact features
     feet: tuple[int, ...]
@@ -44,7 +44,7 @@ class Skeleton:
 
     @cached_property
     def edges(self) -> tuple[tuple[int, int], ...]:
-        """(parent, child) of each bone."""
+        """The parent and the child of each bone."""
         return tuple((parent, joint) for joint, parent in enumerate(self.parents) if parent >= 0)
 
     @cached_property
@@ -68,7 +68,7 @@ class Skeleton:
     def mirror(self, joints: Tensor) -> Tensor:
         """Returns the mirror image of joints (..., J, 3).
 
-        x changes sign, and left and right joints are swapped.
+        The sign of x is changed, and left and right joints are swapped.
         """
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
@@ -77,7 +77,7 @@ class Skeleton:
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
-        """Returns joint positions (..., J, 3), given the vectors `bones` and the root position."""
+        """Returns the joint positions (..., J, 3) for the vectors `bones` and a root position (..., 3)."""
         paths = [[0.0] * len(self)]
         for joint, parent in enumerate(self.parents[1:], 1):
             paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])
@@ -93,8 +93,8 @@ def forward_kinematics(
 
     Args:
         skeleton: the tree of joints.
-        rotations: (..., J, 3, 3), relative to the parents. They apply to the bones that begin at a
-            joint, as in SMPL and BVH.
+        rotations: (..., J, 3, 3), relative to the parents. As in SMPL and BVH, the rotation of a
+            joint applies to the bones that begin at the joint.
         offsets: (J, 3), positions relative to the parents in the rest pose. The offset of the root
             is ignored.
         root: (..., 3), position of the root.
@@ -109,7 +109,7 @@ def forward_kinematics(
 def global_rotations(rotations: Tensor, parents: Sequence[int]) -> Tensor:
     """Converts rotations (..., J, 3, 3) relative to the parents to world rotations.
 
-    Each level of the tree takes one matrix product.
+    Each level of the tree requires one matrix product.
     """
     import torch
 
@@ -276,7 +276,7 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the indices of joints, given the names of joints or body parts.
+    """Returns the sorted indices of the joints with these names, or in body parts with these names.
 
     Raises:
         UserError: If a name is unknown. The message suggests similar names.

@@ -21,8 +21,8 @@ ADULT = (
 """Position of each of SMPL's 24 joints relative to its parent in the rest pose, in meters.
 
 In the rest pose, the arms are stretched out to the sides, the body faces +z, and y points up. These
-positions replace the licensed model files. They are the bone lengths of HumanML3D's reference clip,
-rounded and made symmetric.
+positions replace the licensed model files. They have the bone lengths of HumanML3D's reference
+clip, rounded and made symmetric.
 """
 
 
@@ -58,13 +58,14 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """The 147 unnormalized features of Kim et al. 2023 (FLAME).
 
-    The features are the translation (3) and 24 rotations as 6D rows, in world coordinates as in
-    AMASS: meters, z up, neither centered nor rotated. `read_pose` describes raw motions.
+    The features are the translation (3) and 24 rotations as 6D rows. They are in AMASS's world
+    coordinates: in meters, with z up, and neither centered nor rotated. `read_pose` describes raw
+    motions.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offsets, in meters, of the body used for decoding, like `ADULT`. The first
-            offset leads from the translation to the pelvis.
+        offsets: (24, 3) offset of each joint from its parent in the rest pose, in meters, for
+            decoding. The first offset leads from the translation to the pelvis. Default: `ADULT`.
 
     Example:
         >>> representation = SMPL()

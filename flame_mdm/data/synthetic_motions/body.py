@@ -1,4 +1,4 @@
-"""The body of the synthetic motions: curves that an action sets, and its kinematics.
+"""The body of the synthetic motions: curves that are set by actions, and its kinematics.
 
 Joint angles move the upper body by forward kinematics. The legs follow planned footprints by
 two-bone inverse kinematics, so that a foot on the ground does not move at all. Hands that reach for
@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-# Offsets from the parent in meters, for a standing body with hanging arms that faces +z. x is for
-# the left side; the right side is mirrored.
+# Offset of each joint from its parent in meters, for a standing body that faces +z, with its arms
+# hanging down. x applies to the left side; the right side is mirrored.
 HIP = (0.075, -0.075, 0.0)
 SPINE1 = (0.0, 0.131, -0.015)
 SPINE2 = (0.0, 0.142, 0.0)
@@ -62,9 +62,10 @@ def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 class Body:
-    """Curves over time that actions change. Initially, the person stands and breathes.
+    """Curves over time that describe a body. Actions change them.
 
-    Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
+    Initially, the body stands still and breathes. Angles are in radians. The first axis of feet and
+    arms is the side: 0 = left, 1 = right.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class Body:
         self.arms += np.array(
             [rng.normal(0.03, 0.05), rng.uniform(0.14, 0.24), -0.4, rng.uniform(0.2, 0.4)]
         )[:, None]
-        # Rise of the shoulders in addition to the rise with the arms
+        # Rise of the shoulders in addition to the rise that raised arms cause
         self.shoulders = np.zeros((2, len(t)))
         # Whether a foot that is too far away is pulled toward its hip, instead of lengthening the
         # shin
@@ -152,8 +153,8 @@ class Body:
         heel_up = (self.foot_pitch > 0)[..., None]
         ankles = self.ankles + heel_up * (rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
 
-        # The pelvis is lowered if a leg could not reach its footprint. In a walk, this makes the
-        # pelvis bob.
+        # The pelvis is lowered where a leg could not reach its footprint otherwise. This makes the
+        # pelvis bob in a walk.
         reach = 0.998 * (THIGH + SHIN)
         out[:, 0] = self.position
         apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
@@ -190,7 +191,7 @@ class Body:
         for side, sign in enumerate(SIGN):
             forward, sideways, outward, elbow = self.arms[side]
             arm = rotation(2, sign * sideways) @ rotation(0, -forward) @ rotation(1, sign * outward)
-            # The shoulder girdle rises with the arm, as in people
+            # As in people, the shoulder girdle rises with the arm
             lift = 0.2 * (1 + (arm @ down)[:, 1]) + self.shoulders[side]
             collar = bone @ rotation(2, sign * lift)
             out[:, 13 + side] = out[:, 9] + bone @ np.array([sign * COLLAR[0], *COLLAR[1:]])
@@ -236,7 +237,7 @@ def bent(
 
 
 def beat(t: np.ndarray, frequency: float, phase: float = 0.0) -> np.ndarray:
-    """Returns a sine wave of a frequency in hertz. `phase` is in turns."""
+    """Returns a sine wave with a frequency in hertz and a phase in turns."""
     return np.sin(2 * np.pi * (frequency * t + phase))
 
 

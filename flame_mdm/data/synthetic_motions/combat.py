@@ -96,7 +96,7 @@ def hit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribut
 
 
 def block(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Crosses the forearms in front of the face, behind bent knees."""
+    """Crosses the forearms in front of the face and bends the knees."""
     start = rng.uniform(0.15, 0.45)
     up = pulse(t, start, start + rng.uniform(0.25, 0.35), t[-1] - 0.6, t[-1])
     for side, sign in enumerate(SIGN):

@@ -14,7 +14,7 @@ from flame_mdm.data.synthetic_motions.body import (
     pulse,
 )
 
-LYING_HEEL = 1.35  # angle of a foot on its toes behind the lying body, in radians
+LYING_HEEL = 1.35  # angle of the feet of a lying body on its toes, in radians
 
 
 def stretch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
@@ -109,16 +109,16 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
 
 
 def _toes(heel: float) -> tuple[float, float]:
-    """Returns the position of the toes of a foot with a raised heel, in meters.
+    """Returns the position, in meters, of the toes of a foot with a raised heel.
 
-    The two numbers are the distances in front of and below the ankle.
+    The two numbers are the distance in front of the ankle and the distance below it.
     """
     _, low, ahead = FOOT
     return ahead * np.cos(heel) + low * np.sin(heel), ahead * np.sin(heel) - low * np.cos(heel)
 
 
 def hop(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Hops on one leg and holds up the other foot behind."""
+    """Hops on one leg while holding the other foot up behind the body."""
     (side,) = SIDES[str(requested["side"])]
     sign, hops = SIGN[side], events(rng, t, int(requested["count"]), 0.75)
     first, last = hops[0][0], hops[-1][0] + hops[-1][1]

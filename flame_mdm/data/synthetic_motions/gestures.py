@@ -1,4 +1,4 @@
-"""Motions in place: gestures of arms and head, jumps, kicks, bends, sitting and lying."""
+"""Motions in place: gestures of the arms and the head, jumps, kicks, bends, sitting and lying."""
 
 import numpy as np
 
@@ -258,7 +258,7 @@ def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
 
     Args:
         body: the body to seat.
-        seated: (F,) progress from standing, 0, to sitting, 1.
+        seated: (F,) progress from standing (0) to sitting (1).
         bent: (F,) lean of the trunk.
     """
     body.position[:, 1] += seated * (CHAIR - body.position[:, 1])

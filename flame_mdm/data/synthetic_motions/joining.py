@@ -1,6 +1,6 @@
 """Joins two motions.
 
-The second motion begins at the position and in the pose in which the first motion ends.
+The second motion begins at the position and in the pose at the end of the first motion.
 """
 
 import copy
@@ -12,7 +12,8 @@ from flame_mdm.data.synthetic_motions.body import Body, ease, rotation
 # Curves of a body that are blended into the values of the second motion, and the axis of their
 # frames
 ANGLES = {"pelvis": -1, "spine": -1, "head": -1, "arms": -1, "shoulders": -1, "foot_pitch": -1}
-# Curves of the second motion that are moved to the place in the world where the first motion ends
+# Curves of the second motion that are moved to the position in the world at which the first motion
+# ends
 PLACES = {"position": 0, "heading": -1, "ankles": 1, "foot_yaw": -1}
 FRAMES = ANGLES | PLACES
 PLANTED = 0.05  # distance in meters; a foot that has to move farther takes a step
@@ -30,8 +31,8 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
     Args:
         first: a body at evenly spaced times.
         second: a body at times with the same spacing.
-        overlap: how many seconds before the end of the first motion the second one begins.
-        blend: how many seconds the difference takes to fade out after the end of the first motion.
+        overlap: seconds by which the second motion begins before the end of the first motion.
+        blend: seconds after the end of the first motion until the difference is faded out.
     """
     spacing = second.t[1] - second.t[0]
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1
@@ -91,7 +92,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
 
 
 def frames_of(body: Body, frames: np.ndarray) -> Body:
-    """Returns a body with frames (N,) of another body, at the same frame rate."""
+    """Returns a body with selected frames (N,) of another body, at the same frame rate."""
     part = copy.copy(body)
     part.t = np.arange(len(frames)) * (body.t[1] - body.t[0])
     for name, axis in FRAMES.items():
@@ -104,10 +105,9 @@ def frames_of(body: Body, frames: np.ndarray) -> Body:
 
 
 def _padded(values: np.ndarray, axis: int, start: int, frames: int) -> np.ndarray:
-    """Pads values to `frames` frames along `axis`, so that the given values begin at frame `start`.
+    """Pads values to `frames` frames along `axis`, so that they begin at frame `start`.
 
-    The first given value is repeated before `start`, and the last given value is repeated at the
-    end.
+    The first value is repeated before `start`, and the last value is repeated at the end.
     """
     length = values.shape[axis]
     return np.take(values, np.clip(np.arange(frames) - start, 0, length - 1), axis)

@@ -37,7 +37,7 @@ class Gait:
     toe_up: float
     # Half the distance between the tracks of the feet
     width: float
-    # How far the pelvis is lowered while the body moves
+    # Distance by which the pelvis is lowered while the body moves
     sink: float = 0.03
     # Amplitude of the vertical motion of the pelvis, which is highest when both feet are in the air
     bounce: float = 0.0
@@ -53,11 +53,11 @@ def walk_along(
     The foot `first` takes the first step. Returns how far the right foot is in front of the left
     foot (F,), in meters, relative to the heading of the pelvis.
     """
-    # The pelvis accelerates, keeps its speed and stops. Each footprint is where the pelvis will be
-    # in the middle of the foot's next stance, shifted sideways by the width of the gait. On
+    # The pelvis accelerates, keeps its speed and stops. Each footprint is at the position of the
+    # pelvis in the middle of the foot's next stance, shifted sideways by the width of the gait. On
     # average, the feet are therefore below the body.
     t, start = body.t, rng.uniform(0.08, 0.18)
-    # Time until the last foot is down
+    # Time until the last foot is on the floor
     seconds = t[-1] - rng.uniform(0.06, 0.16) - start
     # A run ends with walking steps, in which the feet never leave the ground at the same time.
     landing = min(gait.swing, 0.82)

@@ -1,4 +1,4 @@
-"""More ways to move, such as sneaking, limping, marching, climbing or carrying."""
+"""More kinds of locomotion, such as sneaking, limping, marching, climbing and carrying."""
 
 import numpy as np
 
@@ -135,9 +135,9 @@ def _tread(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lifts the feet alternately in place, the left foot first.
 
-    A foot is lifted by `lift` meters and moves `ahead` meters in the air. Returns two curves (F,).
-    The first is a wave that is 1 when the left foot is up and -1 when the right foot is up. The
-    second states whether the body is moving.
+    Each foot is lifted by `lift` meters, and moves forward by `ahead` meters in the air. Returns
+    two curves (F,). The first is a wave that is 1 when the left foot is up and -1 when the right
+    foot is up. The second states whether the body is moving.
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))
@@ -189,7 +189,7 @@ def push(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def pull(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Holds on with both hands, leans back, and drags something backward in short steps."""
+    """Holds something heavy with both hands, leans back, and drags it backward in short steps."""
     gait = Gait(rng.uniform(0.56, 0.66), 0.8, 0.07, -0.1, -0.2, 0.11, 0.0)
     walk_along(body, rng, gait, rng.uniform(0.35, 0.5), straight(0, -1), RIGHT)
     effort = ease(t, -0.1, 0.4)

@@ -167,7 +167,10 @@ def test_a_reading_says_what_is_different_from_the_sentence():
         == "the model cannot do 'walks forward' and 'waves' at the same time: they are sampled one after the other"
     )
     (line,) = reader.read("a person limps").warnings()
-    assert line == "the model does not know 'walks with a limp': it walks forward slowly instead"
+    assert (
+        line
+        == "the model does not know 'walks with a limp': the person walks forward slowly instead"
+    )
 
 
 def test_two_actions_that_a_model_knows_as_one_are_joined():

@@ -1,4 +1,4 @@
-"""Condition encoders for text, action labels, or no condition."""
+"""Condition encoders for text, for action labels, and for unconditional models."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
@@ -12,9 +12,9 @@ from flame_mdm.batch import Condition, MotionBatch
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Base class for encoders of texts or actions.
+    """Base class for encoders of text or action labels.
 
-    For each batch, an encoder returns a `Condition` that includes the null condition.
+    For each batch, an encoder returns a `Condition`, which includes the null condition.
 
     Example:
         >>> class WordCount(ConditionEncoder):  # an encoder that counts the words of a caption
@@ -31,7 +31,7 @@ class ConditionEncoder(nn.Module, ABC):
 
     #: C, the width of the condition; 0 = unconditioned.
     features: int
-    #: What the encoder reads: captions ("text") or class labels ("action").
+    #: Input of the encoder: captions ("text") or action labels ("action").
     reads: Literal["text", "action"] = "text"
     #: Maximum number of words per caption; None = no limit.
     max_words: int | None = None
@@ -63,15 +63,15 @@ class ConditionEncoder(nn.Module, ABC):
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Fills the encoder's cache on disk for these captions.
+        """Encodes these captions and writes them to a cache on disk.
 
-        By default, the method does nothing. It is called by only one process.
+        Only one process calls this method. By default, it does nothing.
         """
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
-        """Opens the cache of `precompute` in every process and returns its size in bytes.
+        """Opens the cache that `precompute` wrote, and returns its size in bytes.
 
-        Returns 0 if there is no cache.
+        Every process calls this method. The size is 0 if there is no cache.
 
         Raises:
             UserError: If the cache is damaged.
@@ -83,7 +83,7 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """No condition: vectors and tokens of width 0, which are also the null condition.
+    """Empty condition, whose vectors and tokens have width 0. The null condition is the same.
 
     Example:
         >>> x = torch.zeros(2, 5, 3)

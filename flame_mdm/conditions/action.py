@@ -9,12 +9,12 @@ from flame_mdm.errors import UserError
 
 
 class ActionLabels(ConditionEncoder):
-    """One learned vector per class, initialized from N(0, 1).
+    """Encoder with one learned vector per action label, initialized from N(0, 1).
 
     The null condition is the zero vector.
 
-    Source: Tevet et al. 2023 (MDM), section 3. For denoisers that read tokens, there is one token,
-    equal to the pooled vector.
+    Source: Tevet et al. 2023 (MDM), section 3. For denoisers that read tokens, the pooled vector is
+    also the only token.
 
     Args:
         features: C, the width of the vectors.
@@ -38,7 +38,7 @@ class ActionLabels(ConditionEncoder):
         super().__init__()
         if num_actions < 1:
             raise UserError(
-                "condition=action needs a data set with action labels. This one has none"
+                "condition=action requires a data set with action labels, but this one has none"
             )
         self.features = features
         self.table = nn.Parameter(torch.randn(num_actions, features))
@@ -51,7 +51,8 @@ class ActionLabels(ConditionEncoder):
         """
         if batch.action is None:
             raise UserError(
-                "condition=action needs action labels, but this batch has none. Choose data with labels"
+                "condition=action requires action labels, but this batch has none. Choose a data "
+                "set with labels"
             )
         pooled, nothing = (
             self.table[batch.action.to(self.table.device)],

@@ -14,14 +14,16 @@ class ReadPrompt:
     """A prompt as a model reads it.
 
     Attributes:
-        parts: words of each part, and its duration in seconds if the prompt states one.
+        parts: the words of each part, and its duration in seconds, or None if the prompt states
+            none.
         captions: the caption that the model reads for each part.
         unknown: words that never occur in the training captions, or that the model does not read.
-        summary: one line that states how the prompt was understood. It is "" unless each caption of
+        summary: one line that states how the prompt was understood, or "" unless each caption of
             the model describes a single action.
         changes: lines about differences between the prompt and what is sampled.
-        fitting: for each part, the seconds that fit its stated number of repetitions, or None if it
-            states no number. The tuple is empty if the captions do not describe single actions.
+        fitting: for each part, a duration in seconds that suits its stated number of repetitions,
+            or None if it states no number. The tuple is empty if the captions do not describe
+            single actions.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -41,13 +43,13 @@ def read_prompt(
     splits: bool = False,
     check_words: bool = True,
 ) -> ReadPrompt:
-    """Reads a prompt as the model reads it.
+    """Returns a prompt as a model reads it.
 
     Args:
-        prompt: the text.
-        parts: words of its parts, as in "walks @3 | sits", and their durations in seconds if the
-            text states them.
-        facts: facts of the model.
+        prompt: the text as typed by the user.
+        parts: the words of each part of the prompt, as in "walks @3 | sits", and its duration in
+            seconds, or None if the prompt states none.
+        facts: facts about the model, such as its "vocabulary", "actions" and "captions".
         max_words: maximum number of words that the model reads in a caption; None = no limit.
         splits: whether a sentence with several actions is split into one part per action. This
             applies only to texts with a single part.

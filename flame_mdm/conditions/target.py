@@ -1,12 +1,12 @@
 """Target conditions: where joints should be at the end of a motion.
 
 Source: Tevet et al. 2025, "CLoSD", section 3.1. A target (B, 8, 4) contains a slot for each name in
-`SLOTS`. A slot contains x, y, z, and a flag, which is 1 if the slot is requested and 0 if it is
-free. Free slots are 0.
+`SLOTS`. Each slot contains x, y, z, and a flag, which is 1 if the slot is requested and 0 if it is
+free. All values of a free slot are 0.
 
 Positions are in meters relative to the first predicted frame, whose root is at x = z = 0 and faces
 +z. y is the height above the floor. "traj" is the pelvis projected onto the floor, y = 0. The x of
-"heading" is the direction that hips and shoulders face, in radians: 0 = +z, positive toward +x.
+"heading" is the direction that the hips and shoulders face, in radians: 0 = +z, positive toward +x.
 """
 
 import math
@@ -22,7 +22,7 @@ JOINTS = ("pelvis", "left_foot", "right_foot", "left_wrist", "right_wrist", "hea
 SLOTS = (*JOINTS, "traj", "heading")
 HEADING = SLOTS.index("heading")
 COORDINATES = Constant([[1.0, 1.0, 1.0]] * len(JOINTS) + [[1.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-"""Coordinates (8, 3) of the slots that are lengths. The x of the heading is an angle instead."""
+"""Mask (8, 3) of the coordinates that are lengths. The x of the heading is an angle instead."""
 
 FLOOR = Constant([1.0, 0.0, 1.0])
 """Factors (3,) of x, y and z that project a position onto the floor."""
@@ -43,8 +43,8 @@ class TargetConditions:
             having no target.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
-        heading_modulo_pi: compute the error of the heading modulo pi, as in MDM's code. A body that
-            faces backwards then has no error.
+        heading_modulo_pi: whether to compute the error of the heading modulo pi, as in MDM's code.
+            A body that faces backwards then has no error.
 
     Raises:
         UserError: If the skeleton lacks a joint, if a choice is unknown, or if the probability is
@@ -93,7 +93,7 @@ class TargetConditions:
         self.drop_prob, self.weight, self.heading_modulo_pi = drop_prob, weight, heading_modulo_pi
 
     def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns the values (B, 8, 3) of all slots at the end of motions.
+        """Returns the values (B, 8, 3) of all slots at the ends of motions.
 
         Args:
             joints: (B, F, J, 3), positions in meters.
@@ -110,7 +110,7 @@ class TargetConditions:
         return torch.cat([last[:, self.columns.on(last.device)], pelvis, turned[:, None]], 1)
 
     def draw(self, joints: Tensor, u: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns targets (B, 8, 4) from the ends of real motions.
+        """Draws targets (B, 8, 4), whose values are taken from the ends of real motions.
 
         Args:
             joints: (B, F, J, 3), positions in meters.

@@ -29,12 +29,13 @@ CAPTIONS_AT_ONCE = 64
 class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
-    A frozen language model is not part of the state dict or the parameters. It is loaded only if
-    the cache lacks a caption. Its tokens are always rounded to float16, even without a cache.
+    A frozen language model is neither in the state dict nor among the parameters. It is loaded only
+    if a caption is missing from the cache. Its tokens are always rounded to float16, even without a
+    cache.
 
     Args:
         model: name on the Hugging Face hub, or a folder.
-        features: C, width of the model's outputs.
+        features: C, the width of the model's outputs.
         max_tokens: maximum number of word pieces per caption, including special tokens. Longer
             captions are truncated.
         pooling: how a caption is converted to one vector. "projection" is CLIP's projected,
@@ -45,23 +46,26 @@ class PretrainedText(ConditionEncoder):
             implementation, the map is drawn with a fixed seed, and a released checkpoint can
             replace it.
         revision: full 40-digit commit hash on the hub; required for models from the hub.
-        package: installed Python package that contains the files, instead of the hub. `model` is
-            then the folder in the package.
+        package: installed Python package from which the files are loaded instead of the hub. In
+            this case, `model` is used only as a name.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
-        normalize: scale the pooled vector to norm 1.
-        tokens: return the last hidden states as tokens. Otherwise, no tokens are returned.
-        attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME
-            and MFM do.
-        encode_null: use the encoded "" as the null condition (FLAME). Otherwise, the null condition
-            is zeros with the sample's token mask (MDM).
-        freeze: False = fine-tune the language model together with the motion model.
+        normalize: whether to scale the pooled vector to norm 1.
+        tokens: whether to return the last hidden states as tokens. Otherwise, no tokens are
+            returned.
+        attend_padding: whether to pad every caption to `max_tokens` and to treat the padding as
+            real tokens, as FLAME and MFM do.
+        encode_null: whether to use the encoded empty caption as the null condition, as FLAME does.
+            Otherwise, the null condition consists of zeros with the token mask of the sample, as in
+            MDM.
+        freeze: whether to freeze the language model. Otherwise, it is fine-tuned together with the
+            motion model.
 
     Raises:
-        UserError: If a caption is encoded and the model is not pinned, its file is not the
-            published file, or its width is not `features`.
-        FileNotFoundError: If a caption is encoded and the model is not in the cache and cannot be
-            downloaded.
+        UserError: When a caption is encoded, if the model is not pinned to a revision, if its file
+            differs from the published file, or if its width is not `features`.
+        FileNotFoundError: When a caption is encoded, if the model is neither in the cache nor
+            available for download.
 
     Example:
         >>> encoder = PretrainedText("openai/clip-vit-base-patch32", 512, 22, "projection")
@@ -161,7 +165,7 @@ class PretrainedText(ConditionEncoder):
         del self._pretrained.network  # frees its memory
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> int:
-        """Opens the file that `precompute` wrote and returns its size in bytes.
+        """Opens the file that `precompute` wrote, and returns the size of its arrays in bytes.
 
         Raises:
             UserError: If the file is missing or damaged.
@@ -202,7 +206,7 @@ class PretrainedText(ConditionEncoder):
     def _encode(
         self, captions: Sequence[str], network: nn.Module, device: torch.device
     ) -> tuple[Tensor, ...]:
-        """Runs the language model.
+        """Runs the language model on captions.
 
         Returns the input of `_pool` (N, C), the tokens (N, S, C) and the token mask (N, S).
         """
@@ -259,7 +263,7 @@ class PretrainedText(ConditionEncoder):
     def _look_up(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Same as `_encode`, but reads the captions from the cache if it contains all of them."""
+        """Returns the same as `_encode`, but from the cache if it contains all captions."""
         encoded, distinct = self._cache, set(captions)
         if encoded is None or not encoded.rows.keys() >= distinct:
             encoded = self._encode_frozen(sorted(distinct, key=len), device)
@@ -310,7 +314,8 @@ class Pretrained:
             "t5": T5EncoderModel
         }
         loader = text_halves.get(kind, AutoModel)
-        # BERT's published pooler is not used, and RoBERTa has no pooler: see PretrainedText.
+        # The pooler is not loaded: BERT's is not used, and RoBERTa is published without one (see
+        # `pooling` of PretrainedText).
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
         # Otherwise, transformers reports the weights of the unused half of CLIP or T5 as not loaded
@@ -328,8 +333,8 @@ class Pretrained:
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
-        # Code in model repositories is never executed. Without this option, transformers asks the
-        # user.
+        # Code in model repositories is never executed. Without this option, transformers would ask
+        # the user.
         options["trust_remote_code"] = False
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
@@ -400,7 +405,7 @@ class EncodedCaptions:
     def gather(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the outputs for some captions in float32, on a device.
+        """Returns the outputs for the given captions in float32, on a device.
 
         The outputs are vectors (N, C), tokens (N, S, C) and the mask of the tokens (N, S).
         """

@@ -24,15 +24,15 @@ No caption contains this token.
 
 
 class LearnedTokens(ConditionEncoder):
-    """Hashed words, learned positions and one transformer layer.
+    """Text encoder with hashed words, learned positions and one transformer layer.
 
     The null condition is one learned vector.
 
-    A word is the sum of two rows of the table, selected by its hash; see `vocabulary.hashed`. The
-    vector of a word that does not occur in the training captions would be random. Such a word is
-    replaced by another form of it that occurs in the captions (walked, walks), or dropped. Samples
-    with the same caption share its dropout, because each caption is encoded once. Linear layers
-    skip the padding.
+    The vector of a word is the sum of two rows of a table, which are selected by the hash of the
+    word; see `vocabulary.hashed`. A word that does not occur in the training captions would have a
+    random vector. It is therefore replaced by another of its forms that does occur (walked, walks),
+    or dropped. Samples with the same caption share the same dropout, because each caption is
+    encoded once. Linear layers skip the padding.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector. Therefore,
     all parameters receive gradients, regardless of whether a denoiser reads the pooled vector or
@@ -42,9 +42,9 @@ class LearnedTokens(ConditionEncoder):
         features: C, the width of the tokens and of the pooled vector.
         buckets: rows of the word table.
         max_words: maximum number of words per caption. Additional words are dropped.
-        heads: number of attention heads; divides `features`.
+        heads: number of attention heads, which must divide `features`.
         dropout: probability of dropout in the transformer layer.
-        pretrain_steps: number of steps of `pretrain`.
+        pretrain_steps: number of training steps in `pretrain`.
 
     Raises:
         UserError: If a size is below 1.
@@ -106,7 +106,7 @@ class LearnedTokens(ConditionEncoder):
         Pooled vectors of captions for the same clip are pulled together, and pooled vectors of
         different clips are pushed apart. Each step compares two captions from each of `PAIRS`
         clips. Without this training, a small model learns many words slowly, because it learns them
-        only from the loss of the motions. Clips with a single caption are not used.
+        only from the motion loss. Clips with a single caption are not used.
         """
         groups, device = (
             [captions for captions in groups if len(set(captions)) > 1],
@@ -150,8 +150,8 @@ class LearnedTokens(ConditionEncoder):
             self._rows[caption] = np.array(self.rows(caption), np.int64)
         rows = [self._rows[caption] for caption in numbers]
         lengths = np.array([len(words) for words in rows])
-        # The host computes everything that depends on values, because otherwise it would wait for
-        # the device.
+        # Everything that depends on values is computed on the host, which would otherwise have to
+        # wait for the device.
         is_real = np.arange(lengths.max()) < lengths[:, None]
         of_caption = np.array([numbers[caption] for caption in batch.text])
         words, index, token_mask, of_sample = (
@@ -163,9 +163,9 @@ class LearnedTokens(ConditionEncoder):
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def encode(self, words: Tensor, counts: Tensor) -> Condition:
-        """Encodes `rows` (B, S, 2) of captions of lengths (B,) like `forward`.
+        """Encodes captions like `forward`, from their `rows` (B, S, 2) and lengths (B,).
 
-        The function has no branches, so that it can be exported as a graph.
+        This method has no branches, so that it can be exported as a graph.
         """
         token_mask = length_mask(counts, words.shape[1])
         index = torch.arange(token_mask.numel(), device=words.device)
@@ -173,7 +173,9 @@ class LearnedTokens(ConditionEncoder):
         return Condition(tokens.sum(1) / counts[:, None], tokens, token_mask, self._null())
 
     def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
-        """Encodes captions as (N, S, C), with zeros in the padding. Only attention processes it.
+        """Encodes captions as tokens (N, S, C), with zeros in the padding.
+
+        Only attention processes the padding.
 
         Args:
             rows: (T, 2), rows of the table for all real tokens.

@@ -23,7 +23,8 @@ FUNCTION_WORDS = frozenset(
 )
 """Function words, which do not describe what happens.
 
-A text with only these words describes nothing. There is no warning if a model does not know them.
+Text that consists only of these words describes nothing. Users are not warned if a model does not
+know one of them.
 """
 NUMBERS = frozenset(
     [
@@ -60,15 +61,16 @@ def words(text: str) -> list[str]:
 
 
 def hashed(word: str, buckets: int) -> tuple[int, int]:
-    """Returns two rows of a table of `buckets` word vectors.
+    """Returns the two rows for a word in a table of `buckets` vectors.
 
-    The vector of a word is the sum of both rows.
+    The vector of the word is the sum of both rows.
 
-    The rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). Two words
-    are confused only if both parts are equal. The hash (CRC-32) is the same on every machine.
+    The numbers of the rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash
+    embeddings"). Two words are confused only if both parts are equal. The hash (CRC-32) is the same
+    on every machine.
     """
-    # Two hashes of the word with different prefixes would not suffice: CRC is linear, so both would
-    # collide together.
+    # Two hashes of the word with different prefixes would not be enough: CRC is linear, so both
+    # hashes would collide for the same pairs of words.
     number = zlib.crc32(word.encode())
     return number % buckets, number // buckets % buckets
 
@@ -96,7 +98,7 @@ def vocabulary(
 
 
 def known_form(word: str, seen: Collection[str]) -> str | None:
-    """Returns a known word: `word` itself, or a form with another ending (walked, walks).
+    """Returns `word` itself if it is known, or a known form with another ending (walked, walks).
 
     Returns None if no form is known.
     """
@@ -121,8 +123,8 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
     Args:
         text: the prompt.
-        facts: facts of the model. Imported models have no vocabulary, so their words are not
-            checked.
+        facts: facts about the model. For imported models, whose vocabulary is unknown, words are
+            not checked.
         max_words: maximum number of words that the model reads; None = no limit.
     """
     lines = []
@@ -166,8 +168,9 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     """Returns the question " Did you mean '...'?" for text with unknown words.
 
-    The question quotes the text with its unknown words replaced by known words. If there are no
-    such words, it quotes the nearest training caption that contains a content word of the text.
+    The question quotes the text with its unknown words replaced by known words. If one of them
+    cannot be replaced, it quotes the nearest training caption that contains a content word of the
+    text.
 
     A word that is not English is replaced by a known word with a similar spelling. An English word
     is replaced only by a known word with a similar meaning ("shelf" never becomes "she").
@@ -176,7 +179,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     for word in (unknown := unknown_words(text, facts)):
         if (meant := _meant(word, facts["vocabulary"])) is None:
             break
-        # a function, because the words of a model may contain backslashes
+        # a function instead of a string, because the words of a model may contain backslashes
         fixed = re.sub(rf"\b{word}\b", lambda _, replacement=meant: replacement, fixed)
     else:
         if unknown:
@@ -205,8 +208,8 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
     Text is split at sentence boundaries and at "then". With `verbs`, it is also split at each comma
     that is followed by a verb. After such a comma, an "and" before a verb also splits the text.
     Otherwise, "and" does not: "raises both hands and waves" is one action. A part without a verb is
-    joined with its neighbor. "In limp style" at the end, which adapters teach, is added to all
-    parts.
+    joined with its neighbor. A style at the end, such as "in limp style", is added to all parts.
+    Adapters teach such styles.
 
     Args:
         text: the sentence.
@@ -254,7 +257,7 @@ def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[st
 def plainest(captions: Iterable[str]) -> list[str]:
     """Returns captions sorted from plain to elaborate.
 
-    Captions about "a person" are first, and shorter captions come before longer ones.
+    Captions that begin with "a person" come first, and shorter captions come before longer ones.
     """
     return sorted(
         captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption)

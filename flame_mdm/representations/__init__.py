@@ -112,7 +112,7 @@ class Representation(nn.Module, ABC):
         """
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Returns the 6D rotations (..., F, N, 6) that features (..., F, D) in the data's units contain.
+        """Returns the 6D rotations (..., F, N, 6) in features (..., F, D) in the data's units.
 
         By default, features contain no rotations (N = 0).
         """

@@ -32,8 +32,7 @@ class HumanML(Representation):
     | root_velocity | 2 | x and z of the root's displacement to the next frame, in body coordinates |
     | root_height | 1 | y of the root |
     | positions | 3 (J - 1) | joint positions without the root, in body coordinates: root at x = z = 0, facing +z |
-    | rotations | 6 (J - 1) | 6D rotation (columns) of each bone relative to the previous bone: the
-    shortest arcs, not SMPL's rotations |
+    | rotations | 6 (J - 1) | 6D (columns) relative to the previous bone: shortest arcs, not SMPL's rotations |
     | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
     | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves until the next frame |
 
@@ -277,7 +276,7 @@ class HumanML(Representation):
         return rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(relative), "columns")
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the heading (..., F) and the position (..., F, 3) of the root in the features' unit."""
+        """Returns heading (..., F) and position (..., F, 3) of the root, in the features' unit."""
         turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
         heading = self.turn_unit * turn
         x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)

@@ -91,7 +91,7 @@ class Motion272(Representation):
         return torch.cat([*rows, rotation.matrix_to_rot6d(turned, "rows").flatten(1)], 1).float()
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Returns 6D rotations (..., F, 23, 6): the turn of the root, then the rotations of the joints."""
+        """Returns 6D rotations (..., F, 23, 6): the root's turn, then the joint rotations."""
         turn = features[..., None, self.slices["turn"]]
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 

@@ -98,9 +98,10 @@ class Rifke(Representation):
         return least - torch.log(0.5 + torch.exp(least - most))
 
     def heading(self, joints: Tensor) -> Tensor:
-        """Returns the heading (T,), in (-pi, pi] radians, of a body with joint positions (T, 21, 3).
+        """Returns the heading (T,) of a body with joint positions (T, 21, 3).
 
-        A body with heading 0 faces +z. Positive headings turn toward +x.
+        Headings are in radians, in (-pi, pi]. A body with heading 0 faces +z. Positive headings
+        turn toward +x.
         """
         left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow
@@ -125,7 +126,7 @@ class Rifke(Representation):
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:
-    """Interpolates (T, ...) linearly to ((T - 1) * factor + 1, ...) frames.
+    """Interpolates linearly between the T frames of (T, ...), to ((T - 1) * factor + 1, ...).
 
     TEMOS is evaluated at 100 frames per second, 8 times the rate of the features.
     """

@@ -148,7 +148,7 @@ def _shorter(normalized: Tensor) -> Tensor:
 
 
 def _completed(rot6d: Tensor) -> Tensor:
-    """Returns pairs of vectors (..., 6) in which basis vectors replace one vector or both vectors."""
+    """Returns pairs of vectors (..., 6) in which basis vectors replace one or both vectors."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
     basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
     replaced = _shorter(first)

@@ -77,7 +77,7 @@ class Skeleton:
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
-        """Returns the joint positions (..., J, 3) for the vectors `bones` and a root position (..., 3)."""
+        """Returns joint positions (..., J, 3) from the vectors `bones` and the root position."""
         paths = [[0.0] * len(self)]
         for joint, parent in enumerate(self.parents[1:], 1):
             paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])

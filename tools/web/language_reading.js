@@ -165,7 +165,7 @@ export class Reader {
     const understood = understand(sentence);
     const shown = `'${text.length > 60 ? `${text.slice(0, 59)}…` : text}'`;
     if (understood.isForeign) {
-      throw new NotUnderstood(`${shown}: texts are understood in English only. Write it in English`);
+      throw new NotUnderstood(`${shown}: prompts are understood in English only. Write the prompt in English`);
     }
     const asTyped = { steps: [], captions: [text], texts: [text], changes: [], ignored: [] };
     if (!understood.steps.length) {
@@ -213,7 +213,7 @@ export class Reader {
       notes.changes.push(`'${mention.typed}' is read as '${predicate({ action })}'`);
     } else if (action !== mention.action) {
       const instead = predicate({ action, attributes: implied });
-      notes.changes.push(`the model does not know '${predicate({ action: mention.action })}': it ${instead} instead`);
+      notes.changes.push(`the model does not know '${predicate({ action: mention.action })}': the person ${instead} instead`);
     }
     const attributes = { ...implied };
     const { takes } = actions().get(action);

@@ -1,4 +1,4 @@
-"""Actions and attributes that a model knows, from the facts in its file."""
+"""Actions and attributes that a model knows, derived from the facts in its file."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -40,7 +40,7 @@ class Abilities:
     """Actions and attributes of a model whose captions each name one action from a list.
 
     Args:
-        facts: facts of the model: "actions", "vocabulary" and, if known, "captions".
+        facts: facts about the model: "actions", "vocabulary" and, if known, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -51,7 +51,7 @@ class Abilities:
 
     @cached_property
     def actions(self) -> list[str]:
-        """Names in `actions.yaml` of the actions that the model knows."""
+        """Actions that the model knows, by their names in `actions.yaml`."""
         listed: dict[str, None] = {}
         for name in self.names:
             plain = name.replace("_", " ").lower()
@@ -109,7 +109,7 @@ class Abilities:
         return False
 
     def choices(self, action: str) -> dict[str, list[Value]]:
-        """Returns the values of each attribute that the model knows for an action."""
+        """Returns, for each attribute of an action, the values that the model knows."""
         takes = actions()[action].takes
         listed = {
             name: [value for value in values if self.supports(action, name, value)]
@@ -125,7 +125,7 @@ class Abilities:
     def nearest(self, understood: Understanding) -> list[str]:
         """Returns captions of the three known actions that are nearest in meaning to a sentence.
 
-        Returns [] if no meaning is known.
+        The list is empty if none of the words has a known meaning.
         """
         names = [action for action in understood.nearest if action in self.actions]
         ranked = nearest_to([word for word in understood.text.lower().split() if word.isalpha()])

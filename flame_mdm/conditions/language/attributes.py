@@ -1,4 +1,4 @@
-"""Attributes that the words around an action state: side, count, direction, speed, and turn."""
+"""Attributes stated by the words around an action: side, count, direction, speed, and turn."""
 
 from collections.abc import Collection, Sequence
 
@@ -31,7 +31,7 @@ class Reader:
         entry: the action.
         tokens: tokens of the sentence.
         numbers: indices of the tokens that belong to the action.
-        verb: indices of the tokens of the phrase that names the action.
+        verb: indices of the tokens in the phrase that names the action.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Reader:
         self._state("direction", self._around(value), number)
 
     def _around(self, value: str) -> str:
-        """Returns a direction. In a circle, left and right become clockwise or counterclockwise."""
+        """Returns a direction. In circles, left means counterclockwise, right means clockwise."""
         earlier = str(self.attributes.get("direction", ""))
         turns = {"left": "counterclockwise", "right": "clockwise"}
         if earlier == "circle":

@@ -32,7 +32,7 @@ CONNECTORS = {
     ("simultaneously",): WHILE,
     ("meanwhile",): WHILE,
 }
-"""Words that state the order of two clauses, longest first."""
+"""Words that state the order of two clauses. Longer connectors come first."""
 AT_THE_END = {
     (word,)
     for word in ("simultaneously", "meanwhile", "at", "in", "afterwards", "afterward", "later")
@@ -49,12 +49,12 @@ class Clause:
     """Consecutive words of a sentence.
 
     Attributes:
-        numbers: indices of its tokens.
-        link: when the clause happens relative to the previous clause, or "" if the sentence does
+        numbers: indices of the tokens in the clause.
+        link: when the action happens relative to the previous clause, or "" if the sentence does
             not say.
-        is_first: whether it is the first clause of its sentence.
-        after_comma: whether a comma precedes it.
-        matches: phrases in it that name actions.
+        is_first: whether the clause is the first one of its sentence.
+        after_comma: whether a comma precedes the clause.
+        matches: phrases in the clause that name actions.
     """
 
     numbers: list[int]
@@ -121,7 +121,7 @@ def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
 
 
 def joined(clauses: Sequence[Clause]) -> list[Clause]:
-    """Merges clauses so that each has an action.
+    """Merges clauses, so that each of them has an action.
 
     A clause without an action is merged with the previous clause or, if it is the first clause,
     with the next one. A clause such as "then faster" is not merged, because it repeats the previous

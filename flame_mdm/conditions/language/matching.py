@@ -19,7 +19,7 @@ class Match:
 
     Attributes:
         phrase: the phrase.
-        used: indices of its tokens in the sentence, in increasing order.
+        used: indices of the tokens that form the phrase, in increasing order.
         is_weak: whether the phrase, such as "go", counts as an action only if the sentence has no
             other action.
     """
@@ -40,9 +40,9 @@ class Match:
 
 
 def find_phrases(tokens: Sequence[Token]) -> list[Match]:
-    """Returns the phrases for actions in a sentence.
+    """Finds the phrases that name actions in a sentence.
 
-    At each word, the longest phrase is taken. Phrases do not overlap.
+    If several phrases begin at a word, the longest one is used. Phrases do not overlap.
     """
     matches: list[Match] = []
     number = 0

@@ -9,9 +9,9 @@ from flame_mdm.conditions.language.tables import actions, words_of
 from flame_mdm.conditions.language.vectors import word_table
 
 SIMILAR = 0.65
-"""Minimum similarity at which a word is read as the nearest action.
+"""Minimum similarity at which a word is read as the action that is nearest in meaning.
 
-docs/language.md reports precision and recall.
+docs/language.md reports the precision and recall at this threshold.
 """
 NEIGHBORS = 5  # number of nearest listed words that decide whether a word names a thing
 
@@ -26,7 +26,7 @@ def nearest_actions(word: str) -> list[tuple[str, float]]:
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to the mean of some words, nearest first."""
+    """Returns the actions with their similarities to the mean of several words, nearest first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 
@@ -54,7 +54,7 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 
 
 def is_thing(word: str) -> bool:
-    """Returns whether most of the nearest listed words name things rather than actions."""
+    """Returns whether a word probably names a thing: most of the nearest listed words do."""
     vector = word_table().vector(word)
     if vector is None:
         return False
@@ -68,7 +68,7 @@ def is_thing(word: str) -> bool:
 def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
     """Returns the actions with their scores, highest score first.
 
-    The score is the mean of the similarities to the action's nearest word and to its center.
+    The score is the mean of two similarities: to the nearest word of the action, and to its center.
     """
     names, rows, vectors = _action_vectors()
     words = vectors @ vector
@@ -104,7 +104,7 @@ def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
 
 @cache
 def _centers() -> np.ndarray:
-    """Returns, for each action, the mean vector of its words (N, D), scaled to norm 1."""
+    """Returns the mean vectors (N, D) of the words of all N actions, scaled to norm 1."""
     names, rows, vectors = _action_vectors()
     centers = np.array([vectors[rows == row].sum(0) for row in range(len(names))])
     return centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-9)

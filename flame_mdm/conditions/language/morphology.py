@@ -1,4 +1,4 @@
-"""Base forms of English words, from rules and a list of irregular forms."""
+"""Base forms of English words, based on rules and a list of irregular forms."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -10,10 +10,10 @@ VOWELS = "aeiou"
 
 @cache
 def base_forms(word: str) -> tuple[str, ...]:
-    """Returns the possible base forms of a word, the word itself first.
+    """Returns the possible base forms of a word, beginning with the word itself.
 
-    For "waving", these are waving, wav and wave. Not all of them are words, so the caller must
-    select the forms that it knows.
+    For "waving", these are waving, wav and wave. Not all of them are words, so callers must select
+    the forms that they know.
     """
     return tuple(dict.fromkeys([word, *_irregular().get(word, ()), *_stems(word)]))
 

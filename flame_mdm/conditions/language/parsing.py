@@ -65,9 +65,9 @@ def is_explained(word: str) -> bool:
 
 
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Returns the actions nearest in meaning to the words of a sentence that are in no table.
+    """Returns the actions that are nearest in meaning to the unexplained words of a sentence.
 
-    If all words are in the tables, all of them are used.
+    If all words are explained by the tables, all of them are used.
     """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
@@ -89,7 +89,7 @@ class _Sentence:
         self.clauses = parts.joined(self.clauses)
 
     def steps(self) -> list[Step]:
-        """Returns the actions in their order."""
+        """Returns the actions in the order in which they happen."""
         steps: list[Step] = []
         # Actions of "While walking,", which are added to the following clause
         during: list[Step] = []
@@ -140,7 +140,7 @@ class _Sentence:
     def _choose(self, clause: Clause) -> None:
         """Keeps the phrases of a clause that name its actions.
 
-        If there are none, a word with a meaning similar to an action is used.
+        If there are none, a word that is similar in meaning to an action is used.
         """
         strong = [match for match in clause.matches if not match.is_weak]
         if strong:
@@ -228,7 +228,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause happens during the previous clause: "stands still, waving"."""
+        """Returns whether a clause happens during the previous one: "stands still, waving"."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]
@@ -261,6 +261,6 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Returns a step without duplicates, and without "stands still" next to another action."""
+    """Removes duplicates from a step, and "stands still" if the step has another action."""
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

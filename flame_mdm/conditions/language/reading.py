@@ -1,4 +1,4 @@
-"""How a model reads a sentence: the captions that are passed to it, and the words that it does not know."""
+"""Reading of sentences: captions for the model, and words that it does not know."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -24,9 +24,9 @@ class Reading:
 
     Attributes:
         understanding: the understood content of the sentence.
-        steps: the actions to sample, in order; the model knows all of them.
+        steps: the actions to sample, in order. The model knows all of them.
         captions: one caption per step, for the model.
-        texts: the words of the sentence for each step.
+        texts: the words of the sentence that describe each step.
         changes: differences between the sentence and the sampled motion, one line each.
         ignored: words (as typed) and attributes (in words) that have no effect.
     """
@@ -47,7 +47,7 @@ class Reading:
         )
 
     def seconds(self) -> tuple[float | None, ...]:
-        """Returns the seconds that fit the stated count of each step, or None without a count."""
+        """Returns a duration in seconds for each step that states a count, or None otherwise."""
         counts = [
             step[0].attributes.get("count") if len(step) == 1 else None for step in self.steps
         ]
@@ -65,7 +65,7 @@ class Reader:
     """Reads sentences for a model whose captions each name one action from a list.
 
     Args:
-        facts: facts of the model: "actions", "vocabulary" and, if known, "captions".
+        facts: facts about the model: "actions", "vocabulary" and, if known, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -83,8 +83,9 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are not changed: training captions with an action that the model does
-        not list, and sentences whose words are in no table, but are all known to the model.
+        Two kinds of sentences are passed to the model unchanged: training captions with an action
+        that the model does not list, and sentences without a listed action whose unknown words are
+        all in the vocabulary of the model.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not
@@ -94,7 +95,7 @@ class Reader:
         understood = understand(sentence)
         if understood.is_foreign:
             raise UserError(
-                f"{_shown(text)}: texts are understood in English only. Write it in English"
+                f"{_shown(text)}: prompts are understood in English only. Write the prompt in English"
             )
         as_typed = Reading(understood, (), (text,), (text,))
         if not understood.steps:
@@ -164,7 +165,8 @@ class Reader:
         elif action != mention.action:
             instead = predicate(Mention(action, attributes))
             notes.changes.append(
-                f"the model does not know '{predicate(Mention(mention.action))}': it {instead} instead"
+                f"the model does not know '{predicate(Mention(mention.action))}': the person "
+                f"{instead} instead"
             )
         stated = dict(attributes)
         for name in ATTRIBUTES:
@@ -182,10 +184,10 @@ class Reader:
         return replace(mention, action=action, attributes=stated)
 
     def _known_action(self, mention: Mention) -> tuple[str | None, dict[str, Value]]:
-        """Returns a known action and the attributes that it needs.
+        """Returns a known action and the attributes that it requires.
 
-        If the model does not know the action itself, a nearly equivalent action is returned.
-        Returns None if there is no such action.
+        If the model does not know the action itself, a nearly equivalent action is returned, or
+        None if there is no such action.
         """
         if mention.action in self.abilities.actions:
             return mention.action, {}
@@ -195,9 +197,10 @@ class Reader:
         return None, {}
 
     def _possible(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns the steps that the model can sample instead of a step.
+        """Returns the steps that the model can sample for a step.
 
-        If the model knows no simultaneous actions, the actions follow each other.
+        If the model does not know simultaneous actions, the actions are sampled one after the
+        other.
         """
         distinct = tuple({mention.action: mention for mention in step}.values())
         if len(distinct) == 1 or self.abilities.is_simultaneous:
@@ -209,7 +212,7 @@ class Reader:
         return [(mention,) for mention in distinct]
 
     def _repeated(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns the steps that add up to the step's count.
+        """Returns steps that add up to the count of the given step.
 
         For example, "kicks four times" becomes two steps of "kicks twice".
         """
@@ -234,7 +237,7 @@ class Reader:
 class NotUnderstood(UserError):
     """Error for a sentence without an action that the model knows.
 
-    `nearest` contains captions with similar meanings.
+    `nearest` contains captions of the known actions that are nearest in meaning.
     """
 
     def __init__(self, message: str, nearest: Sequence[str]):
@@ -250,14 +253,14 @@ class NotUnderstood(UserError):
 
 @dataclass
 class _Notes:
-    """Lines about changes, and words without effect, collected while a sentence is read."""
+    """Lines about changes, and words without effect, that are collected during reading."""
 
     changes: list[str]
     ignored: list[str] = field(default_factory=list)
 
 
 def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
-    """Returns the steps, with two of them merged if the model knows the pair as one action.
+    """Merges pairs of successive steps that the model knows as one action.
 
     An example is "stretches both arms and leans to the left".
     """
@@ -291,8 +294,8 @@ def _shown(text: str) -> str:
 def _caption(step: Step, words: str, special: Set[str]) -> str:
     """Returns the caption of a step.
 
-    If the model knows a word of the sentence that no table explains, the caption contains the words
-    of the sentence.
+    If one of the words is in no table but in the vocabulary of the model, the words are used as the
+    caption unchanged.
     """
     return words if special & set(words.lower().split()) else caption(step)
 

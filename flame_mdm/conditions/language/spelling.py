@@ -5,7 +5,8 @@ from functools import cache
 from flame_mdm.conditions.language.morphology import inflections
 from flame_mdm.conditions.language.tables import GAP, actions, phrases, words_of
 
-# Maximum length of words that are never corrected: too many words are similar to them
+# Words with this number of letters or fewer are never corrected, because too many words are similar
+# to them
 NEVER_CORRECTED = 2
 FREQUENT = (
     "a",
@@ -25,7 +26,7 @@ FREQUENT = (
 
 
 def distance(first: str, second: str, most: int) -> int:
-    """Returns the number of edits between two words, or `most` + 1 if it exceeds `most`.
+    """Returns the number of edits between two words, or `most` + 1 if there are more than `most`.
 
     An edit inserts, removes or replaces a letter, or swaps two neighboring letters. This is the
     optimal string alignment distance (Damerau 1964; Levenshtein 1966).

@@ -17,7 +17,7 @@ class Phrase:
     """Words that name an action.
 
     Attributes:
-        words: base forms; `GAP` stands for up to four words.
+        words: base forms of the words; `GAP` stands for up to four arbitrary words.
         action: name of the action.
         attributes: attributes that the phrase states.
     """
@@ -28,13 +28,13 @@ class Phrase:
 
     @property
     def size(self) -> int:
-        """The number of words, without gaps."""
+        """The number of words, not counting gaps."""
         return len(self.words) - self.words.count(GAP)
 
 
 @dataclass(frozen=True)
 class ActionEntry:
-    """An action, with the attributes that it can have and its words in captions.
+    """An action, with the attributes that it can have and the words that describe it in captions.
 
     `actions.yaml` describes the fields.
     """
@@ -88,7 +88,7 @@ def actions() -> dict[str, ActionEntry]:
 
 @cache
 def phrases_by_first_word() -> dict[str, list[Phrase]]:
-    """Returns the phrases that name actions, by first word. The longest phrases are first."""
+    """Returns the phrases that name actions, by their first word. Longer phrases come first."""
     listed_at: dict[str, list[Phrase]] = {}
     for entry in actions().values():
         for phrase in entry.phrases:

@@ -1,4 +1,4 @@
-"""Words of a sentence, correction of typos, and detection of languages other than English."""
+"""Splitting of sentences into words, correction of typos, and detection of other languages."""
 
 import re
 import unicodedata
@@ -26,7 +26,7 @@ class Token:
     Attributes:
         typed: the word as typed.
         word: the word as read: in lower case and corrected.
-        start, end: position in the sentence.
+        start, end: position of the token in the sentence.
     """
 
     typed: str
@@ -36,7 +36,7 @@ class Token:
 
     @property
     def is_word(self) -> bool:
-        """Whether the token is a word, and not a punctuation mark."""
+        """Whether the token is a word rather than a punctuation mark."""
         return self.typed[0].isalnum()
 
     def has_form(self, *bases: str) -> bool:
@@ -54,10 +54,11 @@ def tokenize(text: str) -> list[Token]:
 
 
 def is_known(word: str) -> bool:
-    """Returns whether a word is English: any form is in the tables or a frequent word."""
+    """Returns whether a word is English: one of its forms is in the tables or is frequent."""
     if word.isdecimal() or word in _listed():
         return True
-    # Forms of short words do not count, because most are names: "tims"
+    # Base forms with three or fewer letters do not count, because most of these words are names,
+    # such as "tims"
     return any(form == word or len(form) > 3 for form in base_forms(word) if word_table().has(form))
 
 
@@ -104,7 +105,7 @@ def is_english(word: str) -> bool:
 def corrected(tokens: Sequence[Token]) -> list[Token]:
     """Returns the tokens with corrected typos.
 
-    A typo is an unknown word for which there are only a few similar known words.
+    An unknown word is a typo if it is similar to only a few known words.
     """
     return [
         _corrected(token) if token.is_word and not is_known(token.word) else token
@@ -115,7 +116,8 @@ def corrected(tokens: Sequence[Token]) -> list[Token]:
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
     """Returns the tokens, with one rare word replaced by an action that differs in one letter.
 
-    This function is for sentences in which no action is understood, such as "doge to the left".
+    This function is used for sentences in which no action is understood, such as "doge to the
+    left".
 
     Args:
         tokens: tokens of the sentence.

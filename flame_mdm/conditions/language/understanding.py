@@ -11,10 +11,10 @@ class Mention:
     """An action in a sentence.
 
     Attributes:
-        action: its name in `actions.yaml`.
+        action: name of the action in `actions.yaml`.
         attributes: side, count, direction, speed and amount, if the sentence states them.
-        text: the words of the sentence for the action.
-        start, end: position of its verb in the sentence.
+        text: the words of the sentence that describe the action.
+        start, end: position of the verb in the sentence.
         typed: the word that was read as this action because of its meaning, or "" if the sentence
             names the action.
     """
@@ -42,11 +42,11 @@ class Understanding:
     Attributes:
         text: the sentence as typed.
         steps: actions in order.
-        objects: words for things; they have no effect.
+        objects: words for things, which have no effect.
         unknown: words that are not understood, as typed.
-        corrected: words that were read as other words: typed word -> corrected word.
+        corrected: words that were read as other words, as a mapping from typed to corrected words.
         is_foreign: whether the sentence is not in English.
-        nearest: the three actions with the nearest meanings if no action is understood.
+        nearest: if no action is understood, the three actions that are nearest in meaning.
     """
 
     text: str

@@ -1,7 +1,7 @@
 """Meanings of words: a table of vectors for frequent English words and words for motion.
 
 `tools/word_vectors.py` distills the table from MiniLM (all-MiniLM-L6-v2, Apache License 2.0).
-`word_vectors.md` documents source and license.
+`word_vectors.md` documents the source and the license.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from flame_mdm.conditions.language.morphology import base_forms
 from flame_mdm.safe_io import read_npz
 
 FILE = Path(__file__).with_name("word_vectors.npz")
-SMOOTHING = 1e-4  # words with a higher frequency have less weight in a mean
+SMOOTHING = 1e-4  # words that are more frequent than this have little weight in a mean
 
 
 class WordTable:
-    """Vectors (N, D) of norm 1 for N words, most frequent first."""
+    """Vectors (N, D) of norm 1 for N words, with the most frequent words first."""
 
     def __init__(self, words: Sequence[str], vectors: np.ndarray):
         self.words = list(words)
@@ -41,8 +41,8 @@ class WordTable:
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
         """Returns the mean vector (D,) of words, scaled to norm 1, or None if all are missing.
 
-        Frequent words have less weight: smooth inverse frequency (Arora et al. 2017), with
-        frequencies from Zipf's law.
+        Frequent words have less weight (smooth inverse frequency, Arora et al. 2017). The
+        frequencies follow Zipf's law.
         """
         rows = [row for word in words if (row := self.rank(word)) is not None]
         if not rows:
@@ -58,6 +58,7 @@ def word_table() -> WordTable:
     """Returns the table that the package contains."""
     arrays = read_npz(FILE)
     words = arrays["words"].tobytes().decode().split("\n")
-    # 8 bits per number. The scale of each word is lost, but all vectors have length 1.
+    # The table has 8 bits per number. The lengths of the vectors are not stored, because all of
+    # them are 1.
     vectors = arrays["vectors"].astype(np.float32)
     return WordTable(words, vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

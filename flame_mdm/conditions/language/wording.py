@@ -24,7 +24,7 @@ PLURALS = {"hand": "hands", "arm": "arms", "leg": "legs"}
 
 
 def predicate(mention: Mention) -> str:
-    """Returns the words for an action and its attributes: "walks sideways to the left"."""
+    """Returns the words for an action and its attributes, such as "walks sideways to the left"."""
     entry, stated = actions()[mention.action], mention.attributes
     words = [entry.say]
     if "{side}" in entry.say:
@@ -50,7 +50,7 @@ def times(count: int) -> str:
 
 
 def caption(step: Sequence[Mention]) -> str:
-    """Returns the caption of simultaneous actions: "a person walks forward while waving"."""
+    """Returns the caption of simultaneous actions, such as "a person walks while waving"."""
     first, *others = (predicate(mention) for mention in step)
     return " while ".join([f"{WHO} {first}", *(_participle(other) for other in others)])
 

@@ -354,7 +354,7 @@ def test_check_and_preparation_agree_and_one_bad_file_stops_nothing(
     for said in (checked, prepared):
         with subtests.test(said=said):
             assert "mine/b.bvh, line 1" in said
-            assert "mine/one.npz: only 1 frames at 20 fps, but a motion needs at least 3" in said
+            assert "mine/one.npz: only 1 frames at 20 fps, but a motion requires at least 3" in said
             assert "error: 2 of 4 motions in mine cannot be prepared" in said
     store = Store(Path("data/ours-humanml-clean-smpl22"))
     assert [clip.id for clip in store.clips] == ["a", "c"]

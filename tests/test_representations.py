@@ -401,7 +401,7 @@ def test_bad_motions_and_options(subtests):
         ),
         (SMPL(), raw[:, :69], r"\(4, 69\)"),
         (Rot6D(), raw[:0], r"\(0, 75\)"),
-        (Motion272(), raw[:1], "1 frame, but encoding needs at least 2"),
+        (Motion272(), raw[:1], "1 frame, but encoding requires at least 2"),
         (Rifke(), bent, r"shape \(frames, 21, 3\) for rifke, but found \(5, 22, 3\)"),
     ):
         with subtests.test(motion=motion, message=message):

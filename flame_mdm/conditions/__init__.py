@@ -46,7 +46,7 @@ class ConditionEncoder(nn.Module, ABC):
             batch: captions in `batch.text`, or labels in `batch.action`.
 
         Returns:
-            The condition, with its null condition, on the device of `batch.x`.
+            The condition and its null condition, both on the device of `batch.x`.
 
         Raises:
             UserError: If the batch contains no captions or labels.
@@ -83,7 +83,7 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """Empty condition, whose vectors and tokens have width 0. The null condition is the same.
+    """Empty condition whose vectors and tokens have width 0. The null condition is the same.
 
     Example:
         >>> x = torch.zeros(2, 5, 3)

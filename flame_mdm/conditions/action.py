@@ -18,7 +18,7 @@ class ActionLabels(ConditionEncoder):
 
     Args:
         features: C, the width of the vectors.
-        num_actions: number of labels in the data set.
+        num_actions: number of action labels in the data set.
 
     Raises:
         UserError: If there are no labels.
@@ -44,7 +44,7 @@ class ActionLabels(ConditionEncoder):
         self.table = nn.Parameter(torch.randn(num_actions, features))
 
     def forward(self, batch: MotionBatch) -> Condition:
-        """Returns the vectors of the labels `batch.action` (B,).
+        """Returns the learned vectors of the labels `batch.action` (B,).
 
         Raises:
             UserError: If the batch contains no labels.

@@ -20,7 +20,7 @@ class ReadPrompt:
         unknown: words that never occur in the training captions, or that the model does not read.
         summary: one line that states how the prompt was understood, or "" unless each caption of
             the model describes a single action.
-        changes: lines about differences between the prompt and what is sampled.
+        changes: lines about differences between the prompt and the sampled motion.
         fitting: for each part, a duration in seconds that suits its stated number of repetitions,
             or None if it states no number. The tuple is empty if the captions do not describe
             single actions.
@@ -87,7 +87,7 @@ def _with_actions(
 ) -> ReadPrompt:
     """Reads a prompt for a model whose captions describe single actions.
 
-    Unless it is split, the prompt keeps its parts. If a part names several actions, the model reads
+    The prompt keeps its parts unless it is split. If a part names several actions, the model reads
     the words of the part unchanged.
     """
     readings: list[Reading]

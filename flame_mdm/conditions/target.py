@@ -1,12 +1,13 @@
-"""Target conditions: where joints should be at the end of a motion.
+"""Target conditions: requested positions of joints at the end of a motion.
 
 Source: Tevet et al. 2025, "CLoSD", section 3.1. A target (B, 8, 4) contains a slot for each name in
 `SLOTS`. Each slot contains x, y, z, and a flag, which is 1 if the slot is requested and 0 if it is
 free. All values of a free slot are 0.
 
 Positions are in meters relative to the first predicted frame, whose root is at x = z = 0 and faces
-+z. y is the height above the floor. "traj" is the pelvis projected onto the floor, y = 0. The x of
-"heading" is the direction that the hips and shoulders face, in radians: 0 = +z, positive toward +x.
++z. y is the height above the floor. "traj" is the position of the pelvis projected onto the floor
+(y = 0). The x of "heading" is the direction that the hips and shoulders face, in radians: 0 = +z,
+positive toward +x.
 """
 
 import math
@@ -36,15 +37,15 @@ class TargetConditions:
     """Draws targets for training motions and computes the error of predicted motions.
 
     Args:
-        joints: names of the skeleton's joints, in the order of its positions.
-        facing: joint indices of right hip, left hip, right shoulder and left shoulder.
+        joints: names of the skeleton's joints, in the order of the joint positions.
+        facing: joint indices of the right hip, left hip, right shoulder and left shoulder.
         choices: sets of slots. For each training motion, one of the sets is drawn with equal
             probability. An empty set results in a target that requests nothing, which differs from
             having no target.
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
         heading_modulo_pi: whether to compute the error of the heading modulo pi, as in MDM's code.
-            A body that faces backwards then has no error.
+            The error of a body that faces backwards is then 0.
 
     Raises:
         UserError: If the skeleton lacks a joint, if a choice is unknown, or if the probability is

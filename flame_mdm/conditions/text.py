@@ -34,16 +34,16 @@ class PretrainedText(ConditionEncoder):
     cache.
 
     Args:
-        model: name on the Hugging Face hub, or a folder.
+        model: name of the language model on the Hugging Face hub, or its folder.
         features: C, the width of the model's outputs.
         max_tokens: maximum number of word pieces per caption, including special tokens. Longer
             captions are truncated.
         pooling: how a caption is converted to one vector. "projection" is CLIP's projected,
             unnormalized text embedding. "mean" is the mean of the real tokens, including special
-            tokens (Reimers & Gurevych 2019). "pooler" is tanh of a linear map of the first token,
-            as in BERT. RoBERTa is published without this map, and transformers initializes it with
-            new random numbers each time. FLAME was trained with one such map. In this
-            implementation, the map is drawn with a fixed seed, and a released checkpoint can
+            tokens (Reimers & Gurevych 2019). "pooler" is the first token after a linear map and
+            tanh, as in BERT. RoBERTa is published without this map, and transformers initializes it
+            with new random numbers each time. FLAME was trained with one of these random maps. In
+            this implementation, the map is drawn with a fixed seed, and a released checkpoint can
             replace it.
         revision: full 40-digit commit hash on the hub; required for models from the hub.
         package: installed Python package from which the files are loaded instead of the hub. In
@@ -62,9 +62,9 @@ class PretrainedText(ConditionEncoder):
             motion model.
 
     Raises:
-        UserError: When a caption is encoded, if the model is not pinned to a revision, if its file
-            differs from the published file, or if its width is not `features`.
-        FileNotFoundError: When a caption is encoded, if the model is neither in the cache nor
+        UserError: If a caption is encoded with a model that is not pinned to a revision, whose file
+            differs from the published file, or whose width is not `features`.
+        FileNotFoundError: If a caption is encoded with a model that is neither in the cache nor
             available for download.
 
     Example:
@@ -176,7 +176,7 @@ class PretrainedText(ConditionEncoder):
         return self._cache.pooled.nbytes + self._cache.tokens.nbytes
 
     def move_cache(self, device: torch.device) -> None:
-        """Moves the opened encodings to a device."""
+        """Moves the cached encodings to a device."""
         if self._cache is not None:
             self._cache.pooled, self._cache.tokens = (
                 self._cache.pooled.to(device),
@@ -184,9 +184,9 @@ class PretrainedText(ConditionEncoder):
             )
 
     def _distinct(self, captions: Sequence[str]) -> list[str]:
-        """Returns each caption once, and "" for the null condition.
+        """Returns the distinct captions, including "" for the null condition.
 
-        The longest captions are first, so that the captions of a batch have similar lengths.
+        The longest captions come first, so that the captions of a batch have similar lengths.
         """
         return sorted({*captions, ""}, key=lambda caption: (-len(caption), caption))
 
@@ -198,7 +198,7 @@ class PretrainedText(ConditionEncoder):
         return Path(folder) / f"{Path(source.model).name}-{key[:16]}.safetensors"
 
     def _pool(self, first: Tensor) -> Tensor:
-        """Applies the part of the pooling that is not cached: (N, C) -> (N, C)."""
+        """Applies the part of the pooling that is not cached to vectors (N, C)."""
         if self.pooling == "pooler":
             first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
         return nn.functional.normalize(first, dim=-1) if self.normalize else first
@@ -394,7 +394,7 @@ class EncodedCaptions:
             raise UserError(f"{path} is damaged ({error})") from error
 
     def save(self, path: Path) -> None:
-        """Writes the content to a .safetensors file."""
+        """Writes the encoded captions to a .safetensors file."""
         arrays = {
             "pooled": self.pooled,
             "tokens": self.tokens,

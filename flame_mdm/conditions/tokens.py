@@ -1,4 +1,4 @@
-"""A small text encoder that is trained with the model and needs no download."""
+"""A small text encoder that is trained with the model and requires no download."""
 
 from collections.abc import Sequence
 
@@ -40,7 +40,7 @@ class LearnedTokens(ConditionEncoder):
 
     Args:
         features: C, the width of the tokens and of the pooled vector.
-        buckets: rows of the word table.
+        buckets: number of rows in the word table.
         max_words: maximum number of words per caption. Additional words are dropped.
         heads: number of attention heads, which must divide `features`.
         dropout: probability of dropout in the transformer layer.
@@ -101,7 +101,7 @@ class LearnedTokens(ConditionEncoder):
         return [vocabulary.hashed(word, self.buckets) for word in [START, *words[: self.max_words]]]
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
-        """Trains with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
+        """Trains the encoder with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
         Pooled vectors of captions for the same clip are pulled together, and pooled vectors of
         different clips are pushed apart. Each step compares two captions from each of `PAIRS`

@@ -207,9 +207,9 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
     Text is split at sentence boundaries and at "then". With `verbs`, it is also split at each comma
     that is followed by a verb. After such a comma, an "and" before a verb also splits the text.
-    Otherwise, "and" does not: "raises both hands and waves" is one action. A part without a verb is
-    joined with its neighbor. A style at the end, such as "in limp style", is added to all parts.
-    Adapters teach such styles.
+    Otherwise, "and" does not split the text: "raises both hands and waves" is one action. A part
+    without a verb is joined with its neighbor. A style at the end, such as "in limp style", is
+    added to all parts. Adapters teach such styles.
 
     Args:
         text: the sentence.
@@ -244,7 +244,7 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
 @cache
 def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[str]]:
-    """Returns the patterns of a comma and of an "and" that are followed by a verb."""
+    """Returns patterns for a comma and for an "and", each followed by a verb."""
     finite = (
         "|".join(re.escape(verb) for verb in sorted(verbs) if not verb.endswith("ing")) or "(?!)"
     )

@@ -116,7 +116,7 @@ class MotionSource(ABC):
         return Counter()
 
     def leave_out(self, reason: str, count: int = 1) -> None:
-        """Counts clips that are left out."""
+        """Adds `count` to the number of clips that are left out for this reason."""
         if count:
             self.excluded[reason] += count
 
@@ -219,7 +219,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice, with a leading space, for a split without clips.
+    """Returns advice about a split without clips, with a leading space.
 
     The advice is "" for published data sets, because their splits are fixed.
     """

@@ -113,7 +113,7 @@ def styled(caption: str, name: str) -> str:
 def check_clips(path: str | Path, fps: float) -> None:
     """Checks the motions in a folder before training.
 
-    Prints the skeletons of the motions, and which of their parts were left out.
+    Prints the skeletons of the motions, and the parts of them that were left out.
 
     Raises:
         UserError: If a motion cannot be read, its floor rises, or its body floats.
@@ -175,7 +175,7 @@ class LessonData(MotionDataModule):
     """Data module for a `Lesson`. Half of the clips in each batch are the user's clips."""
 
     def halves(self) -> list[np.ndarray]:
-        """Returns the indices of the user's training clips, and the indices of the prior store's clips."""
+        """Returns the indices of the user's training clips and of the known clips."""
         is_kept = np.array([clip.id.startswith(KEPT) for clip in self.train.clips])
         if is_kept.all():
             raise UserError(

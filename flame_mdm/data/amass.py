@@ -44,8 +44,8 @@ class Recording(NamedTuple):
 
     Args:
         poses: (F, 156), axis-angle vectors of SMPL+H's 52 joints.
-        translation: (F, 3) in meters, z up.
-        betas: shape of the body.
+        translation: (F, 3) positions in meters, with z up.
+        betas: shape parameters of the body.
         gender: "male", "female" or "neutral".
         fps: frames per second.
     """
@@ -57,7 +57,7 @@ class Recording(NamedTuple):
     fps: float
 
     def every(self, fps: float) -> Recording:
-        """Returns every int(self.fps / fps)-th frame, as HumanML3D and FLAME do.
+        """Keeps every int(self.fps / fps)-th frame, as HumanML3D and FLAME do.
 
         Recordings at 59.94 or 250 Hz then have about `fps` frames per second.
 
@@ -67,12 +67,12 @@ class Recording(NamedTuple):
         step = int(self.fps / fps)
         if step < 1:
             raise UserError(
-                f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}"
+                f"recorded at {self.fps:g} frames per second, which is fewer than the requested {fps:g}"
             )
         return self.cut(slice(None, None, step))
 
     def cut(self, frames: slice) -> Recording:
-        """Returns a slice of the frames, with the same body."""
+        """Returns the recording of the same body with only a slice of its frames."""
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:
@@ -137,7 +137,7 @@ def read(file: Path | bytes, name: str) -> Recording:
 
 @dataclass
 class Amass:
-    """A folder with AMASS as downloaded archives, unpacked subsets, or both."""
+    """A folder that contains AMASS as downloaded archives, as unpacked subsets, or as both."""
 
     root: Path
 
@@ -188,8 +188,8 @@ class Amass:
         Yields pairs (key, result), sorted by key.
 
         Args:
-            arguments: argument of the function for each recording, by the recording's key.
-                Keys and arguments must be picklable.
+            arguments: mapping from the key of each recording to the argument of the function. Keys
+                and arguments must be picklable.
             function: called as `function(argument, recording)`. It must be picklable.
             workers: number of processes; 0 = one per core.
         """

@@ -62,8 +62,8 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
     """Returns `path` if it is a folder, or a temporary folder with the `members` of the archive.
 
-    The temporary folder is removed when `owner` is garbage-collected. The result is its deepest
-    subfolder that contains all members.
+    The temporary folder is removed when `owner` is garbage-collected. The result is the deepest
+    folder inside it that contains all members.
 
     Raises:
         UserError: For the same reasons as `members`, and if a member would be unpacked outside

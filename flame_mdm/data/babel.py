@@ -90,7 +90,7 @@ class Babel(MotionSource):
         return {"labels": sum(1 for file in files for _ in self._annotations(file))}
 
     def count(self) -> int:
-        """Returns the number of clips, which requires the labels and the lengths of the motions."""
+        """Returns the number of clips, computed from the labels and the lengths of the motions."""
         return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
@@ -199,7 +199,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 def _starts(label: Label, frames: int) -> tuple[range, str]:
     """Returns the first frame of each clip for a label, and the reason if there is no clip.
 
-    `frames` is the number of frames of the motion.
+    `frames` is the number of frames in the motion.
     """
     none = range(0)
     if label.text == "transition":

@@ -249,7 +249,7 @@ def _standard(tree: bvh.Bvh) -> tuple[bvh.Bvh, dict[str, Any]]:
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
-    """Converts a take to an SMPL motion (F, 75) float32 in AMASS's axes, z up.
+    """Converts a take to an SMPL motion (F, 75) float32 in AMASS's axes, with z up.
 
     Each frame contains the position of the pelvis in meters and the axis-angle vectors of 24
     joints. The hands (22 and 23) do not rotate.

@@ -20,8 +20,7 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields the rows of a caption table.
 
-    Each row is a pair of its location (file and line), which error messages name, and its cells by
-    column.
+    Each row is a pair: its location (file and line) for error messages, and its cells by column.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in
@@ -34,7 +33,7 @@ def table_rows(
         names = list(rows.fieldnames or ())
         if "id" not in names or len(names) > len(set(names) & set(columns)):
             raise UserError(
-                f"its columns are {str(names)[:200]}; use {', '.join(columns)} (only id is required)"
+                f"its columns are {str(names)[:200]}. Use only {', '.join(columns)}; id is required"
             )
         for row in rows:
             where = f"{path}, line {rows.line_num}"

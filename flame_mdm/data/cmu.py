@@ -1,9 +1,9 @@
 """The CMU motion capture database, with captions from HumanML3D, KIT-ML or the user.
 
-The motions are from http://mocap.cs.cmu.edu, as ASF/AMC or converted to BVH. They are free for all
-uses.
-Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML).
-`docs/cmu.md` lists the required downloads, and how this data differs from HumanML3D and KIT-ML.
+The motions from http://mocap.cs.cmu.edu are read as ASF/AMC files, or as conversions to BVH. They
+are free for all uses. Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data
+2016 (KIT-ML). `docs/cmu.md` lists the required downloads, and how this data differs from HumanML3D
+and KIT-ML.
 """
 
 import re
@@ -152,7 +152,7 @@ class CMU(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, list[Path]]:
-        """Files of each recording, best file first.
+        """Files of each recording, with the best file first.
 
         Recordings that are known to be bad are left out.
         """
@@ -330,7 +330,9 @@ class CMU(MotionSource):
                     action = None if item.action is None else self.actions.index(item.action)
                     yield replace(clip, action=action)
         if len(self._errors) == len(tasks):
-            raise UserError(f"{self.path}: no recording can be read; {self._errors[0]}")
+            raise UserError(
+                f"{self.path}: no recording can be read. The first error is: {self._errors[0]}"
+            )
 
     def counts(self) -> Mapping[str, float]:
         """Returns how many HumanML3D clips and captions were read."""
@@ -473,9 +475,9 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording with `frames` frames.
 
-    Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. They
-    are followed by CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has
-    the lowest priority, because conversions state 120 for nearly all recordings.
+    Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. The
+    next source is CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has the
+    lowest priority, because conversions state 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -550,8 +552,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
 def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
     """Returns a tree with additional joints.
 
-    Each keyword is the name of a joint, and its value is the parent and the offset (3,) of the
-    joint.
+    The keyword arguments map the name of each new joint to its parent and its offset (3,).
     """
     return replace(
         tree,

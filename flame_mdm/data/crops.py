@@ -163,7 +163,7 @@ class Clips(Dataset[Sample]):
         return self.__getitems__([draw])[0]
 
     def __getitems__(self, draws: Sequence[Draw]) -> list[Sample]:
-        """Returns the samples of a batch. Called by the data loader."""
+        """Returns the samples of a batch. The data loader calls this method."""
         samples: list[Sample] = []
         indices = [index for index, _ in draws]
         for index, first, length, caption in zip(
@@ -200,7 +200,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """Index of the caption used for each clip in evaluation, derived from the id of the clip."""
+        """Index (clips,) of each clip's caption in evaluation, derived from the id of the clip."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

@@ -76,7 +76,7 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns batches that contain every clip exactly once across all ranks, longest first."""
+    """Returns batches that contain each clip once across all ranks; the longest clips come first."""
     mine = np.argsort(-lengths, kind="stable")[rank::world]
     return [
         [(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)
@@ -162,7 +162,7 @@ class MotionDataModule(LightningDataModule):
         self.prepare_data_per_node = False  # all machines share the folder
 
     def prepare_data(self) -> None:
-        """Writes the store if it does not exist. Lightning calls this on only one rank."""
+        """Writes the store if it does not exist. Lightning calls this method on only one rank."""
         if (self.folder / "store.json").exists():
             say(*self.source.changed(self.folder / "store.json"))
         else:
@@ -266,7 +266,7 @@ class MotionDataModule(LightningDataModule):
         return self.device
 
     def clips(self, split: Split) -> Clips:
-        """Returns the clips of a split with their crop rule.
+        """Returns the clips of a split, which are cropped when they are drawn.
 
         If the published split has no test clips, as in HumanAct12, the training clips are used for
         testing.

@@ -129,7 +129,7 @@ class Folder(MotionSource):
         self._representation: Representation | None = None
 
     def suit(self, representation: Representation) -> None:
-        """Configures the source for a representation, so that `clips` yields raw motions for it.
+        """Configures the source so that `clips` yields raw motions for a representation.
 
         Raises:
             UserError: If `motion` does not fit the representation.
@@ -335,7 +335,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
     """Inserts a word before the captions of some actions.
 
     Args:
-        prefixes: the word to insert, by action.
+        prefixes: the word to insert for each action.
         notes: captions and labels of all motions.
         table: the file that lists the actions, named in the error message.
 
@@ -358,7 +358,7 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
 
     Args:
         folder: the folder named in the error message.
-        uprights: `upright` of each motion (see `Doubts`), by layout.
+        uprights: for each layout, the value `upright` of each motion; see `Doubts`.
     """
     for layout, values in uprights.items():
         if np.median(values) < LYING:
@@ -403,7 +403,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
     """Adds the cells of a table row to the note of its motion."""
     name, split = cells["id"], cells.get("split")
     if name not in notes:
-        raise UserError(f"unknown motion {name!r}; ids are paths in the folder, without extension")
+        raise UserError(f"unknown motion {name!r}. Ids are paths in the folder, without extension")
     if split:
         known_split(split)
     note = notes[name]
@@ -438,7 +438,7 @@ def _read(
 
     The motion has `fps` frames per second. Without a `representation`, the joints are SMPL's 22
     joints, and rotations are in AMASS's axes. For KIT-ML's representations, the joints are KIT-ML's
-    21 joints. For representations in camera axes, the rotations are in these axes.
+    21 joints. If the representation uses camera axes, the rotations use them as well.
     """
     path = file.path
     try:
@@ -448,7 +448,7 @@ def _read(
             raise UserError(f"{path}: {doubts.jump}")
         if len(joints) < SHORTEST:
             raise UserError(
-                f"{path}: only {len(joints)} frames at {fps:g} fps, but a motion needs at least {SHORTEST} frames"
+                f"{path}: only {len(joints)} frames at {fps:g} fps, but a motion requires at least {SHORTEST} frames"
             )
         notes = [note for note in recording.motion.notes if note not in doubts.lines]
         of_kit = representation is not None and representation.skeleton is KIT21

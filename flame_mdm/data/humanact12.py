@@ -1,4 +1,4 @@
-"""HumanAct12: 1,191 clips of 12 actions, as the SMPL poses published by ACTOR's authors.
+"""HumanAct12: 1,191 clips of 12 actions, as SMPL poses published by ACTOR's authors.
 
 Sources: Guo et al. (Action2Motion), ACM MM 2020; poses by Petrovich et al. (ACTOR), ICCV 2021.
 See `docs/actions.md`.
@@ -140,7 +140,7 @@ def find(path: Path, name: str) -> Path:
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns the named lists in a pickled dictionary, which must have equal lengths."""
+    """Returns the named lists, which must have equal lengths, from a pickled dictionary."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (

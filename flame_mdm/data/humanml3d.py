@@ -84,7 +84,7 @@ def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
 
 
 class HumanML3D(T2MFolder):
-    """The processed folder with 263 features (Guo et al., CVPR 2022).
+    """Reader for the processed folder with 263 features per frame (Guo et al., CVPR 2022).
 
     Args:
         path: the folder, which must contain texts and splits.

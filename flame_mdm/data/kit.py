@@ -22,7 +22,7 @@ UNITS_PER_METER = 640
 
 
 class KIT(T2MFolder):
-    """The processed folder with 251 features (Guo et al., CVPR 2022)."""
+    """Reader for the processed folder with 251 features per frame (Guo et al., CVPR 2022)."""
 
     name = "kit"
     representation = "humanml-legacy-kit21"
@@ -34,11 +34,11 @@ class KIT(T2MFolder):
 class KITTemos(MotionSource):
     """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
 
-    The recordings have 100 frames per second, of which every eighth frame is used. Source:
-    Petrovich, Black, Varol, "TEMOS", ECCV 2022; FLAME follows its rules. The training and
-    validation splits leave out motions of fewer than 10 or more than 500 frames. The test split
-    keeps all motions, but only the first caption of each. The attribute `ghosh_test` states whether
-    a clip is in Ghosh et al.'s test split.
+    The recordings have 100 frames per second, and every eighth frame is used. Source: Petrovich,
+    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. The training and validation
+    splits leave out motions of fewer than 10 or more than 500 frames. The test split keeps all
+    motions, but only the first caption of each. The attribute `ghosh_test` states whether a clip is
+    in Ghosh et al.'s test split.
 
     `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
     contains TEMOS's lists of these numbers.

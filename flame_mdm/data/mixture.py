@@ -114,6 +114,6 @@ class Mixture(MotionSource):
             part.suit(representation)
 
     def check(self, fps: float) -> list[str]:
-        """Checks the licenses, and returns the lines that the parts print about their files."""
+        """Checks the licenses, and returns the lines to print about the files of all parts."""
         self.check_licenses()
         return [line for part in self.parts.values() for line in part.check(fps)]

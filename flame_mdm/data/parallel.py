@@ -130,8 +130,8 @@ def _first(pending: deque[Future[Result]]) -> Result:
 def _start_worker() -> None:
     """Sets up a worker process.
 
-    The process uses a single thread, ignores Ctrl-C, which the parent process handles, and exits if
-    the parent process dies.
+    The process uses a single thread, exits if the parent process dies, and ignores Ctrl-C, which
+    the parent process handles.
     """
     # torch reads this variable when a task imports torch. Importing torch here would slow down
     # tasks that do not need it.

@@ -80,7 +80,7 @@ class ResidentLoader:
         clips: clips of the split.
         batches: the draws that make up each batch.
         features: (N + 1, D), as returned by `resident_features`.
-        multiple: number of frames. The length of each batch is padded to a multiple of it.
+        multiple: each batch is padded to a multiple of this number of frames.
     """
 
     def __init__(

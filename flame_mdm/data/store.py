@@ -12,7 +12,7 @@ changed:
     store.json       representation, frame rate, options of the source, counts, hashes of the other
                      files, fingerprint
 
-Verification adds a report to the folder, `verify.json`.
+Verification adds the report `verify.json` to the folder.
 """
 
 import hashlib
@@ -62,7 +62,7 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 @dataclass(frozen=True)
 class Entry:
-    """One clip of a store: frames `start` to `start + length` of the packed array.
+    """One clip of a store: `length` frames of the packed array, beginning with frame `start`.
 
     All other fields have the same meaning as in `Clip`.
     """
@@ -204,7 +204,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     existing intact store is replaced.
 
     Raises:
-        UserError: If `folder` contains anything but an intact store.
+        UserError: If `folder` contains anything other than an intact store.
     """
     source.suit(representation)
     total, before = source.count(), (folder / "store.json").exists()
@@ -224,7 +224,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 
 def _replaceable(folder: Path) -> list[Path]:
-    """Returns the files of the store in a folder, `store.json` first.
+    """Returns the files of the store in a folder, with `store.json` first.
 
     The list is empty if the folder is missing or empty.
 

@@ -1,8 +1,8 @@
 """The synthetic data set: procedural motions with captions and exact attributes.
 
-It needs no download. `docs/synthetic.md` describes the grammar of the captions and the limitations
-of the data set. To add an action, add its motion to `synthetic_motions`, a line to `MORE` in
-`synthetic_actions`, and its captions to `synthetic_more.yaml`.
+It requires no download. `docs/synthetic.md` describes the grammar of the captions and the
+limitations of the data set. To add an action, add its motion to `synthetic_motions`, a line to
+`MORE` in `synthetic_actions`, and its captions to `synthetic_more.yaml`.
 """
 
 import re
@@ -212,7 +212,7 @@ def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> 
 
 
 class Synthetic(MotionSource):
-    """Procedural motions of SMPL's 22 joints, with y up and with captions.
+    """Procedural motions of SMPL's 22 joints (y up), with captions and exact attributes.
 
     Each clip shows one action or, with `actions="all"`, sometimes two actions at once. The body
     starts at the origin and faces +z. Clip number n depends only on n, the seed, and the options

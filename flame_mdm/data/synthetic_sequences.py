@@ -162,7 +162,7 @@ def _moved(
 ) -> Body:
     """Returns a body that moves through the action.
 
-    If the action is endless and not `whole`, its end is cut off.
+    If the action is endless and `whole` is False, its end is cut off.
     """
     action = ACTIONS[str(attributes["action"])]
     shortest = max(SECONDS[0], 0.35 + 0.8 * int(attributes.get("count", 0)), action.seconds)

@@ -140,7 +140,7 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 
 
 class T2MFolder(MotionSource):
-    """Reader for a folder in the layout shown above.
+    """Reader for a processed folder in the layout that this module describes.
 
     Cuts and mirrored copies are in the same split as their motion. The attribute `tokens` contains
     the words with their parts of speech, one list per caption. Mirrored copies have names of their
@@ -262,7 +262,7 @@ class T2MFolder(MotionSource):
         return array
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        """Counts a motion without items under its reason, or the captions of it that are left out."""
+        """Records why a motion has no items, or how many of its captions are left out."""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
         elif frames >= MAX_LENGTH:

@@ -121,7 +121,7 @@ class Representation(nn.Module, ABC):
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns the mean and std (D,) for normalization, computed from all training frames (N, D).
 
-        Representations without `slices` are not normalized: their mean is 0 and their std is 1.
+        Without `slices`, features are not normalized: the mean is 0 and the std is 1.
         """
         if self.slices:
             return grouped_statistics(features, self.slices.values())

@@ -40,14 +40,14 @@ class HumanML(Representation):
     Motions are first made canonical: the lowest joint is at y = 0, and in the first frame, the
     root is at x = z = 0 and the body faces +z.
 
-    The variant "legacy" equals the published data with all its peculiarities. The direction across
-    the body is the direction across the shoulders minus the direction across the hips, instead of
-    their sum. In the first frame, the heading is 0, although the smoothed heading is not. `turn` is
-    half the turn to the right, and changes its sign where the heading crosses 180 degrees. The root
-    velocity is in the body coordinates of the next frame. Rotations are world rotations of the
-    bones relative to the inverse heading, also at the shoulders. `decode` equals the published
-    decoding. If a bone is exactly opposite to its rest direction, the published code returns NaN.
-    This implementation returns a half turn instead.
+    The variant "legacy" reproduces the published data with all its peculiarities. The direction
+    across the body is the direction across the shoulders minus the direction across the hips,
+    instead of their sum. In the first frame, the heading is 0, although the smoothed heading is
+    not. `turn` is half the turn to the right, and changes its sign where the heading crosses 180
+    degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
+    rotations of the bones relative to the inverse heading, also at the shoulders. `decode` is also
+    the published decoding. If a bone is exactly opposite to its rest direction, the published code
+    returns NaN. This implementation returns a half turn instead.
 
     The variant "clean" has none of these peculiarities. Headings are unwrapped and padded
     point-symmetrically at both ends before they are smoothed, which preserves steady turns and the
@@ -66,7 +66,7 @@ class HumanML(Representation):
             its own lengths.
         units_per_metre: units of the features per meter.
         contact_threshold: squared displacement of a foot per frame, in the features' unit, below
-            which the foot is in contact. HumanML3D uses 0.002, KIT 0.05.
+            which the foot is in contact. HumanML3D uses 0.002, and KIT uses 0.05.
 
     Raises:
         UserError: If the skeleton is unknown, or if `bone_lengths` do not fit the skeleton.
@@ -162,7 +162,7 @@ class HumanML(Representation):
 
     @property
     def turn_unit(self) -> float:
-        """Radians to the left per unit of the column `turn`."""
+        """Heading change to the left, in radians, per unit of the column `turn`."""
         return -2.0 if self.legacy else 1.0
 
     def root_steps(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -203,7 +203,7 @@ class HumanML(Representation):
                 )
             if len(motion) < 3:
                 raise UserError(
-                    f"{name}: only {len(motion)} frames, but encoding needs at least 3. Exclude it"
+                    f"{name} has only {len(motion)} frames, but encoding requires at least 3. Exclude it"
                 )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]
@@ -236,8 +236,8 @@ class HumanML(Representation):
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns the x and z (N, 2) of the direction that the hips and shoulders face.
 
-        The direction is the cross product of the vertical and the direction to the right. It is
-        shorter if the body lies on its side. `hips` is the weight of the hips.
+        The direction is the cross product of the vertical and the direction to the right. The
+        vector is shorter if the body lies on its side. `hips` is the weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[
             :, list(self.skeleton.facing)
@@ -265,7 +265,7 @@ class HumanML(Representation):
     def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
         """Returns the shortest arcs from the rest directions to the bones.
 
-        The arcs (N, J - 1, 6) are 6D columns. They are relative to the arc of the parent.
+        The arcs (N, J - 1, 6) are 6D columns. Each arc is relative to the arc of the parent.
         """
         rest = joints.new_tensor(self.skeleton.raw_offsets)
         arcs = rotation.between(rest, self.skeleton.bones(joints))

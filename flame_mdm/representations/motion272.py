@@ -52,7 +52,9 @@ class Motion272(Representation):
         """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
-            raise UserError("motion: only 1 frame, but encoding needs at least 2. Exclude it")
+            raise UserError(
+                "the motion has only 1 frame, but encoding requires at least 2. Exclude it"
+            )
         # Z up -> y up
         axes = torch.tensor(
             [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64
@@ -66,8 +68,8 @@ class Motion272(Representation):
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
         """Returns features (F, 272) float32 for joint positions and rotations (F, 22, 3, 3).
 
-        The joint positions are (F, 22, 3). In both, y is up, and the body faces +z in the first
-        frame.
+        The joint positions have the shape (F, 22, 3). In both arguments, y is up, and the body
+        faces +z in the first frame.
         """
         joints = joints.double() - torch.stack(
             [joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]]

@@ -126,9 +126,10 @@ class Rifke(Representation):
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:
-    """Interpolates linearly between the T frames of (T, ...), to ((T - 1) * factor + 1, ...).
+    """Increases the frame rate of frames (T, ...) by a factor, with linear interpolation.
 
-    TEMOS is evaluated at 100 frames per second, 8 times the rate of the features.
+    The result has (T - 1) * factor + 1 frames. TEMOS is evaluated at 100 frames per second, 8 times
+    the rate of the features.
     """
     steps = torch.arange((len(joints) - 1) * factor + 1)
     begin = (steps // factor).clamp(max=max(len(joints) - 2, 0))

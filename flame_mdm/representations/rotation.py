@@ -126,7 +126,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
     """Returns a bool tensor (..., 1) that is True where two vectors (..., 6) define no rotation.
 
     `first` and `across` are the results of `_orthogonal`. If the vectors are parallel, `across`
-    consists of rounding errors. NaN is not degenerate, so it stays NaN.
+    consists of rounding errors. Vectors with NaN do not count as degenerate, so they stay NaN.
     """
     length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
     parallel = (
@@ -212,7 +212,7 @@ def inverse(quaternion: Tensor) -> Tensor:
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Rotates vectors (..., 3) by unit quaternions (..., 4). The leading shapes broadcast."""
+    """Rotates vectors (..., 3) by unit quaternions (..., 4). The leading shapes are broadcast."""
     xyz, vector = torch.broadcast_tensors(quaternion[..., 1:], vector)
     twice = 2 * torch.linalg.cross(xyz, vector)
     return vector + quaternion[..., :1] * twice + torch.linalg.cross(xyz, twice)

@@ -66,7 +66,7 @@ class Skeleton:
         )
 
     def mirror(self, joints: Tensor) -> Tensor:
-        """Returns the mirror image of joints (..., J, 3).
+        """Returns the mirror image of joint positions (..., J, 3).
 
         The sign of x is changed, and left and right joints are swapped.
         """
@@ -276,7 +276,7 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the sorted indices of the joints with these names, or in body parts with these names.
+    """Returns the sorted indices of the joints that are named, or are in named body parts.
 
     Raises:
         UserError: If a name is unknown. The message suggests similar names.

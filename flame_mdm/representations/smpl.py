@@ -58,9 +58,9 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """The 147 unnormalized features of Kim et al. 2023 (FLAME).
 
-    The features are the translation (3) and 24 rotations as 6D rows. They are in AMASS's world
-    coordinates: in meters, with z up, and neither centered nor rotated. `read_pose` describes raw
-    motions.
+    The features are the translation (3) and 24 rotations as 6D rows. Like AMASS, they use world
+    coordinates in meters, with z up, and are neither centered nor rotated. `read_pose` describes
+    raw motions.
 
     Args:
         fps: frames per second.

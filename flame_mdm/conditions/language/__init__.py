@@ -1,1 +1,1 @@
-"""Understanding of English prompts, independent of a model: actions, attributes and order."""
+"""Understanding of English prompts, independent of any model: actions, attributes and order."""

@@ -29,7 +29,7 @@ class Reader:
 
     Args:
         entry: the action.
-        tokens: tokens of the sentence.
+        tokens: words and punctuation marks of the sentence.
         numbers: indices of the tokens that belong to the action.
         verb: indices of the tokens in the phrase that names the action.
     """
@@ -127,7 +127,7 @@ class Reader:
         self._state("direction", self._around(value), number)
 
     def _around(self, value: str) -> str:
-        """Returns a direction. In circles, left means counterclockwise, right means clockwise."""
+        """Returns a direction. In a circle, left is counterclockwise and right is clockwise."""
         earlier = str(self.attributes.get("direction", ""))
         turns = {"left": "counterclockwise", "right": "clockwise"}
         if earlier == "circle":

@@ -121,7 +121,7 @@ def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
 
 
 def joined(clauses: Sequence[Clause]) -> list[Clause]:
-    """Merges clauses, so that each of them has an action.
+    """Merges clauses so that each one has an action.
 
     A clause without an action is merged with the previous clause or, if it is the first clause,
     with the next one. A clause such as "then faster" is not merged, because it repeats the previous

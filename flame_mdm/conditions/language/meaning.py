@@ -1,4 +1,4 @@
-"""Meanings of words that are in no table: the nearest actions, and whether a word names a thing."""
+"""Meanings of words that are in no table: nearest actions, and detection of words for things."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -40,7 +40,7 @@ def similarity(action: str, other: str) -> float:
 
 
 def similar_word(word: str, words: Sequence[str]) -> str | None:
-    """Returns the word of `words` that is most similar in meaning to `word`.
+    """Returns the word in `words` that is most similar in meaning to `word`.
 
     Returns None if no word is similar enough.
     """
@@ -54,7 +54,7 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 
 
 def is_thing(word: str) -> bool:
-    """Returns whether a word probably names a thing: most of the nearest listed words do."""
+    """Returns whether a word names a thing, judging by the listed words that are nearest to it."""
     vector = word_table().vector(word)
     if vector is None:
         return False
@@ -83,7 +83,7 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
     """Returns the names of the actions, and the single words that name them.
 
-    Each word is given with the index of its action and with its vector.
+    For each word, the index of its action and its vector are also returned.
     """
     table, weak = word_table(), words_of("weak")
     names = list(actions())

@@ -19,7 +19,7 @@ def base_forms(word: str) -> tuple[str, ...]:
 
 
 def _stems(word: str) -> Iterator[str]:
-    """Yields the word without a regular ending, in each possible spelling."""
+    """Yields the possible spellings of a word without its regular ending."""
     if word.endswith(("ies", "ied")) and len(word) > 4:
         yield f"{word[:-3]}y"
     for ending in ("ing", "ed", "es", "s", "in"):

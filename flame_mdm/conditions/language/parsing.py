@@ -75,7 +75,7 @@ def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
 
 
 class _Sentence:
-    """The actions described in a sentence, given its tokens and the phrases that name actions."""
+    """Finds the actions in a sentence from its tokens and from the phrases that name actions."""
 
     def __init__(self, text: str, tokens: Sequence[Token], matches: Sequence[Match]):
         self.text, self.tokens = text, tokens
@@ -121,7 +121,7 @@ class _Sentence:
         return [_without_idle(step) for step in steps + during + later]
 
     def rest(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Returns the words for things and the words that are not understood, both as typed."""
+        """Returns the words for things, and the words that are not understood (as typed)."""
         objects, unknown = [], []
         for number, token in enumerate(self.tokens):
             if not token.is_word or number in self.verbs:
@@ -228,7 +228,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause happens during the previous one: "stands still, waving"."""
+        """Returns whether a clause accompanies the previous action: "stands still, waving"."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]

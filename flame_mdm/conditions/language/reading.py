@@ -25,7 +25,7 @@ class Reading:
     Attributes:
         understanding: the understood content of the sentence.
         steps: the actions to sample, in order. The model knows all of them.
-        captions: one caption per step, for the model.
+        captions: the caption that the model reads for each step.
         texts: the words of the sentence that describe each step.
         changes: differences between the sentence and the sampled motion, one line each.
         ignored: words (as typed) and attributes (in words) that have no effect.
@@ -47,7 +47,7 @@ class Reading:
         )
 
     def seconds(self) -> tuple[float | None, ...]:
-        """Returns a duration in seconds for each step that states a count, or None otherwise."""
+        """Returns a duration in seconds for each step, or None for steps without a stated count."""
         counts = [
             step[0].attributes.get("count") if len(step) == 1 else None for step in self.steps
         ]
@@ -83,9 +83,9 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are passed to the model unchanged: training captions with an action
-        that the model does not list, and sentences without a listed action whose unknown words are
-        all in the vocabulary of the model.
+        Two kinds of sentences are passed to the model unchanged. The first kind are training
+        captions with an action that the model does not list. The second kind are sentences in which
+        no action is understood, but whose unknown words are all in the model's vocabulary.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not
@@ -149,7 +149,7 @@ class Reader:
         return Reading(understood, tuple(steps), tuple(captions), tuple(texts), changes, ignored)
 
     def _mention(self, mention: Mention, text: str, notes: "_Notes") -> Mention:
-        """Returns a mention reduced to an action and attributes that the model knows."""
+        """Reduces a mention to an action and attributes that the model knows."""
         action, attributes = self._known_action(mention)
         if action is None:
             nearest = [
@@ -294,8 +294,8 @@ def _shown(text: str) -> str:
 def _caption(step: Step, words: str, special: Set[str]) -> str:
     """Returns the caption of a step.
 
-    If one of the words is in no table but in the vocabulary of the model, the words are used as the
-    caption unchanged.
+    If a word is not in the tables but in the model's vocabulary, the words themselves are used as
+    the caption.
     """
     return words if special & set(words.lower().split()) else caption(step)
 

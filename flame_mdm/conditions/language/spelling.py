@@ -1,4 +1,4 @@
-"""Corrections of typos (one or two letters) to words for motions, attributes and subjects."""
+"""Correction of typos (one or two letters) in words for motions, attributes and subjects."""
 
 from functools import cache
 
@@ -55,7 +55,7 @@ def distance(first: str, second: str, most: int) -> int:
 
 @cache
 def corrections(word: str) -> tuple[str, ...]:
-    """Returns the words of the tables that a misspelled word may stand for.
+    """Returns the words in the tables that a misspelled word may stand for.
 
     The tuple is empty if no word is similar. All returned words are equally likely: they differ
     from the misspelled word by the same number of edits of the same kind. A word of up to five
@@ -88,7 +88,7 @@ def action_words() -> frozenset[str]:
 def _correct_words() -> tuple[str, ...]:
     """Returns the words that a typo may stand for.
 
-    Frequent words are first, followed by words for actions, and then by all other words.
+    Frequent words come first, followed by words for actions and then by all other words.
     """
     tables = phrases()
     listed = words_of("body") | words_of("people") | words_of("function") | words_of("objects")

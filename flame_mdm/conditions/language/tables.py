@@ -72,7 +72,7 @@ def words_of(*keys: str) -> frozenset[str]:
 
 @cache
 def word_values(key: str) -> dict[str, str]:
-    """Returns the value that each word of a table states.
+    """Returns a mapping from each word of a table to the value that it states.
 
     For example, `word_values("speed")["slowly"]` is "slow".
     """

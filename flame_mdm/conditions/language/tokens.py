@@ -25,7 +25,7 @@ class Token:
 
     Attributes:
         typed: the word as typed.
-        word: the word as read: in lower case and corrected.
+        word: the word in lower case, after typos are corrected.
         start, end: position of the token in the sentence.
     """
 
@@ -114,13 +114,13 @@ def corrected(tokens: Sequence[Token]) -> list[Token]:
 
 
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
-    """Returns the tokens, with one rare word replaced by an action that differs in one letter.
+    """Replaces one rare word by a word for an action that differs from it in one letter.
 
     This function is used for sentences in which no action is understood, such as "doge to the
     left".
 
     Args:
-        tokens: tokens of the sentence.
+        tokens: words and punctuation marks of the sentence.
         free: indices of the words that may be replaced.
     """
     for number in free:

@@ -41,8 +41,8 @@ class WordTable:
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
         """Returns the mean vector (D,) of words, scaled to norm 1, or None if all are missing.
 
-        Frequent words have less weight (smooth inverse frequency, Arora et al. 2017). The
-        frequencies follow Zipf's law.
+        Frequent words have less weight, as in smooth inverse frequency (Arora et al. 2017). Their
+        frequencies are estimated with Zipf's law.
         """
         rows = [row for word in words if (row := self.rank(word)) is not None]
         if not rows:
@@ -55,7 +55,7 @@ class WordTable:
 
 @cache
 def word_table() -> WordTable:
-    """Returns the table that the package contains."""
+    """Returns the table of word vectors that the package contains."""
     arrays = read_npz(FILE)
     words = arrays["words"].tobytes().decode().split("\n")
     # The table has 8 bits per number. The lengths of the vectors are not stored, because all of

@@ -116,7 +116,7 @@ class Body:
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
         """Blends an arm by `weight` (F,) into a pose.
 
-        The pose consists of four angles: forward, sideways, turned outward, elbow.
+        The pose consists of four angles: forward, sideways, outward rotation, and elbow.
         """
         for angle, target in enumerate(pose):
             self.arms[side, angle] += weight * (target - self.arms[side, angle])
@@ -131,13 +131,13 @@ class Body:
         """Moves a wrist by `weight` (F,) from its position to a point (3,) or (F, 3) in meters.
 
         If the weight is 0, the angles of the arm determine the position of the wrist. `frame` is
-        world, chest or head. For chest and head, the point is relative to this joint, with x to the
-        left and z ahead.
+        "world", "chest" or "head". For chest and head, the point is relative to this joint, with x
+        to the left and z ahead.
         """
         self.reaches.append((side, weight[:, None], np.asarray(target, float), frame))
 
     def joints(self) -> np.ndarray:
-        """Returns joint positions (F, 22, 3) in meters, y up."""
+        """Returns joint positions (F, 22, 3) in meters, with y up."""
         # Footprints are determined first, so that feet never slide. The pelvis is placed above
         # them. Inverse kinematics connects the hips to the feet. Spine, head and arms are computed
         # from angles.
@@ -267,7 +267,7 @@ def step(
 
 
 def follow_feet(body: Body) -> None:
-    """Moves the pelvis along with the midpoint between the feet, on the ground."""
+    """Moves the pelvis horizontally, together with the midpoint between the feet."""
     middle = body.ankles.mean(0)[:, [0, 2]]
     body.position[:, [0, 2]] += middle - middle[0]
 

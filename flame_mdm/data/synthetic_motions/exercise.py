@@ -18,7 +18,7 @@ LYING_HEEL = 1.35  # angle of the feet of a lying body on its toes, in radians
 
 
 def stretch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Reaches up with both arms, on tiptoe, or bends to one side with the arms overhead."""
+    """Reaches up with both arms while on tiptoe, or bends to one side with the arms overhead."""
     start = rng.uniform(0.05, 0.2)
     up = pulse(t, start, start + rng.uniform(0.7, 0.9), t[-1] - 0.7, t[-1])
     for side in (0, 1):
@@ -54,7 +54,7 @@ def lean(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 def jumping_jacks(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
-    """Jumps the feet apart while the arms swing overhead, and back together."""
+    """Jumps with the feet apart while the arms swing overhead, and then jumps back."""
     wide = rng.uniform(0.2, 0.26)
     for start, seconds in events(rng, t, int(requested["count"]), 1.05):
         air = min(0.26, 0.3 * seconds)

@@ -50,8 +50,8 @@ def walk_along(
 ) -> np.ndarray:
     """Moves the pelvis along a path at `speed` m/s, with footprints on both sides of the path.
 
-    The foot `first` takes the first step. Returns how far the right foot is in front of the left
-    foot (F,), in meters, relative to the heading of the pelvis.
+    The foot `first` takes the first step. Returns the distance (F,), in meters, by which the right
+    foot is in front of the left foot, along the heading of the pelvis.
     """
     # The pelvis accelerates, keeps its speed and stops. Each footprint is at the position of the
     # pelvis in the middle of the foot's next stance, shifted sideways by the width of the gait. On
@@ -122,7 +122,7 @@ def walk_along(
 
 
 def straight(x: float, z: float) -> Path:
-    """Returns a straight path along the vector (x, z), whose length is the length of the path."""
+    """Returns a straight path along the vector (x, z), which also determines its length."""
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 

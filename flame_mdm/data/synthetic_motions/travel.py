@@ -258,7 +258,7 @@ def climb_stairs(
 
 
 def _smooth(count: np.ndarray) -> np.ndarray:
-    """Returns a count (F,) that grows at a nearly even pace, slowing between two steps."""
+    """Returns a count (F,) of steps that grows nearly evenly, but slows between two steps."""
     return count - 0.05 * np.sin(2 * np.pi * count)
 
 

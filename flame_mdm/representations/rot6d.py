@@ -16,8 +16,8 @@ class Rot6D(Representation):
     """The 25 x 6 unnormalized features of Petrovich et al. 2021 (ACTOR).
 
     The features are 24 rotations as 6D rows, followed by (x, y, z, 0, 0, 0). (x, y, z) is the
-    root's translation relative to the first frame, in meters. In these camera coordinates, y points
-    down, and z points away from the camera. `smpl.read_pose` describes raw motions.
+    root's translation relative to the first frame. It is in meters and in camera coordinates, where
+    y points down and z points away from the camera. `smpl.read_pose` describes raw motions.
 
     Args:
         fps: frames per second.

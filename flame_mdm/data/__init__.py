@@ -46,8 +46,8 @@ class Clip:
     # data sets also keep the tagged words of their captions here.
     attributes: Mapping[str, Any] = field(default_factory=dict)
     # Name of the representation if the release contains encoded features instead of raw motions.
-    # `motion` (F, D) then consists of these features and is stored unchanged. Empty if `motion` is
-    # raw.
+    # `motion` (F, D) then consists of these features and is stored unchanged. The name is empty if
+    # `motion` is raw.
     encoded: str = ""
     # First frame and length of the part of the motion that forms the clip. None = the entire
     # motion. Consecutive clips with the same array object share its frames in the store. Windows
@@ -56,8 +56,8 @@ class Clip:
     # Joint positions (F', J, 3) in meters at the frame rate of the recording, for protocols that
     # compare motions at that rate.
     reference: np.ndarray | None = None
-    # Identifier of the license of this motion, such as "MIT". Empty if one license applies to all
-    # motions of the data set.
+    # Identifier of the license of this motion, such as "MIT". It is empty if one license applies to
+    # all motions of the data set.
     license: str = ""
 
 

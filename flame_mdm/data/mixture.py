@@ -31,8 +31,8 @@ class Mixture(MotionSource):
 
     name = "mixture"
     named_by_recipe = True
-    # Increase this number whenever the version of any data set increases, because the motions of
-    # that data set then also change in a mixture
+    # Increase this number whenever the version of any data set increases, because a mixture then
+    # also reads the motions of that data set differently
     version = 1
 
     def __init__(self, parts: Mapping[str, MotionSource], use: Use = "any"):

@@ -23,8 +23,8 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-# Number of bytes that each value adds to the expanded size. If values counted as nothing, a file of
-# a few bytes could repeat a list endlessly.
+# Number of bytes that each value adds to the expanded size. Otherwise, a file of a few bytes could
+# repeat a list endlessly.
 VALUE = 512
 
 

@@ -14,7 +14,7 @@ from flame_mdm.data.synthetic_motions.body import (
     pulse,
 )
 
-LYING_HEEL = 1.35  # angle of the feet of a lying body on its toes, in radians
+LYING_HEEL = 1.35  # angle of a foot that rests on its toes behind a lying body, in radians
 
 
 def stretch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:

@@ -203,7 +203,7 @@ class HumanML(Representation):
                 )
             if len(motion) < 3:
                 raise UserError(
-                    f"{name} has only {len(motion)} frames, but encoding requires at least 3. Exclude it"
+                    f"{name}: {len(motion)} frames are too few (encoding requires at least 3). Exclude it"
                 )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]

@@ -45,7 +45,7 @@ class TargetConditions:
         drop_prob: probability that a training motion has no target.
         weight: weight of the error in the loss.
         heading_modulo_pi: whether to compute the error of the heading modulo pi, as in MDM's code.
-            The error of a body that faces backwards is then 0.
+            The heading error of a body that faces backwards is then 0.
 
     Raises:
         UserError: If the skeleton lacks a joint, if a choice is unknown, or if the probability is

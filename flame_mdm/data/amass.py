@@ -72,7 +72,7 @@ class Recording(NamedTuple):
         return self.cut(slice(None, None, step))
 
     def cut(self, frames: slice) -> Recording:
-        """Returns the recording of the same body with only a slice of its frames."""
+        """Returns a recording of the same body that contains only a slice of the frames."""
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:

@@ -86,7 +86,7 @@ class Units(Crop):
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns first frames, drawn uniformly, and lengths that are multiples of `unit`."""
+        """Returns uniformly drawn first frames, and lengths that are multiples of `unit`."""
         length = np.minimum(frames, self.max_frames) // self.unit * self.unit
         if below is None:
             return np.zeros_like(length), length
@@ -123,7 +123,7 @@ class Fixed(Crop):
         return self.frames
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns first frames, drawn uniformly, and a constant length."""
+        """Returns uniformly drawn first frames and a constant length."""
         spare = np.maximum(0, frames - self.frames - 1)
         first = np.zeros_like(spare) if below is None else below(spare + 1)
         return first, np.full_like(spare, self.frames)

@@ -39,7 +39,7 @@ class Mixture(MotionSource):
         if not parts:
             raise UserError("data.source.parts is empty. Specify at least one data set")
         if use not in ("any", "research"):
-            raise UserError(f"data.source.use={use!s:.40}: unknown. Use any or research")
+            raise UserError(f"data.source.use={use!s:.40}: unknown value. Use any or research")
         self.parts, self.use = dict(parts), use
         self.verbs = tuple(sorted({verb for part in parts.values() for verb in part.verbs}))
         self.options = {

@@ -1,4 +1,4 @@
-"""MARDM's essential features: the features of HumanML3D that determine the positions."""
+"""MARDM's essential features: HumanML3D's features that determine the joint positions."""
 
 from flame_mdm.representations.humanml import HumanML
 

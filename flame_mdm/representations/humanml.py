@@ -1,4 +1,4 @@
-"""HumanML3D's features: root trajectory, local joints, rotations, velocities, contacts."""
+"""HumanML3D's features: root trajectory, joint positions, rotations, velocities and contacts."""
 
 from collections.abc import Iterable, Sequence
 from typing import Literal
@@ -45,9 +45,9 @@ class HumanML(Representation):
     instead of their sum. In the first frame, the heading is 0, although the smoothed heading is
     not. `turn` is half the turn to the right, and changes its sign where the heading crosses 180
     degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
-    rotations of the bones relative to the inverse heading, also at the shoulders. `decode` is also
-    the published decoding. If a bone is exactly opposite to its rest direction, the published code
-    returns NaN. This implementation returns a half turn instead.
+    rotations of the bones relative to the inverse heading, including the bones at the shoulders.
+    `decode` also follows the published code. If a bone is exactly opposite to its rest direction,
+    the published code returns NaN. This implementation returns a half turn instead.
 
     The variant "clean" has none of these peculiarities. Headings are unwrapped and padded
     point-symmetrically at both ends before they are smoothed, which preserves steady turns and the
@@ -203,7 +203,7 @@ class HumanML(Representation):
                 )
             if len(motion) < 3:
                 raise UserError(
-                    f"{name}: {len(motion)} frames are too few (encoding requires at least 3). Exclude it"
+                    f"{name}: {len(motion)} frames are too few (encoding requires at least 3). Exclude the motion"
                 )
             check_finite(motion, name)
         lengths = [len(motion) for motion in motions]

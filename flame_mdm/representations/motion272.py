@@ -1,4 +1,4 @@
-"""MotionStreamer's features: root trajectory, local joints, velocities, SMPL's rotations."""
+"""MotionStreamer's features: root trajectory, joint positions, velocities, SMPL's rotations."""
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
@@ -13,7 +13,7 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 
 
 class Motion272(Representation):
-    """272 features of Xiao et al. 2025 (MotionStreamer), one row per frame.
+    """The 272 features of Xiao et al. 2025 (MotionStreamer), with one row per frame.
 
     Columns by name, in `slices`:
 
@@ -26,9 +26,9 @@ class Motion272(Representation):
     | rotations | 132 | SMPL's rotations as 6D rows; the root's rotation is in body coordinates |
 
     In the first row, `turn` is the identity, and velocities are 0. The heading is computed from the
-    root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z. Raw
-    motions have z up; `smpl.read_pose` describes them. Bones have the lengths of `offsets`, whereas
-    the authors keep the bone lengths of each subject.
+    root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z. In
+    raw motions, which `smpl.read_pose` describes, z is up. Bones have the lengths of `offsets`,
+    whereas the authors keep the bone lengths of each subject.
 
     Args:
         fps: frames per second.

@@ -1,4 +1,4 @@
-"""TEMOS's features: root height, local joints, heading change and root velocity."""
+"""TEMOS's features: root height, local joint positions, heading change and root velocity."""
 
 from collections.abc import Iterable
 
@@ -20,7 +20,7 @@ The published code removes the root, but still uses the original indices of hips
 
 
 class Rifke(Representation):
-    """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, also used by FLAME.
+    """The 64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, which FLAME also uses.
 
     A motion of T frames is encoded as T rows.
 
@@ -126,7 +126,7 @@ class Rifke(Representation):
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:
-    """Increases the frame rate of frames (T, ...) by a factor, with linear interpolation.
+    """Increases the frame rate of a motion (T, ...) by a factor, using linear interpolation.
 
     The result has (T - 1) * factor + 1 frames. TEMOS is evaluated at 100 frames per second, 8 times
     the rate of the features.

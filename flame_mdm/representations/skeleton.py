@@ -276,7 +276,7 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the sorted indices of the joints that are named, or are in named body parts.
+    """Converts the names of joints and body parts to sorted joint indices.
 
     Raises:
         UserError: If a name is unknown. The message suggests similar names.

@@ -64,7 +64,7 @@ class Abilities:
 
     @cached_property
     def is_simultaneous(self) -> bool:
-        """Whether a caption of the model describes two simultaneous actions."""
+        """Whether any of the model's captions describes two simultaneous actions."""
         marked = [
             text for text in self.captions if " while " in text or " at the same time" in text
         ]

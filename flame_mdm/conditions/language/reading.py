@@ -83,9 +83,10 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are passed to the model unchanged. The first kind are training
-        captions with an action that the model does not list. The second kind are sentences in which
-        no action is understood, but whose unknown words are all in the model's vocabulary.
+        Two kinds of sentences are passed to the model unchanged. The first kind consists of
+        training captions with an action that the model does not list. The second kind consists of
+        sentences in which no action is understood, but whose unknown words are all in the model's
+        vocabulary.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not

@@ -51,7 +51,7 @@ def pulse(t: np.ndarray, start: float, top: float, leave: float, end: float) -> 
 
 
 def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 3, 3) about x, y or z (0, 1, 2) by angles (...) in radians."""
+    """Returns rotations (..., 3, 3) about axis x, y or z (0, 1, 2) by angles (...) in radians."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., axis, axis] = 1

@@ -75,7 +75,7 @@ def duck(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def hit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Is struck from the front: head and trunk snap back, and a foot steps back."""
+    """Is struck from the front: the head and trunk snap back, and one foot steps back."""
     start, side = rng.uniform(0.3, 0.6), int(rng.integers(2))
     sign, snap = SIGN[side], rng.uniform(0.8, 1.1)
     jerk = pulse(t, start, start + 0.14, start + 0.2, start + 0.8)

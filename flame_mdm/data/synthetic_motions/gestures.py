@@ -19,7 +19,7 @@ CHAIR = 0.54  # height of the pelvis on a chair whose seat is 45 cm high
 
 
 def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Raises one arm or both arms, and swings the forearms."""
+    """Raises one or both arms and swings the forearms."""
     start, end = rng.uniform(0.1, 0.3), t[-1]
     weight = pulse(t, start, start + 0.5, end - 0.45, end + 0.05)
     swing = 2 * np.pi * rng.uniform(1.4, 1.7) * (t - start)
@@ -36,7 +36,7 @@ def wave(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Raises one arm or both arms over the head, through the front or through the side."""
+    """Raises one or both arms over the head, either forward or sideways."""
     start = rng.uniform(0.15, 0.5)
     weight = ease(t, start, start + rng.uniform(0.7, 1.0))
     over_front, high = rng.random() < 0.5, rng.uniform(2.7, 3.0)

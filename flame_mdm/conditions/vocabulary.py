@@ -265,7 +265,7 @@ def plainest(captions: Iterable[str]) -> list[str]:
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
-    """Returns the captions that share the largest fraction of their words with the text, best first.
+    """Returns the captions that share the largest fraction of words with the text, best first.
 
     The list is empty if no caption shares a word with the text.
     """

@@ -76,7 +76,10 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns batches that contain each clip once across all ranks; the longest clips come first."""
+    """Returns batches that contain each clip once across all ranks.
+
+    The longest clips come first.
+    """
     mine = np.argsort(-lengths, kind="stable")[rank::world]
     return [
         [(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)

@@ -187,7 +187,10 @@ class HumanML3D(T2MFolder):
         return missing
 
     def _make(self, amass: Amass) -> None:
-        """Creates the motions that do not exist yet, so that an interrupted command can be resumed."""
+        """Creates the motions that do not exist yet.
+
+        An interrupted command can therefore be resumed.
+        """
         if todo := self._todo():
             _ = self.names, self.texts  # raises an error if they are missing
             if missing := self._missing(amass, todo):
@@ -218,7 +221,10 @@ class HumanML3D(T2MFolder):
             remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
-        """Writes the mean and std over all motions of every length and split, with mirrored copies."""
+        """Writes the mean and std over all motions and their mirrored copies.
+
+        Motions of every length and split are included.
+        """
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
         if wrong := [

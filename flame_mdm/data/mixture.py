@@ -16,7 +16,7 @@ Use = Literal["any", "research"]
 
 @cache
 def known_licenses() -> dict[str, dict[str, str]]:
-    """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` of each license."""
+    """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` by license."""
     return read_package_yaml(Path(__file__).with_name("licenses.yaml"))
 
 

@@ -109,7 +109,7 @@ class _Unpickler(pickle._Unpickler):
         )
 
     def plain(self, value: Any) -> Any:
-        """Returns a value in which objects of the pickle are converted to arrays, numbers and text."""
+        """Converts the objects in a value of the pickle to arrays, numbers and text."""
         self.expanded += VALUE + (len(value) if isinstance(value, str | bytes | bytearray) else 0)
         check_expansion(self.expanded, self.size)
         match value:

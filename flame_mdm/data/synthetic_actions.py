@@ -182,7 +182,7 @@ def drawn_from(rng: np.random.Generator, actions: Mapping[str, Action]) -> str:
 
 
 def move(body: Body, rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> None:
-    """Moves a body through the action, or the two simultaneous actions, that the attributes name."""
+    """Moves a body through the action or the two simultaneous actions in the attributes."""
     name, cyclic = str(attributes["action"]), attributes.get("ends") == "cycle"
     action = CYCLES[name] if cyclic else ACTIONS[name]
     action.motion(body, rng, t, attributes)

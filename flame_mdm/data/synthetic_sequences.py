@@ -1,4 +1,4 @@
-"""Synthetic clips for models that continue frames: motions that follow the end of another motion."""
+"""Synthetic clips for models that continue frames: motions that follow another motion."""
 
 from collections.abc import Sequence
 

@@ -119,7 +119,7 @@ class Representation(nn.Module, ABC):
         return features.new_zeros(*features.shape[:-1], 0, 6)
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns the mean and std (D,) for normalization, computed from all training frames (N, D).
+        """Computes the mean and std (D,) for normalization from all training frames (N, D).
 
         Without `slices`, features are not normalized: the mean is 0 and the std is 1.
         """

@@ -39,7 +39,7 @@ class Reading:
     ignored: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """Returns a summary of the understood actions, such as "walks forward, then waves twice"."""
+        """Returns a summary of the actions, such as "walks forward, then waves twice"."""
         if not self.steps:
             return self.texts[0]
         return ", then ".join(

@@ -284,7 +284,10 @@ def flight(t: np.ndarray, start: float, seconds: float) -> np.ndarray:
 def events(
     rng: np.random.Generator, t: np.ndarray, count: int, slowest: float
 ) -> list[tuple[float, float]]:
-    """Returns the start and the duration, in seconds, of `count` equally long repetitions at random times."""
+    """Draws the times of `count` repetitions of equal length.
+
+    Returns the start and the duration of each repetition, in seconds.
+    """
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]

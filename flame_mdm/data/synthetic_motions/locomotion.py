@@ -17,7 +17,10 @@ from flame_mdm.data.synthetic_motions.body import (
 )
 
 Path = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Signature of a path: fraction (N,) of the path, length in meters -> x (N,), z (N,) and heading (N,)."""
+"""Signature of a path.
+
+It maps fractions (N,) of the path and its length in meters to x (N,), z (N,) and heading (N,).
+"""
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.3.0"
 
-# This must be set before torch is imported. A thread that waits for others then spins only
-# briefly before it sleeps. By default, it spins much longer; if other programs use the cores, a
-# training step then takes three to twenty times as long. Without any spinning, a second thread
-# brings no speedup.
+# This must be set before torch is imported. It limits how long a thread that waits for other
+# threads spins before it sleeps. The default is so long that a training step takes three to twenty
+# times as long when other programs use the cores. Without any spinning, a second thread would bring
+# no speedup.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 

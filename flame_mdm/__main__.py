@@ -1,4 +1,7 @@
-"""The command line: `flame-mdm COMMAND OBJECT [OUT] key=value ...`, also `python -m flame_mdm COMMAND ...`."""
+"""Command line: `flame-mdm COMMAND OBJECT [OUT] key=value ...`.
+
+`python -m flame_mdm COMMAND ...` is equivalent.
+"""
 
 import sys
 from collections.abc import Sequence
@@ -29,13 +32,18 @@ COMMANDS = {
     "export": "write a checkpoint as a model file, or as ONNX graphs",
     "push": "upload a model file to the Hugging Face hub",
 }
-"""Command -> purpose. `commands/NAME.py` has its settings and `main(settings)`; `import` is in import_released.py."""
+"""Purpose of each command.
+
+`commands/NAME.py` contains the command's settings and its `main(settings)`. The file of `import`
+is called `import_released.py`, because `import` is a Python keyword.
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command line and returns its exit code.
 
-    `argv` are the arguments after `flame-mdm`. Default: the arguments of this process.
+    `argv` contains the arguments after `flame-mdm`. By default, these are the arguments of this
+    process.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):

@@ -1,6 +1,8 @@
 """Common data types: batches of motions, conditions, edits and masks.
 
-B batch, F frames, D features, S condition tokens, C condition width. In all masks, True = real.
+Shapes: B is the batch size, F the number of frames, D the number of features, S the number of
+condition tokens, and C the condition width. All masks are True for real entries and False for
+padding.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ class MotionBatch:
     Attributes:
         x: (B, F, D) float32, normalized features, 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, unique in the data set. The name of a sample seeds its noise, and results are
-            joined by name.
+        ids: B names, each unique in the data set. The name of a sample seeds its noise and
+            identifies it in results.
         text: one caption per motion, or None if the data contains no captions.
         action: (B,) int64 class labels, or None if the data contains no classes.
 
@@ -46,9 +48,9 @@ class MotionBatch:
         return len(self.ids)
 
     def to(self, device: torch.device) -> MotionBatch:
-        """Moves the batch to a device.
+        """Copies the batch to a device asynchronously.
 
-        Called by Lightning. The copy is asynchronous.
+        Lightning calls this method.
         """
         action = None if self.action is None else sent(self.action, device)
         return replace(self, x=sent(self.x, device), mask=sent(self.mask, device), action=action)
@@ -56,7 +58,7 @@ class MotionBatch:
     def pin_memory(self) -> MotionBatch:
         """Copies the batch to pinned memory, so that copies to a GPU are asynchronous.
 
-        Called by the data loader.
+        The data loader calls this method.
         """
         action = None if self.action is None else self.action.pin_memory()
         return replace(self, x=self.x.pin_memory(), mask=self.mask.pin_memory(), action=action)
@@ -68,16 +70,16 @@ class Condition:
 
     Attributes:
         pooled: (B, C), one vector per sample.
-        tokens: (B, S, C), one vector per word piece. S is 0 if the encoder returns no tokens.
-        token_mask: (B, S) bool, True = real token. In a null condition, None means that a sample
-            keeps its own mask when its condition is replaced.
-        null: the null condition, which means "no condition", with batch size 1. None if the encoder
-            has no null condition.
-        prefix: (B, P, D), normalized features of the P clean frames before the motion. None if no
-            frames precede it.
-        target: (B, 8, 4), where the motion should end; see `flame_mdm.conditions.target`. None if
-            it may end anywhere.
-        target_mask: (B,) bool, False = this sample has no target. None if every sample has one.
+        tokens: (B, S, C), one vector per word piece, or S = 0 if the encoder returns no tokens.
+        token_mask: (B, S) bool, True = real token. If the null condition has no mask (None), a
+            sample keeps its own mask when its condition is replaced by the null condition.
+        null: the null condition, which stands for "no condition" and has batch size 1, or None if
+            the encoder has no null condition.
+        prefix: (B, P, D), normalized features of the P clean frames before the motion, or None if
+            no frames precede it.
+        target: (B, 8, 4), where the motion should end (see `flame_mdm.conditions.target`), or None
+            if it may end anywhere.
+        target_mask: (B,) bool, False = this sample has no target, or None if every sample has one.
 
     Example:
         >>> null = Condition(torch.zeros(1, 3), torch.zeros(1, 0, 3), None)
@@ -103,8 +105,8 @@ class Condition:
             drop: (B,) bool, True = replace the condition of this sample.
         """
         if self.null is None:
-            raise ValueError("this condition has no null condition, so samples cannot be dropped")
-        if not self.pooled.shape[1]:  # unconditioned: the condition is its null condition
+            raise ValueError("there is no null condition with which to replace conditions")
+        if not self.pooled.shape[1]:  # an unconditional model: every condition is null
             return self
         null = self.null
         pooled = torch.where(drop[:, None], null.pooled.to(self.pooled), self.pooled)
@@ -126,9 +128,9 @@ class Condition:
         return replace(self, pooled=pooled, tokens=tokens, token_mask=token_mask)
 
     def with_null(self) -> Condition:
-        """Returns a batch of size 2B: the conditions, followed by the null condition of each sample.
+        """Returns a batch of size 2B: the conditions, followed by their null conditions.
 
-        With this batch, classifier-free guidance needs only one forward pass.
+        This lets classifier-free guidance compute both predictions in one forward pass.
         """
         batch = self.pooled.shape[0]
         rows = torch.arange(batch, device=self.pooled.device)
@@ -136,7 +138,7 @@ class Condition:
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
 
     def select(self, rows: Tensor) -> Condition:
-        """Returns the conditions of samples `rows` (N,) int64."""
+        """Returns the conditions of the N samples with the indices `rows` (N,), int64."""
 
         def selected(x: Tensor | None) -> Tensor | None:
             return None if x is None else x[rows]
@@ -156,10 +158,10 @@ class Guide(Protocol):
     """Guides motions (B, F, D) toward a goal, such as world positions."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns `x_t`, changed so that its clean estimate is closer to the goal.
+        """Changes `x_t` so that its clean estimate is closer to the goal, and returns it.
 
         Args:
-            clean: returns the clean estimate of a noisy motion.
+            clean: function that returns the clean estimate of a noisy motion.
             x_t: (B, F, D), the noisy motion.
         """
         ...
@@ -178,22 +180,22 @@ class Edit:
     Attributes:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature in this frame.
-        mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t"
-            replaces the kept part of the noisy sample with the known motion with the same amount of
-            noise (FLAME, RePaint). "trajectory" overwrites the early part of the flow's path
-            (MFM).
+        mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t" replaces
+            the kept part of the noisy sample with the known motion, to which the same amount of
+            noise is added (FLAME, RePaint). "trajectory" overwrites the early part of the flow's
+            path (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
         blend: for "x_t", when the kept part is replaced: "after" each step (FLAME, eq. 6), so that
             the result contains the known motion itself, or "before" each call of the denoiser
             (FLAME's code), so that the result contains the model's version of the known motion.
-        resample: for "x_t", how many times each step is repeated, after noise is added again
-            (RePaint, algorithm 1).
+        resample: for "x_t", how many times each step is repeated. Noise is added again before each
+            repetition (RePaint, algorithm 1).
         guide: for "x0", a goal that is imposed on the clean estimate at each step, before the kept
             part overwrites it. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
-            with the noise of the first of these steps (SDEdit). MDM's code sets the number of
-            skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. None = sampling
-            starts from pure noise.
+            with the noise level of the first of these steps (SDEdit). MDM's code sets the number of
+            skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. If `strength`
+            is None, sampling starts from pure noise.
 
     Example:
         >>> known, keep = torch.ones(1, 4, 2), torch.zeros(1, 4, 2, dtype=torch.bool)
@@ -212,7 +214,7 @@ class Edit:
     guide: Guide | None = None
 
     def impose(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D) with the kept features replaced by the known features.
+        """Replaces the kept features of a clean estimate (B, F, D) with the known features.
 
         This implements mode "x0".
         """
@@ -220,7 +222,7 @@ class Edit:
         return torch.where(self.keep, self.known, x0_hat)
 
     def steps(self, total: int) -> int:
-        """Returns how many of `total` sampling steps are taken, at least one."""
+        """Returns how many of the `total` sampling steps are taken, which is at least one."""
         return total if self.strength is None else max(1, round(self.strength * total))
 
 
@@ -231,22 +233,22 @@ Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
 """
 
 Noise = Callable[[int], Tensor]
-"""Function that maps the draw index (0, 1, 2, ...) to the noise (B, F, D) for a sampling run.
+"""Function that maps the draw index (0, 1, 2, ...) to the noise (B, F, D) of a sampling run.
 
-Sampling starts from draw 0.
+Sampling starts from draw 0; stochastic samplers use the later draws.
 """
 
 
 def pad_to(x: Tensor, size: int) -> Tensor:
-    """Pads dimension 1 of x (B, N, ...) with zeros (False in masks) up to `size` entries."""
+    """Pads dimension 1 of x (B, N, ...) to `size` entries with zeros, or with False in masks."""
     missing = size - x.shape[1]
     return x if missing == 0 else torch.cat([x, x.new_zeros(x.shape[0], missing, *x.shape[2:])], 1)
 
 
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
-    """Returns the mask (B, F) bool for lengths (B,).
+    """Returns a bool mask (B, F) in which the first `lengths` (B,) frames of each motion are True.
 
-    `frames` is F. Default: the maximum of the lengths.
+    `frames` is F, by default the maximum length.
 
     Example:
         >>> length_mask(torch.tensor([1, 2])).tolist()
@@ -257,7 +259,7 @@ def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
 
 
 def ceil_div(count: int, size: int) -> int:
-    """Returns `count / size`, rounded up: the number of groups of `size` items that hold `count`."""
+    """Returns how many groups of `size` items are needed for `count` items."""
     return -(-count // size)
 
 
@@ -269,17 +271,17 @@ def padded_length(length: int, multiple: int, most: int) -> int:
 def sent(x: Tensor, device: torch.device) -> Tensor:
     """Moves a tensor to a device.
 
-    A copy to a GPU does not wait for earlier work on the GPU.
+    A copy to a GPU does not wait until the GPU has finished earlier work.
     """
     copied = device.type == "cuda" and x.device.type == "cpu"
     return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
 
 
 class Constant:
-    """Constant numbers, stored as one tensor per device.
+    """Constant numbers, stored in one tensor per device.
 
-    They are not a module's buffer. Casting a model, or building it on the meta device, therefore
-    does not change them.
+    They are not registered as a buffer of a module, so that casting a model, or building it on the
+    meta device, does not change them.
 
     Example:
         >>> table = Constant([1.0, 2.0])
@@ -294,7 +296,8 @@ class Constant:
     def on(self, device: torch.device) -> Tensor:
         """Returns the tensor on a device. Only the first call for a device waits for a copy."""
         if device not in self.tensors:
-            # The first call may happen during validation. Training cannot use inference tensors.
+            # The first call may happen during validation, but training cannot use inference
+            # tensors.
             with torch.inference_mode(False):
                 self.tensors[device] = torch.tensor(self.values, device=device)
         return self.tensors[device]
@@ -306,10 +309,10 @@ def collate(
     """Collates samples into a batch, padded with zeros.
 
     Args:
-        samples: id, normalized features (F, D), caption and action of each motion.
-        multiple: the batch has the length of the longest sample, rounded up to a multiple of this
-            number of frames.
-        most: maximum number of frames after rounding. A longer sample is never cut.
+        samples: (id, normalized features (F, D), caption, action) of each motion.
+        multiple: the length of the longest sample is rounded up to a multiple of this number of
+            frames.
+        most: maximum number of frames after rounding. Samples that are longer are not cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])

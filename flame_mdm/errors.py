@@ -11,7 +11,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TextIO
 
 MAX_LINE = 2_000
-"""Maximum length of an error line. The middle of longer lines is left out; the project's own messages are shorter."""
+"""Maximum length of an error line.
+
+The middle of longer lines is omitted. All messages of the project are shorter.
+"""
 # Unicode's bidirectional control characters
 DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
@@ -19,7 +22,7 @@ DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 class UserError(ValueError):
     """An error that the user can fix.
 
-    Commands print its message on one line and exit with code 1.
+    Commands print the message on one line and exit with code 1.
     """
 
 
@@ -35,9 +38,9 @@ def first_line(error: BaseException) -> str:
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """Returns " Did you mean a, b?" with the names most similar to `name`.
+    """Returns " Did you mean a, b?", where a and b are the names most similar to `name`.
 
-    Suggests at most three of `names`. Returns "" if none is similar.
+    Suggests at most three of `names`, and returns "" if none of them is similar.
     """
     near = difflib.get_close_matches(name, list(names), 3, 0.5)
     return f" Did you mean {', '.join(near)}?" if near else ""
@@ -66,12 +69,12 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns text, which may come from an untrusted file, as one `printable` line."""
+    """Returns text, such as text from an untrusted file, as one `printable` line."""
     return printable(re.sub(r"[\t\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+", " ", text))
 
 
 def markdown_text(text: str) -> str:
-    """Returns text as one line of Markdown without markup."""
+    """Escapes text so that Markdown shows it as one line without any formatting."""
     return html.escape(re.sub(r"([|*_`~#\[\]\\])", r"\\\1", one_line(text)), quote=False)
 
 
@@ -79,19 +82,19 @@ _shown: dict[str, str] = {}
 
 
 def show_as(path: str, name: str) -> None:
-    """Shows a name instead of a path in all later messages.
+    """Makes all later messages show a name instead of a path.
 
-    If a command works on a temporary copy of a file, its messages then contain the name that the
-    user typed.
+    A command that works on a temporary copy of a file uses this so that its messages contain the
+    name that the user typed.
     """
     _shown[path] = name
 
 
 def say(*lines: object, error: bool = False) -> None:
-    """Prints each argument as one `printable` line, because text may come from untrusted files.
+    """Prints each argument as one `printable` line, because it may come from an untrusted file.
 
-    If the output is piped to a program that has ended, such as `head`, all later lines are dropped.
-    The command still finishes its work.
+    If the output is piped to a program that has ended, such as `head`, all later lines are dropped,
+    but the command still finishes its work.
     """
     stream = sys.stderr if error else sys.stdout
     for line in lines:
@@ -107,7 +110,7 @@ def say(*lines: object, error: bool = False) -> None:
 
 
 def drop(stream: TextIO) -> None:
-    """Redirects a standard stream to the null device, and discards its buffered text."""
+    """Redirects a standard stream to the null device and discards its buffered text."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
@@ -118,13 +121,13 @@ def _escaped(char: str) -> str:
 
 
 def renamed_names(module: str, names: Mapping[str, str], since: str) -> Callable[[str], Any]:
-    """Returns a `__getattr__` for a module with renamed names.
+    """Returns a `__getattr__` for a module in which names were renamed.
 
     Old names keep working for one minor version, with a warning.
 
     Args:
         module: `__name__` of the module.
-        names: old name -> new name.
+        names: mapping from old to new names.
         since: version in which they were renamed.
     """
 

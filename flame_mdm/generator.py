@@ -1,7 +1,8 @@
 # pyright: standard
 """Models that generate motions, independent of Lightning.
 
-Importing Lightning takes longer than sampling a motion. `flame_mdm.task` trains the models.
+They do not import Lightning, because the import takes longer than sampling a motion.
+`flame_mdm.task` trains them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,11 +35,11 @@ class Parts:
 
     #: Network that predicts the target of the process.
     denoiser: Denoiser
-    #: Path between noise and motion.
+    #: Process that turns noise into a motion, such as diffusion or flow matching.
     process: Process
-    #: Encoder of texts or actions.
+    #: Encoder of the condition, such as text or actions.
     condition: ConditionEncoder
-    #: Features of a motion.
+    #: Conversion between motions and features.
     representation: Representation
 
     def __post_init__(self) -> None:
@@ -50,7 +51,7 @@ class Parts:
 
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
-        """Builds the parts that a recipe describes, and sets the sizes that depend on other parts."""
+        """Builds the parts of a recipe, including the sizes that depend on other parts."""
         process: Process = instantiate(config["process"])
         condition: ConditionEncoder = instantiate(config["condition"], {"num_actions": num_actions})
         sizes = sizes_of_denoiser(config, representation, process, condition)
@@ -61,7 +62,7 @@ class Parts:
 def sizes_of_denoiser(
     config: Config, representation: Representation, process: Process, condition: ConditionEncoder
 ) -> dict[str, int]:
-    """Returns the arguments of a recipe's denoiser that depend on its other parts."""
+    """Returns the denoiser's arguments that depend on the other parts of the recipe."""
     return {
         "in_features": representation.features,
         "out_features": process.out_features(representation.features),
@@ -71,7 +72,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames that divides all training lengths."""
+    """Returns the number of frames of which all training lengths are multiples."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -95,9 +96,9 @@ def sampling_defaults(
 
 
 class Model:
-    """Base class for the models that checkpoints hold."""
+    """Base class of the models that are stored in checkpoints."""
 
-    # What the model's checkpoints contain, for messages
+    # Noun for this kind of model in messages about its checkpoints
     noun = "a model"
     # The recipe, saved in checkpoints
     config: Config
@@ -114,7 +115,7 @@ class Model:
 
 
 class MotionGenerator(Model, nn.Module):
-    """A denoiser, a process, a condition encoder and a representation, with the code for sampling.
+    """Samples motions with a denoiser, a process, a condition encoder and a representation.
 
     Args:
         parts: the four parts.
@@ -137,7 +138,7 @@ class MotionGenerator(Model, nn.Module):
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
         super().__init__()
-        # Optimizer states in checkpoints number the parameters in this order.
+        # Optimizer states in checkpoints refer to parameters by their index in this order.
         self.condition, self.representation = parts.condition, parts.representation
         self.denoiser, self.process = parts.denoiser, parts.process
         self.sampler_options = sampler_options
@@ -174,7 +175,7 @@ class MotionGenerator(Model, nn.Module):
         return generator
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
-        """Adds facts about the training data, and passes the vocabulary to the text encoder."""
+        """Adds facts about the training data and passes the vocabulary to the text encoder."""
         super().add_facts(facts)
         if "vocabulary" in facts:
             self.condition.seen = frozenset(facts["vocabulary"])
@@ -216,24 +217,24 @@ class MotionGenerator(Model, nn.Module):
         depend on the other motions of its batch.
 
         Args:
-            batch: conditions, `mask` and `ids` of B motions; its `x` is ignored.
-            options: sampler options. For an option that is None, the recipe's value is used.
+            batch: conditions, `mask` and `ids` of B motions. `x` is ignored.
+            options: sampler options. An option that is None has the recipe's value.
             seed: seed of the noise.
             replication: index of the replication, used to sample several motions per id.
             edit: part of a motion to keep.
-            windows: windows that cover motions longer than the training motions. The conditions of
-                the windows replace the conditions of the batch.
-            prefix: (B, C, D) normalized features of the frames before the motions. Required by a
-                model with `context_frames` C. Such a model continues the prefix block by block and
-                accepts no edit, windows or trajectory.
+            windows: overlapping windows that together cover motions longer than the training
+                motions. The windows' conditions replace the conditions of the batch.
+            prefix: (B, C, D) normalized features of the frames before the motions. They are
+                required if the denoiser has `context_frames` C. Such a model continues the prefix
+                block by block and accepts neither an edit nor windows nor a trajectory.
             unconditioned: whether to sample a conditional model with its null condition.
-            shared_noise: whether the noise is a function of only (seed, replication), so that it
-                does not depend on the id.
+            shared_noise: whether the noise depends only on (seed, replication), so that it is the
+                same for all ids.
             trajectory: list that receives the normalized clean estimate (B, F, D) of each call of
                 the denoiser.
 
         Returns:
-            Normalized features (B, F, D), 0 past the end of each motion.
+            Normalized features (B, F, D), which are 0 past the end of each motion.
 
         Raises:
             UserError: If the model or its process cannot sample with these arguments.
@@ -241,7 +242,8 @@ class MotionGenerator(Model, nn.Module):
         self.check_request(options, unconditioned)
         options = self.sampler_options if options is None else options.over(self.sampler_options)
         was_training = self.training
-        if was_training:  # setting the mode of all modules takes as long as running a small network
+        # Setting the mode of all modules takes as long as a forward pass of a small network.
+        if was_training:
             self.eval()
 
         cond = self.encode(batch if windows is None else windows.batch, unconditioned)
@@ -301,7 +303,7 @@ class MotionGenerator(Model, nn.Module):
         return self.condition(empty).drop(nothing == 0)
 
     def guided(self, cond: Condition, options: SamplerOptions, unconditioned: bool) -> Denoise:
-        """Returns the denoiser, with guidance if there is a condition."""
+        """Returns the denoiser, to which guidance is added if there is a condition."""
         scale = options.guidance_scale
         if scale is None or cond.null is None or not self.condition.features or unconditioned:
             return self.denoiser
@@ -309,11 +311,11 @@ class MotionGenerator(Model, nn.Module):
 
     @property
     def block_frames(self) -> int:
-        """Number of frames that a model with `context_frames` predicts at once."""
+        """Number of frames per block, for a model with `context_frames`."""
         return self.facts["max_frames"] - self.denoiser.context_frames
 
     def split_prefix(self, batch: MotionBatch) -> tuple[Tensor | None, MotionBatch]:
-        """Splits motions into the clean prefix that the denoiser reads, and the rest.
+        """Splits motions into the clean prefix that the denoiser reads and the remaining frames.
 
         The prefix is (B, C, D), or None if the denoiser reads no prefix.
         """
@@ -330,19 +332,19 @@ FADE = 0.5
 
 
 class Blocks:
-    """Motions generated in blocks, each of which continues the last frames of the previous block.
+    """Generates motions block by block: each block continues the last frames of the previous one.
 
     Source: Tevet et al. 2025, "CLoSD". The noise of a block is a function of (seed, replication,
     id, block index). Changing a condition therefore changes only the later blocks.
 
     Args:
-        model: a model whose denoiser has `context_frames` C.
+        model: the model. Its denoiser has `context_frames` C.
         ids: B names of the motions, which seed the noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
-        options: sampler options, none of which is None.
+        options: sampler options. None of them may be None.
         seed: seed of the noise.
         replication: index of the replication, used to sample several motions per id.
-        unconditioned: whether the conditions are null conditions, so that no guidance is needed.
+        unconditioned: whether all conditions are null conditions. Guidance is then not applied.
         fade: number of frames after a seam over which a jump between two blocks is faded out; see
             `joined`. 0 = no fading, as in DiP's code.
 
@@ -378,13 +380,13 @@ class Blocks:
     def sample(
         self, cond: Condition, kept: Tensor | None = None, edit: Edit | None = None
     ) -> Tensor:
-        """Samples the next block (B, P, D), normalized.
+        """Samples the next block and returns its normalized features (B, P, D).
 
         Args:
             cond: the conditions of this block.
-            kept: (B,) int64, number of frames of the block to keep; the next block continues
-                these frames. Default: all frames.
-            edit: part of the block to keep.
+            kept: (B,) int64, number of frames of the block that are kept and that the next block
+                continues. Default: all frames.
+            edit: part of the block that is given rather than generated.
         """
         model, prefix = self.model, self.prefix
         frames, features = model.block_frames, model.representation.features
@@ -412,7 +414,7 @@ class Blocks:
 
 
 def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
-    """Removes the jump between frames and the block that continues them.
+    """Removes the jump at the seam between two successive blocks of frames.
 
     The block is shifted so that the step at the seam is the mean of the steps before and after it.
     The shift then decays to zero over the next frames ("inertialization", Bollo 2018).
@@ -420,7 +422,7 @@ def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
     Args:
         before: (B, C, D) features of the frames before the block.
         x: (B, P, D) features of the block.
-        fade: number of frames over which the shift decays.
+        fade: number of frames over which the shift decays to zero.
 
     Returns:
         The shifted block (B, P, D).
@@ -440,11 +442,14 @@ def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
 
 
 class DistilledGenerator(MotionGenerator):
-    """A student model of `flame_mdm.training.distillation`, with guidance built into its weights."""
+    """A student model, trained by `flame_mdm.training.distillation`.
+
+    Guidance is built into its weights.
+    """
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
         super().__init__(parts, sampler_options)
-        # Edits cannot rewrite a path, because the sampler of students has no path.
+        # The sampler of student models has no path that an edit could overwrite.
         self.process.edit_modes = tuple(
             mode for mode in self.process.edit_modes if mode != "trajectory"
         )
@@ -452,7 +457,7 @@ class DistilledGenerator(MotionGenerator):
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
         """Raises `UserError` if guidance or an unconditioned motion is requested.
 
-        A student model has learned neither.
+        A student model has not learned either of them.
         """
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):
@@ -461,6 +466,6 @@ class DistilledGenerator(MotionGenerator):
             )
         if unconditioned and self.condition.features:
             raise UserError(
-                "this distilled model was trained only with a condition, so it cannot sample without one. "
+                "this distilled model was trained only with conditions and cannot sample without one. "
                 f"Pass a {self.condition.reads}"
             )

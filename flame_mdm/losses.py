@@ -10,14 +10,14 @@ from torch.autograd.function import once_differentiable
 from flame_mdm.batch import Constant
 
 CONTACT_SPEED = 0.01
-"""Maximum displacement per frame, in meters, of a foot that counts as in contact in the data."""
+"""Maximum displacement, in meters per frame, of a foot that counts as being in contact."""
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample.
 
-    The mean of a sample without real frames is 0. MDM's code adds 1e-8 to the number of entries.
-    This function does not: 1e-8 is below the resolution of float32.
+    The mean of a sample without real frames is 0. MDM's code adds 1e-8 to the number of entries,
+    which this function omits because it is below the resolution of float32.
 
     Example:
         >>> x, mask = torch.tensor([[[1.0], [3.0], [9.0]]]), torch.tensor([[True, True, False]])
@@ -32,8 +32,8 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
     """Returns the squared error (B,) of a and b (B, F, ...), averaged over real frames.
 
-    `mask` is (B, F). All samples have equal weight, regardless of length (Tevet et al. 2022,
-    eq. 2, averaged as in their code).
+    `mask` is (B, F). Samples have equal weight, whatever their lengths (Tevet et al. 2022, eq. 2,
+    averaged as in their code).
 
     Example:
         >>> masked_mse(torch.zeros(1, 2, 3), torch.full((1, 2, 3), 2.0), torch.ones(1, 2) > 0).tolist()
@@ -43,7 +43,10 @@ def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
 
 
 class _MaskedSquaredError(torch.autograd.Function):
-    """`masked_mean((a - b).square(), mask)`, bit for bit, in about half as many passes."""
+    """Computes `masked_mean((a - b).square(), mask)` in about half as many passes.
+
+    The results are identical, bit for bit.
+    """
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
@@ -63,9 +66,9 @@ class _MaskedSquaredError(torch.autograd.Function):
 
 
 def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> Tensor:
-    """Returns the lengths (..., N) of N bones, from joints (..., J, 3).
+    """Returns the lengths (..., N) of N bones between joint positions (..., J, 3).
 
-    `edges` (N, 2) are the indices of the parent and the child of each bone.
+    `edges` (N, 2) contains the joint indices of the parent and the child of each bone.
     """
     parents, children = torch.as_tensor(edges).T
     return (joints[..., children, :] - joints[..., parents, :]).norm(dim=-1)
@@ -74,27 +77,27 @@ def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> T
 class MotionLosses(nn.Module):
     """Weighted geometric losses of MDM, and a bone-length loss.
 
-    Sources: Tevet et al. 2022, eq. 3-5, and Liang et al. 2024, InterGen. All losses are means
-    over real frames and entries: the norms in the paper are divided by the number of entries per
-    frame, as in its code. Velocities are per frame. Losses with weight 0 are not computed.
+    Sources: Tevet et al. 2022, eq. 3-5, and Liang et al. 2024, InterGen. All losses are means over
+    real frames and entries: the norms in MDM's paper are divided by the number of entries per
+    frame, as in its code. Velocities are in units per frame. Losses with weight 0 are not computed.
 
     Args:
         to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F,
             J, 3) in meters.
         feet: indices of the joints that touch the ground.
-        edges: (parent, child) of each bone, for `bone_length`.
+        edges: joint indices (parent, child) of each bone, used by `bone_length`.
         joints: weight of the squared error of the joint positions (eq. 3).
         velocity: weight of the squared error of the features' velocity (eq. 5).
         foot_contact: weight of the squared velocity of the feet that are in contact in the data
-            (eq. 4). Feet that are not in contact count as 0 in the mean, as in the paper's sum over
-            all frames.
+            (eq. 4). As in the paper's sum over all frames, feet that are not in contact contribute
+            0 to the mean.
         bone_length: weight of the squared error of the bone lengths, in square meters. This is
-            InterGen's bone length loss (arXiv:2304.05684). InterGen applies it only up to a certain
-            noise level. In this implementation, it is applied at all levels.
+            InterGen's bone-length loss (arXiv:2304.05684), but applied at all noise levels, whereas
+            InterGen applies it only up to a certain level.
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.
-        velocity_features: number of features that `velocity` uses, counted from the first. MDM's
-            code uses 144 of 25 x 6 and 262 of 263: it leaves out the last row of the feature
-            matrix. None = all features.
+        velocity_features: number of leading features that `velocity` uses. MDM's code omits the
+            last row of the feature matrix, and so uses 144 of 25 x 6 or 262 of 263 features. None =
+            all features.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)
@@ -118,7 +121,7 @@ class MotionLosses(nn.Module):
     ):
         super().__init__()
         self.to_joints = to_joints
-        # Lists would be copied to the GPU in every step, and the GPU would wait for the copies.
+        # Lists would be copied to the GPU in every step, which would make the GPU wait.
         self.feet, self.edges = Constant(list(feet)), Constant(list(edges))
         self.joints, self.velocity, self.foot_contact, self.bone_length = (
             joints,

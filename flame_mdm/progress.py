@@ -11,9 +11,9 @@ from flame_mdm.signals import raise_received
 
 
 class ProgressBar(tqdm):
-    """Shows tqdm's bar in a terminal, and plain lines elsewhere.
+    """Shows tqdm's bar in a terminal and plain lines elsewhere.
 
-    Plain lines are printed at the beginning, about every 30 seconds, and at the end.
+    A plain line is printed at the beginning, about every 30 seconds, and at the end.
     """
 
     SECONDS = 30.0
@@ -36,7 +36,7 @@ class ProgressBar(tqdm):
 
     @staticmethod
     def status_printer(file: IO[str]) -> Callable[[str], None]:
-        """Returns the function that writes the bar to a file. tqdm itself ends the last line."""
+        """Returns a function that writes the bar to a file. tqdm itself ends the last line."""
         if file.isatty():
             return tqdm.status_printer(file)
         end = ""
@@ -44,7 +44,7 @@ class ProgressBar(tqdm):
         def write(text: str) -> None:
             nonlocal end
             if text:
-                # The program that reads the output, such as `head`, may have ended
+                # The program that reads the output, such as `head`, may have exited
                 with suppress(BrokenPipeError):
                     file.write(end + text.rstrip())
                     file.flush()

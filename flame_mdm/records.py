@@ -13,9 +13,9 @@ from flame_mdm.schemas import ClosedSchema, Int, Number, Plain, Schema, read_jso
 
 
 class Value(Schema):
-    """A metric's value over replications, with the number of motions it was computed from."""
+    """A metric's mean over replications, and the number of motions from which it was computed."""
 
-    # None if the value cannot be computed
+    # None if the metric cannot be computed
     mean: Number | None
     # Half width of the 95 % interval over replications, or None for a single replication
     ci: Number | None
@@ -26,14 +26,15 @@ class Value(Schema):
     # Number of real motions if the metric compares two sets, or None otherwise
     n_real: Int | None = None
     unit: str = ""
-    # Bootstrap values: the metric of motions drawn with replacement from the first replication
+    # Bootstrap values: the metric, computed on motions that are drawn with replacement from the
+    # first replication
     resampled: list[Number | None] = Field(default_factory=list)
 
     @property
     def half(self) -> float | None:
         """Half width of the 95 % interval over replications, or None if it is unknown.
 
-        For a single replication, the interval is over the motions.
+        For a single replication, this is the half width of the bootstrap interval over motions.
         """
         if (self.replications or 0) > 1:
             return self.ci
@@ -56,7 +57,7 @@ def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
 
     See Efron and Tibshirani 1993, section 13.3. Some values, such as Fréchet distances, are larger
     for sets with repeated motions (section 10.6). The interval is therefore shifted to the value.
-    It is valid for the same number of motions.
+    The interval holds only for sets of the same size.
 
     Example:
         >>> percentiles([1.0, 2.0, 3.0], 5.0)
@@ -79,7 +80,8 @@ class ProtocolVersion(Schema):
 class Data(Schema):
     """The data set of an evaluation or audit.
 
-    `frames` contains the minimum and maximum clip length. `excluded` counts excluded clips by reason.
+    `frames` contains the minimum and maximum clip length. `excluded` contains the number of
+    excluded clips per reason.
     """
 
     dataset: str
@@ -110,7 +112,7 @@ class Checkpoint(Schema):
     edit: dict[str, Plain] = Field({})
     experiment: str | None = None
     config_sha256: str = ""
-    # Keys that differ from the recipe, each "key=value"
+    # Changes to the recipe, in the form "key=value"
     recipe_changes: list[str] = Field(default_factory=list)
     selected_by: str = ""
     averaged_weights: bool | None = None
@@ -125,9 +127,9 @@ class Checkpoint(Schema):
 
 
 class UsedSkeleton(Schema):
-    """Origin of the bones if joints are computed from SMPL rotations.
+    """Origin of the bone lengths when joint positions are computed from SMPL rotations.
 
-    The bones come from SMPL's model file or from a stand-in.
+    They come from SMPL's model file or from a stand-in for it.
     """
 
     stand_in: bool
@@ -135,7 +137,7 @@ class UsedSkeleton(Schema):
 
 
 class Cost(Schema):
-    """Cost per motion. Values are None if no model was used."""
+    """Cost per generated motion. The values are None if no model was used."""
 
     nfe: Number | None = None
     seconds_per_sample: Number | None = None
@@ -143,18 +145,19 @@ class Cost(Schema):
 
 
 class Measured(Schema):
-    """The values that an evaluation measures, by metric.
+    """Values that an evaluation measured, by metric.
 
-    `values` belong to the evaluated motions, `ground_truth` to real motions. None = not measured.
+    `values` describes the evaluated motions, and `ground_truth` describes real motions. None means
+    that a value was not measured.
     """
 
     ground_truth: dict[str, Value | None] | None
     values: dict[str, Value | None] | None
-    # Metric -> reason
+    # Reason why a metric was not computed, by metric
     not_computed: dict[str, str]
     # [] if the values are valid
     invalid_because: list[str]
-    # Whether motions were generated although real motions do not have the expected values
+    # Whether the evaluation continued although the values of real motions were not as expected
     forced: bool = False
     warnings: list[str] = Field(default_factory=list)
     cost: Cost | None = None
@@ -168,8 +171,8 @@ class Result(Measured):
     protocol: ProtocolVersion
     changed: dict[str, Plain] = Field({})  # options that differ from the protocol
     split: str
-    # Whether the data has its published splits, which test on clips seen in training or lack
-    # validation clips
+    # Whether the data uses its published splits, in which some test clips are also training clips,
+    # or validation clips are missing
     published_split: bool = False
     data: Data
     seed: Int
@@ -177,11 +180,11 @@ class Result(Measured):
     checkpoint: Checkpoint | None
     samples_sha256: str | None = None  # hash of the motion files from another system
     baseline: str | None = None
-    # Path of the audit card of the extractor; None = not audited
+    # Path of the extractor's audit card, or None if the extractor was not audited
     audit: str | None = None
-    # Number of motions in the audit
+    # Number of motions that were used for the audit
     audit_motions: Int | None = None
-    # None if the data has joint positions
+    # None if the data contains joint positions
     skeleton: UsedSkeleton | None = None
     device: str
     precision: str = ""
@@ -189,7 +192,7 @@ class Result(Measured):
 
     @property
     def counts(self) -> str:
-        """Numbers of replications and motions of most values, as text, or "" if there are no values."""
+        """Most common `Value.counts` of the values, or "" if there are no values."""
         values = [value for value in (self.values or {}).values() if value and value.replications]
         counts = Counter(value.counts for value in values if value.n != 0)
         return counts.most_common(1)[0][0] if counts else ""
@@ -209,7 +212,7 @@ class Result(Measured):
 
     @property
     def stand_in_skeleton(self) -> bool:
-        """Whether the joints have the bones of a stand-in for SMPL's model file."""
+        """Whether the bones come from a stand-in for SMPL's model file."""
         return self.skeleton is not None and self.skeleton.stand_in
 
 
@@ -217,8 +220,8 @@ class AuditedGrade(ClosedSchema):
     """One grade of a perturbation.
 
     Each metric has four numbers: its value, the half width of the value's 95 % interval, the
-    difference from real motions, and the half width of the interval of this difference. None =
-    not computable.
+    difference from real motions, and the half width of the interval of this difference. A number
+    that cannot be computed is None.
     """
 
     grade: Number
@@ -236,21 +239,21 @@ class AuditedPerturbation(ClosedSchema):
 
 
 class AuditedMetric(ClosedSchema):
-    """Properties that a metric declares about one of its values."""
+    """Properties that a metric declares for one of its values."""
 
     unit: str = ""
     # Whether it can detect that a motion does not show what was requested
     sees_meaning: bool = True
     # Whether the value summarizes the metric's other values
     sums_up: bool = True
-    # Whether it reads attributes from the joints, without a network
+    # Whether it reads attributes from the joint positions, without a network
     exact: bool = False
     # Whether its bias depends on the number of motions
     depends_on_count: bool = False
 
 
 class AuditedExtractor(Schema):
-    """The feature extractor of an audit, by its recipe or file."""
+    """The feature extractor of an audit, named by its recipe or file."""
 
     sha256: str
     name: str
@@ -268,15 +271,16 @@ class AuditCard(ClosedSchema):
     seed: Int
     resamples: Int
     packages: dict[str, str]
-    # Whether higher values are better. None = the best values are near the values of real motions
+    # Whether higher values are better, by metric. None = the closer to the value of real motions,
+    # the better
     metrics: dict[str, bool | None]
-    # By metric; empty in files from earlier versions
+    # Properties by metric. Files from earlier versions contain none
     facts: dict[str, AuditedMetric] = Field({})
-    # By metric, the value of real motions and the half width of its interval
+    # The value of real motions and the half width of its interval, by metric
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
     not_computed: dict[str, str]
-    # Agreement with exact attributes, by metric: `auc` and `correlation`
+    # Agreement with exact attributes (`auc` and `correlation`), by metric
     truth: dict[str, dict[str, Number | None]]
 
 

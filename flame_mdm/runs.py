@@ -18,9 +18,9 @@ CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
 HISTORY = "metrics.jsonl"  # training curves; one line per logged step
 RESULTS = "evaluation/**/result*.json"
 HISTORY_LIMIT = 256 * safe_io.MEBIBYTE
-"""Maximum size of a history in bytes.
+"""Maximum size of a history file in bytes.
 
-A million steps, logged every 50 steps, take about 20 MiB.
+A run of a million steps that logs every 50 steps takes about 20 MiB.
 """
 
 
@@ -35,7 +35,7 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """The entry `data` in a provenance file, which may contain additional facts about the data."""
+    """Entry `data` of a provenance file. It may contain additional facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
@@ -56,7 +56,7 @@ class Provenance(Schema):
 
 
 class FaultyBatch(Schema):
-    """The part of a batch on one rank."""
+    """The part of a faulty batch that one rank processed."""
 
     rank: Int
     batch: Int
@@ -65,7 +65,7 @@ class FaultyBatch(Schema):
 
 
 class Fault(Schema):
-    """The batch that stopped a run."""
+    """The batch whose loss stopped a run, with the parts of all ranks."""
 
     step: Int
     usual_loss: str
@@ -73,10 +73,10 @@ class Fault(Schema):
 
 
 def made_by(path: str | Path) -> str:
-    """Explains how to obtain a missing checkpoint or extractor.
+    """Returns a hint on how to obtain a missing checkpoint or extractor.
 
-    Returns the command that creates the file or, if no command creates it, the page that states
-    where to find it.
+    The hint is the command that creates the file. For a file in `assets/`, which no command
+    creates, the hint names the page of the documentation that explains where to find it.
     """
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)
@@ -90,8 +90,8 @@ def made_by(path: str | Path) -> str:
 class Run:
     """Content of a run directory.
 
-    Curves map each name to a mapping from steps to values. Results are stored by their path in the
-    directory.
+    `history` maps the name of each curve to a mapping from steps to values. `results` maps paths in
+    the directory to results.
     """
 
     folder: Path
@@ -116,7 +116,7 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """Number of training steps in the curves."""
+        """Last training step in the curves."""
         trained = (
             curve for name, curve in self.curves.items() if name.startswith(("train/", "samples/"))
         )
@@ -154,7 +154,7 @@ def read_run(folder: Path) -> Run:
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the curves of a run by name, each a mapping from step to value, sorted by step.
+    """Returns the training curves by name. Each curve maps steps to values, sorted by step.
 
     Raises:
         UserError: If the file is damaged.
@@ -168,7 +168,10 @@ def read_history(folder: Path) -> dict[str, dict[int, float]]:
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a history. Ignores an incomplete last line that a killed process left behind."""
+    """Returns the records of a history file.
+
+    An incomplete last line, which a killed process may leave behind, is ignored.
+    """
     if not path.exists():
         return []
     *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")

@@ -1,4 +1,4 @@
-"""Options of the samplers, shared by Python, command line, demo, evaluation and tables."""
+"""Sampler options, shared by the Python API, the command line, the demo, evaluation and tables."""
 
 import math
 from collections.abc import Sequence
@@ -8,9 +8,9 @@ from typing import Any, Self
 from flame_mdm.config.options import option
 from flame_mdm.errors import UserError
 
-# Maximum number of steps of a diffusion or sampler
+# Maximum number of diffusion or sampling steps
 MAX_STEPS = 100_000
-# How diffusion spaces its sampling steps; see `flame_mdm.processes.schedules.timesteps`
+# Spacings of the sampling steps of diffusion; see `flame_mdm.processes.schedules.timesteps`
 SPACINGS = (
     "linspace",
     "stride",
@@ -19,14 +19,14 @@ SPACINGS = (
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerOptions:
-    """How motions are sampled.
+    """Options for sampling motions.
 
-    For an option that is None, the recipe's value is used. If the recipe has no value, the
-    sampler's default applies. A sampler declares its options (`flame_mdm.processes.samplers`), and
-    `flame_mdm.processes.Process` rejects other options.
+    An option that is None has the recipe's value or, if the recipe has none, the sampler's default.
+    Each sampler in `flame_mdm.processes.samplers` declares its options, and
+    `flame_mdm.processes.Process` rejects all others.
 
     Raises:
-        UserError: If a value is invalid for every model.
+        UserError: If a value is invalid for all models.
 
     Example:
         >>> recipe = SamplerOptions(sampler="ddim", num_inference_steps=50)
@@ -83,5 +83,5 @@ class SamplerOptions:
         }
 
     def over(self, defaults: Self) -> Self:
-        """Returns these options; each option that is None is replaced by the option in `defaults`."""
+        """Returns these options, taking each option that is None from `defaults`."""
         return replace(defaults, **self.chosen())

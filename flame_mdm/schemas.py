@@ -1,4 +1,4 @@
-"""Typed schemas of files, and readers whose errors name the file and the key."""
+"""Typed schemas of files, and readers whose error messages name the file and the key."""
 
 import functools
 import json
@@ -15,7 +15,10 @@ from flame_mdm.errors import UserError, did_you_mean
 # Maximum integer in a file. Larger integers overflow when they are plotted or logged.
 MAX_INTEGER = 2**63 - 1
 LIMIT = 4 * safe_io.MEBIBYTE
-"""Maximum size of a file of results, lengths or provenance. Typical files have 10 to 300 KiB."""
+"""Maximum size in bytes of a file of results, lengths or provenance.
+
+Typical files have 10 to 300 KiB.
+"""
 T = TypeVar("T")
 Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 # A finite number that does not overflow when it is plotted
@@ -24,18 +27,18 @@ Plain = str | bool | Int | Number | None
 
 
 class Schema(BaseModel):
-    """Content of a file.
+    """Schema of the content of a file.
 
-    Types are not converted: "1" is not a number. Unknown keys are ignored.
+    Types are not converted: the string "1" is not accepted as a number. Unknown keys are ignored.
     """
 
     model_config = ConfigDict(strict=True)
 
 
 class ClosedSchema(Schema):
-    """Content of a file that people write.
+    """Schema of a file that people write.
 
-    Unknown keys are errors, except overrides such as data.crop.max_frames.
+    Unknown keys are errors, except for overrides such as `data.crop.max_frames`.
     """
 
     @model_validator(mode="before")
@@ -63,7 +66,7 @@ EXPECTED = {
         "too_long": "a shorter list",
     },
 }
-"""Descriptions of the expected content, by the type of a pydantic error or its first word."""
+"""Descriptions of the expected content, by a pydantic error type or its first word."""
 
 _adapter = functools.cache(TypeAdapter)
 
@@ -71,7 +74,7 @@ _adapter = functools.cache(TypeAdapter)
 def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
     """Converts the content of a file to a `Schema` or another type that pydantic supports.
 
-    Dataclasses need `strict` = False. The text "1" is then accepted as a number.
+    Dataclasses require `strict=False`, which also accepts the string "1" as a number.
 
     Raises:
         ValueError: If the content does not match `kind`. The message contains the key, its value
@@ -88,10 +91,10 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
 
 def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> T:
-    """Converts the content of an untrusted file as `check_shape` does if all its values are plain.
+    """Converts the content of an untrusted file, all of whose values must be plain.
 
-    Raises `UserError` with `path` if this fails, or if the content is nested too deeply or contains
-    itself.
+    The content is converted as in `check_shape`. Raises `UserError` with `path` if the conversion
+    fails, or if the content is nested too deeply or contains itself.
     """
     # checked before the shape: the check of the shape would not end for content that contains
     # itself
@@ -104,7 +107,7 @@ def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> 
 
 
 def _too_large(content: Any) -> str:
-    """Returns the first integer above `MAX_INTEGER` in the content as text, or "" if there is none."""
+    """Returns the first integer above `MAX_INTEGER` as text, or "" if there is none."""
     if isinstance(content, dict | list):
         values = content.values() if isinstance(content, dict) else content
         return next(filter(None, map(_too_large, values)), "")
@@ -114,7 +117,7 @@ def _too_large(content: Any) -> str:
 def _first_error(error: ValidationError, content: Any) -> str:
     first: Any = error.errors(include_url=False)[0]
     keys, kind, context = [], first["type"], first.get("ctx", {})
-    for key in first["loc"]:  # pydantic also lists the members of unions; they are not keys
+    for key in first["loc"]:  # pydantic also lists the members of unions, which are not keys
         if (isinstance(content, dict) and key in content) or (
             isinstance(content, list) and isinstance(key, int)
         ):
@@ -140,9 +143,9 @@ def _first_error(error: ValidationError, content: Any) -> str:
 
 
 def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
-    """Returns the content of a JSON file of at most `LIMIT` bytes; see `check_shape`.
+    """Reads a JSON file of at most `LIMIT` bytes and returns its content; see `check_shape`.
 
-    Error messages end with `remedy`.
+    `remedy` is appended to error messages, as advice to the user.
     """
     message = f"; {remedy}" if remedy else ""
     try:

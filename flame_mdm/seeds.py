@@ -1,11 +1,12 @@
 """Counter-based random numbers.
 
-Random numbers depend on their purpose, not on the order of the draws.
+A random number depends on its purpose, not on the order in which numbers are drawn.
 
-In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id).
-The noise does not depend on batch, padding, number of ranks or device. A counter is hashed
-(splitmix64: Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators"). The
-hash is mapped to the normal distribution (Box and Muller 1958).
+In a sampling run, each element of a motion's noise is a function of (seed, replication, id) and its
+index. The noise therefore does not depend on the batch, the padding, the number of ranks or the
+device. It is computed by hashing a counter (splitmix64: Steele, Lea and Flood 2014, "Fast
+splittable pseudorandom number generators") and mapping the hash to the normal distribution (Box and
+Muller 1958).
 """
 
 import hashlib
@@ -23,7 +24,7 @@ Counters = TypeVar("Counters", Tensor, np.ndarray)
 
 
 def key(*parts: str | int) -> int:
-    """Hashes parts to a 63-bit number that is the same on every machine.
+    """Hashes strings and integers to a 63-bit number that is the same on every machine.
 
     Example:
         >>> key("noise", 0, "clip_1") == key("noise", 0, "clip_1"), key("noise", 0, "clip_2") < 2**63
@@ -34,17 +35,17 @@ def key(*parts: str | int) -> int:
 
 
 def seed_generator(number: int, device: torch.device) -> None:
-    """Seeds torch's generators for the CPU and for `device`.
+    """Seeds torch's random number generators of the CPU and of `device`.
 
-    `torch.manual_seed` is slower: it seeds the generators of all devices, which takes about a
-    millisecond if CUDA is not initialized.
+    `torch.manual_seed` is slower, because it seeds the generators of all devices. This takes about
+    a millisecond if CUDA is not initialized.
     """
     torch.default_generator.manual_seed(number)
     if device.type != "cpu":
         torch.get_device_module(device).manual_seed(number)
 
 
-# as signed 64-bit integers
+# Constants of splitmix64, as signed 64-bit integers
 _GOLDEN, _MIX1, _MIX2 = (
     v - (1 << 64) for v in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 )
@@ -62,10 +63,10 @@ def _hash(x: Counters) -> Counters:
 
 
 def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
-    """Returns a function `draw(count)` of uniform integers (B,), 0 <= integer < count.
+    """Returns a function `draw(count)` that draws uniform integers (B,) from 0 to count - 1.
 
-    `count` is an integer below 2^31, or an array (B,) int64 with one integer per key. Each call
-    returns a new draw.
+    `count` is an integer below 2^31, or an int64 array (B,) with one such integer per key. Each
+    call draws new integers.
     """
     state = keys
 
@@ -78,7 +79,10 @@ def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
 
 
 def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Returns two independent uniform draws in (0, 1) for keys (B,): (B, *shape) float32 each."""
+    """Returns two independent uniform draws in (0, 1) for keys (B,).
+
+    Each draw is (B, *shape), float32.
+    """
     positions = torch.arange(math.prod(shape), device=keys.device).reshape(1, *shape)
     bits = _hash(_hash(keys).reshape(-1, *[1] * len(shape)) + positions * _GOLDEN)
     scale = 2.0**-24
@@ -110,11 +114,11 @@ def seeded_noise(
 
     Args:
         ids: B names of the motions.
-        frames: F.
-        features: D.
+        frames: number of frames F.
+        features: number of features D.
         seed: seed of the run.
         replication: index of the replication.
-        like: a tensor whose device and precision are used for the noise.
+        like: a tensor whose device and precision the noise should have.
 
     Returns:
         A function that maps the draw index (0, 1, 2, ...) to noise (B, F, D).

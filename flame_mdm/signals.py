@@ -18,7 +18,7 @@ _received: BaseException | None = None
 def stoppable(signums: Sequence[int]) -> Iterator[None]:
     """Turns signals into exceptions, so that partial files are deleted.
 
-    The exit code of the command is 128 + the signal number.
+    The command exits with code 128 + the signal number.
     """
     global _received
 
@@ -27,7 +27,7 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         global _received
-        # suppresses messages about objects that were being created or deleted
+        # suppresses messages about objects that are being created or deleted
         sys.unraisablehook = lambda _: None
         _received = _received or exception(number)
         raise exception(number)
@@ -39,8 +39,8 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
     try:
         yield
     except Exception:
-        # The exception of a signal may be raised anywhere in a library. The library's cleanup can
-        # then fail with another exception.
+        # The exception of a signal may be raised anywhere in a library, whose cleanup may then fail
+        # with another exception.
         if _received is not None:
             raise _received from None
         raise
@@ -59,8 +59,9 @@ def raise_received() -> None:
 class StopRequest:
     """Records a signal that asks training to stop at the end of a step.
 
-    `signum` is the signal number; 0 = no signal. A second SIGINT stops immediately. A second
-    SIGTERM also stops immediately, unless it comes within one second: `timeout` sends two at once.
+    `signum` is the signal number; 0 = no signal. A second SIGINT stops immediately. So does a
+    second SIGTERM, unless it arrives within one second of the first one: `timeout` sends two at
+    once.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
@@ -70,7 +71,7 @@ class StopRequest:
         self.handlers: dict[int, Any] = {}
 
     def install(self) -> None:
-        """Makes `note` the handler of the signals."""
+        """Registers `note` as the signal handler."""
         self.handlers = {signum: signal.signal(signum, self.note) for signum in self.SIGNALS}
 
     def restore(self) -> None:

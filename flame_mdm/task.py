@@ -1,5 +1,5 @@
 # pyright: standard
-"""Lightning modules that train a model.
+"""Lightning modules for training.
 
 The model itself is `flame_mdm.generator.MotionGenerator`.
 """
@@ -31,7 +31,7 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
 class Task(Model, LightningModule):
-    """Base class for everything that `make train` trains.
+    """Base class of all tasks that `make train` can run.
 
     A recipe names its class in `task._target_`.
     """
@@ -41,7 +41,7 @@ class Task(Model, LightningModule):
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
         self.reported: dict[str, Tensor | float] = {}  # values that are logged after this step
-        self.prepare_data_per_node = False  # the machines of a cluster share the data folder
+        self.prepare_data_per_node = False  # all machines of a cluster share the data folder
 
     @classmethod
     def build(
@@ -52,7 +52,7 @@ class Task(Model, LightningModule):
         actions: Sequence[str] = (),
         facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe, and sets the sizes that depend on other parts.
+        """Builds the task of a recipe, including the sizes that depend on other parts.
 
         Args:
             config: the recipe.
@@ -76,17 +76,17 @@ class Task(Model, LightningModule):
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
-        """If the encoder is frozen, encodes all captions in the data once, on one rank."""
+        """Encodes all captions in the data once, on one rank, if the encoder is frozen."""
         self.encoder().precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
-        """Opens the captions encoded by `prepare_data`, and adds facts about the data."""
+        """Opens the encodings from `prepare_data` and adds facts about the data."""
         data, encoder = self.data, self.encoder()
         size = encoder.load_cache(*self._captions())
         if device := data.choose_device(size):
             encoder.move_cache(device)
-        # Buffers are identical in all processes. If DDP sent them in each forward pass, a process
-        # with more validation batches than the others would wait forever.
+        # Buffers are identical in all processes. If DDP broadcast them in each forward pass, a
+        # process with more validation batches than the others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
         self.add_facts(
             {
@@ -99,9 +99,9 @@ class Task(Model, LightningModule):
             self.add_facts({"licenses": licenses})
 
     def _captions(self) -> tuple[list[str], Path]:
-        """Returns the texts to encode and the folder of their encodings.
+        """Returns the texts to encode and the folder in which to store their encodings.
 
-        The texts are the captions of the data and the prompts of callbacks.
+        The texts are the captions in the data and the prompts of callbacks.
         """
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*self.data.captions(), *prompts}), self.data.folder.parent / "text"
@@ -109,14 +109,14 @@ class Task(Model, LightningModule):
     @property
     def is_reported(self) -> bool:
         """Whether the values of the current training step are logged."""
-        trainer = self._trainer  # None if a step is computed without a trainer
+        trainer = self._trainer  # None if the step is computed without a trainer
         return trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0  # type: ignore[attr-defined]
 
     def report(self, values: Mapping[str, Tensor | float]) -> None:
-        """Stores values of the current training step by name if they will be logged.
+        """Stores named values of the current training step, to be logged after the step.
 
-        `Measurements` writes them to the loggers after the step. Lightning's `log` takes as long
-        per value as running a small network, and keeps the host busy in all later steps.
+        `Measurements` writes them to the loggers. Lightning's `log` would take as long per value as
+        a forward pass of a small network, and would keep the host busy in all later steps.
         """
         if self.is_reported:
             for name, value in values.items():
@@ -129,8 +129,8 @@ class Task(Model, LightningModule):
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """Returns the optimizer and its learning-rate schedule.
 
-        The learning rate rises linearly over the first `lr_warmup` steps. It falls linearly to 0
-        over the last fraction `lr_decay` of the training run.
+        The learning rate rises linearly over the first `lr_warmup` steps. Over the last fraction
+        `lr_decay` of the training run, it falls linearly to 0.
         """
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
@@ -158,8 +158,8 @@ class Task(Model, LightningModule):
     def on_train_start(self) -> None:
         """Allows gradient clipping with fused optimizers in bfloat16.
 
-        Lightning refuses it because such an optimizer could scale gradients itself. In bfloat16,
-        gradients are not scaled.
+        Lightning does not allow it, because such an optimizer may unscale gradients itself. In
+        bfloat16, however, gradients are not scaled.
         """
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:
@@ -171,9 +171,9 @@ class Task(Model, LightningModule):
 
 
 class GeneratorTask(Task):
-    """Trains a `MotionGenerator`: any denoiser with any process.
+    """Trains a `MotionGenerator` with any denoiser and any process.
 
-    Checkpoints contain the weights under the same names as in the generator.
+    In checkpoints, the weights have the same names as in the generator.
 
     Args:
         parts: the four parts of the generator.
@@ -182,17 +182,17 @@ class GeneratorTask(Task):
         cond_drop_prob: probability that a training sample receives the null condition.
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see
             `SamplerOptions`.
-        seed: seed of all random draws during training. Draws are functions of (seed, batch number,
+        seed: seed of all random draws during training, which are functions of (seed, batch number,
             rank).
         compile: whether to compile the denoiser with torch.compile when training begins.
         checkpoint_activations: whether to store fewer activations for the backward pass and
-            recompute the others; see `flame_mdm.denoisers.recomputation`. The weights are the same,
-            but steps are slower.
-        targets: options of `TargetConditions`, for a denoiser with a target encoder. None = no
-            targets.
+            recompute the others; see `flame_mdm.denoisers.recomputation`. The resulting weights are
+            the same, but steps are slower.
+        targets: options of `TargetConditions`, required by a denoiser with a target encoder. None =
+            the model is trained without targets.
 
-    If the denoiser reads `context_frames`, the first frames of a training sample are its clean
-    prefix. Only the frames after the prefix contribute to the losses.
+    If the denoiser has `context_frames`, these first frames of each training sample are its clean
+    prefix, and only the later frames contribute to the losses.
     """
 
     noun = MotionGenerator.noun
@@ -259,7 +259,8 @@ class GeneratorTask(Task):
             seed=config["seed"],
             **section,
         )
-        # One object for both, so that facts added during training are also available for sampling.
+        # The task and the generator share these objects, so that facts that are added during
+        # training are also available for sampling.
         task.config = task.generator.config = config
         task.facts = task.generator.facts = {"actions": list(actions)}
         task.add_facts(facts or {})
@@ -278,7 +279,7 @@ class GeneratorTask(Task):
         return self.generator.describe()
 
     def setup(self, stage: str) -> None:
-        """Also stores the vocabulary of the training captions, and passes it to the text encoder."""
+        """Also stores the vocabulary of the training captions and passes it to the text encoder."""
         super().setup(stage)
         data = self.data
         context = self.generator.denoiser.context_frames
@@ -320,7 +321,7 @@ class GeneratorTask(Task):
             self.pretrain()
 
     def pretrain(self) -> None:
-        """Trains the text encoder on captions before the first step if the recipe requests it."""
+        """Trains the text encoder on the captions before the first step, if the recipe says so."""
         self.encoder().pretrain([clip.captions for clip in self.data.train.clips], self.seed)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
@@ -354,13 +355,13 @@ class GeneratorTask(Task):
         u: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Returns the losses (B,) of the motions of a batch by name; "loss" is their sum.
+        """Returns the losses (B,) of the motions in a batch, by name; "loss" is their sum.
 
         Args:
             batch: the motions.
             cond: their conditions.
-            u: (B,) uniform numbers in (0, 1), which determine the times. Default: drawn.
-            noise: (B, F, D) standard normal noise. Default: drawn.
+            u: (B,) uniform numbers in (0, 1), which determine the times. Default: drawn at random.
+            noise: (B, F, D) standard normal noise. Default: drawn at random.
         """
         process = self.generator.process
         t = None if u is None else process.training_times(u)
@@ -383,7 +384,7 @@ class GeneratorTask(Task):
         )
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
-        """Returns the losses (B,) for clips.
+        """Returns the validation losses (B,) of a batch of clips.
 
         A clip receives the same time, noise and target on every call.
         """
@@ -401,7 +402,7 @@ class GeneratorTask(Task):
             self.val_losses[name].update(value)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean of each loss over the clips of all ranks, with equal weights."""
+        """Logs the mean of each loss over the clips of all ranks, all with equal weight."""
         for name, metric in self.val_losses.items():
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
@@ -414,9 +415,9 @@ def _conditioned(
     batch: MotionBatch,
     u: Tensor | None,
 ) -> tuple[MotionBatch, Condition]:
-    """Returns the motions to predict, without the frames of the prefix, and their conditions.
+    """Returns the motions to predict, without the prefix, and their conditions.
 
-    `u` (B,) are uniform numbers in (0, 1) that determine which targets are requested.
+    `u` (B,) contains uniform numbers in (0, 1) that determine which targets are requested.
     """
     prefix, batch = generator.split_prefix(batch)
     cond = generator.condition(batch)

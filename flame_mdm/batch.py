@@ -158,7 +158,7 @@ class Guide(Protocol):
     """Guides motions (B, F, D) toward a goal, such as world positions."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Changes `x_t` so that its clean estimate is closer to the goal, and returns it.
+        """Returns a version of `x_t` whose clean estimate is closer to the goal.
 
         Args:
             clean: function that returns the clean estimate of a noisy motion.

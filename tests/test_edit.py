@@ -187,7 +187,7 @@ def test_parts_of_an_edit_share_what_the_durations_leave(seconds, frames):
     """Durations are rounded to the nearest frame: 25.8 becomes 26, and 24.8 becomes 25."""
     parts = [("walks", duration) for duration in seconds]
     if frames is None:
-        with pytest.raises(UserError, match="the parts are not as long as the motion"):
+        with pytest.raises(UserError, match="the parts do not add up to the length of the motion"):
             _part_length(parts, 60, 20)
     else:
         assert _part_length(parts, 60, 20) == frames
@@ -312,7 +312,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
         (
             diffusion,
             {"region": [1, 2], "region_seconds": [1, 2]},
-            "region and region_seconds exclude each other",
+            "region and region_seconds cannot be combined",
         ),
         (
             diffusion,
@@ -335,17 +335,17 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
             "method=repaint is unknown. Use one of mdm, flame, flame_code",
         ),
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
-        (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion. Omit seconds"),
-        (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),
+        (diffusion, suffix | {"seconds": 3}, "an edit is as long as the motion. Omit seconds"),
+        (diffusion, suffix | {"texts": "walks | jumps"}, "an edit changes a single motion"),
         (
             diffusion,
             {"strength": 0.5, "texts": "walks | jumps | sits"},
-            "the parts are not as long as the motion",
+            "the parts do not add up to the length of the motion",
         ),
         (
             diffusion,
             {"strength": 0.5, "texts": "walks @1.5 | jumps @1"},
-            "not as long .*, which lasts 2 seconds",
+            "do not add up .* of the motion, 2 seconds",
         ),
         (diffusion, {"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
         *(
@@ -390,7 +390,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, su
         ),
         (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
         ("kit:1", {}, "no prepared data set"),
-        ("walk", {}, r"Use a \.npz, \.bvh, .* file, or dataset:id"),
+        ("walk", {}, r"Use a file of type \.npz, \.bvh, .*, or dataset:id"),
         (CLIP[:-2] + "3", {}, r"has no clip .*\. Did you mean synthetic_0_000003"),
         (CLIP, {"cut": [1, 99]}, f"is not a range within {CLIP}, which lasts"),
     ]

@@ -79,7 +79,7 @@ def test_blocks_are_those_of_the_stream_and_a_new_text_replaces_frames_that_were
 def test_a_text_that_is_refused_leaves_the_stream_as_it_was(model):
     live = LiveStreams(model)
     name = live.block("", WALK, 0)["stream"]
-    with pytest.raises(UserError, match="expected a text that says what happens"):
+    with pytest.raises(UserError, match="expected a description of what happens"):
         live.block(name, " ", 20)
     assert live.block(name, WALK, 30)["from"] == 30
 

@@ -100,7 +100,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
             ["mp4=true"],
             'mp4=true: MP4 requires the av package. Run pip install "flame-mdm[video]"',
         ),
-        (b"walks", ["text=jumps"], "text and prompts exclude each other. Use only one of them"),
+        (b"walks", ["text=jumps"], "text and prompts cannot be combined. Use only one of them"),
         (
             b"walks\njumps",
             ["seconds=[1,2,3]"],
@@ -147,7 +147,7 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
         errors,
         (3, 4, 5, 6),
         (
-            "3,000 characters are too many",
+            "the text has 3,000 characters",
             "part 2 is empty",
             "30 seconds (600 frames)",
             "in English only",

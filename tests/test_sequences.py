@@ -145,8 +145,8 @@ def test_parts_have_their_durations_or_as_many_frames_as_fit_into_a_window(
         (sized(20, 60), [None], 1.4, "0.05 seconds .1 frames. are too short"),
         (sized(20, 60), [None], 61.0, "trained on motions of up to 3 seconds"),
         (sized(20, 60), [2.0, 0.45], None, "a part of 0.45 seconds is too short. .* at least 0.5"),
-        (sized(20, 60), [300, 300.1], None, "600.1 seconds are too long. Use at most 600 seconds"),
-        (sized(20, 40, 10), [0.02], None, "0 seconds are too short. Use at least 0.05 seconds"),
+        (sized(20, 60), [300, 300.1], None, "600.1 seconds is too long. Use at most 600 seconds"),
+        (sized(20, 40, 10), [0.02], None, "0 seconds is too short. Use at least 0.05 seconds"),
     ],
 )
 def test_lengths_out_of_range_are_refused(model, seconds, usual, message):
@@ -257,11 +257,11 @@ def test_bad_requests_give_one_clear_line(model, subtests):
         ),
         ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Use a \.npz"),
         ("walks", {"seed": 0.5}, "seed=0.5: expected a whole number"),
-        ("walks", {"actions": "walk"}, "texts and actions exclude each other"),
+        ("walks", {"actions": "walk"}, "texts and actions cannot be combined"),
         ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),
         (None, {"actions": "walk"}, "action=walk: this model was trained on captions"),
-        (" ", {}, "empty text"),
-        ([], {}, "empty text"),  # is not an unconditioned motion
+        (" ", {}, "the text is empty"),
+        ([], {}, "the text is empty"),  # is not an unconditioned motion
         (["walk", 3], {}, r"^text=3 is not a string\. Pass a string"),
     ]
     for text, options, message in cases:
@@ -419,7 +419,7 @@ def test_a_window_ends_on_the_way_to_the_next_target(axis, begin, frames, expect
 def test_a_target_may_be_in_the_last_frame():
     targets = root_targets([10, 50, 70], 0, [1.0, 5.0, 9.0])
     targets.check_end(71, 20)
-    with pytest.raises(UserError, match=r"3\.5 seconds is after the end .* is at 3\.45 seconds"):
+    with pytest.raises(UserError, match=r"3\.5 seconds is past the end .* is at 3\.45 seconds"):
         targets.check_end(70, 20)
 
 
@@ -438,7 +438,7 @@ def test_a_target_may_be_in_the_last_frame():
         ({"root": [(1.0, [0.0, 1.0])] * 300}, None),
         (
             {"root": [(1.0, [0.0, 1.0])] * 300, "joints": [(1.0, [None, 1.0, None])]},
-            "601 coordinates are too many. Use at most 600",
+            "the targets have 601 coordinates. Use at most 600",
         ),
     ],
 )
@@ -498,7 +498,7 @@ def test_bad_targets_give_one_clear_line(model, tmp_path, subtests):
         ),
         (
             {"root": [{"time": 9, "position": [0, 1]}]},
-            "9 seconds is after .* last frame is at 1.95 seconds",
+            "9 seconds is past .* last frame is at 1.95 seconds",
         ),
         (
             {"joints": [{"time": 1, "joint": "left_rist", "position": [0, 1, 0]}]},
@@ -527,9 +527,9 @@ def test_the_command_prints_the_distance_and_bad_words_are_one_line(
     (tmp_path / "t.json").write_text("{}")
     for options, message in (
         ([], "nothing to sample. Set text="),
-        (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),
+        (["text=walks", "unconditioned=true"], "text and unconditioned cannot be combined"),
         (["text=walks", "path=0,1 2"], "path=0,1 2: expected waypoints as x,z in meters"),
-        (["text=walks", "path=0,1", "targets=t.json"], "path and targets exclude each other"),
+        (["text=walks", "path=0,1", "targets=t.json"], "path and targets cannot be combined"),
     ):
         with subtests.test(options=options, message=message):
             assert message in error_of(capsys, "sample", "quickstart", *options)

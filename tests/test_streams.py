@@ -242,7 +242,7 @@ def test_texts_at_times_give_the_same_motion_whenever_they_are_typed(model):
     assert [len(block.joints) for block in blocks] == [30, 15, 25, 30]
     assert np.array_equal(joints(islice(early, 4)), joints(blocks))
     with pytest.raises(
-        UserError, match=r"at=1: the stream is already at 5 seconds\. Set at to a later time"
+        UserError, match=r"at=1: the stream is already at 5 seconds\. Use a later time"
     ):
         late.change("a person jumps", at=1)
 
@@ -266,9 +266,7 @@ def test_frames_that_were_not_used_can_be_replaced(model, subtests):
             ),
         ):
             late.go_back(at)
-    with pytest.raises(
-        UserError, match="cleanup=true: a cleaned block depends on the block after it"
-    ):
+    with pytest.raises(UserError, match="cleanup=true: a cleaned block depends on the next block"):
         stream(model, "a person walks", cleanup=True).go_back(1)
 
 
@@ -544,14 +542,14 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
             lambda: stream(model, "a person walks", block=31),
             "block=31: this model predicts 30 frames at once",
         ),
-        (lambda: stream(model, " "), "expected a text that says what happens"),
+        (lambda: stream(model, " "), "expected a description of what happens"),
         (
             lambda: generate(model, "a person walks", loop=True),
             "loop=true: this model continues frames",
         ),
         (
             lambda: generate(model, "a person walks", stages=[]),
-            "trajectory: not supported by models that continue frames",
+            "trajectory: not supported by models that continue motions",
         ),
         (
             lambda: generate(model, "a person walks", after=short),
@@ -559,13 +557,13 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
         ),
         (
             lambda: edit(model, walk, region="in_between"),
-            "this model continues frames and cannot edit",
+            "this model can only continue motions",
         ),
         (
             lambda: generate(model, "a person walks", seconds=601),
-            "601 seconds are too long. Use at most 600",
+            "601 seconds is too long. Use at most 600",
         ),
-        (lambda: generate(model, "a person walks", seconds=0), "0 seconds are too short"),
+        (lambda: generate(model, "a person walks", seconds=0), "0 seconds is too short"),
     ):
         with subtests.test(message=message):
             with pytest.raises((UserError, FileNotFoundError), match=message) as error:

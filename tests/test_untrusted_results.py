@@ -169,7 +169,7 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
         "sample",
         f"ckpt={trained}",
         f"text={'a person walks ' * 66_667}",
-        says=" characters are too many",
+        says=": the text has 1,000,005 characters",
     )
     with pytest.raises(
         UserError, match=r"samples=2 for each text: a request may have at most 10,000 motions"

@@ -288,7 +288,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         Raises `UserError` if more than one condition is requested, or if a value is invalid.
         """
         if len(conditions := self.conditions()) > 1:
-            raise UserError(f"{' and '.join(conditions)} exclude each other. Use only one of them")
+            raise UserError(f"{' and '.join(conditions)} cannot be combined. Use only one of them")
         keywords: dict[str, Any] = {
             **self._fields(SamplingRequest),
             "texts": self.text,

@@ -1,2 +1,2 @@
 # pyright: standard
-"""Sampling: requests, generation, editing, sequences of texts, and world-space targets."""
+"""Sampling: requests, generation, editing, sequences of actions, and world-space targets."""

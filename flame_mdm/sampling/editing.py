@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motion editing without additional training: part of a motion is kept, the rest is resampled."""
+"""Motion editing without additional training: keeps part of a motion and resamples the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,29 +29,30 @@ from flame_mdm.sampling.resolution import ResolvedRequest, resolve
 MFM_STEPS = 25
 """Number of sampling steps for MFM's edits.
 
-With `until` = 0.2, "the first 6 time steps" are the steps up to "0.2 time" (i / 25 <= 0.2).
+With this number and `until` = 0.2, the paper's "first 6 time steps" agree with its "0.2 time" (i /
+25 <= 0.2).
 """
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class Edited(Motion):
-    """An edited motion with its original, and the errors of the kept part.
+    """An edited motion, with the original motion and the errors of the kept part.
 
-    The joint error can be large although features are kept. Features are relative to the root, so
-    a kept part continues from the end of a resampled part.
+    The joint error can be large although the features are kept: they are relative to the root, so
+    that a kept part starts where the resampled part before it ends.
 
     Example:
         >>> import flame_mdm
         >>> from flame_mdm.sampling.editing import Edited
-        >>> issubclass(Edited, flame_mdm.Motion)  # it is saved and shown like other motions
+        >>> issubclass(Edited, flame_mdm.Motion)  # so it can be saved and shown like other motions
         True
     """
 
     #: The motion before editing.
     original: Motion
-    #: (F, D) bool, True = this feature in this frame should be kept.
+    #: (F, D) bool, True = this feature should be kept in this frame.
     keep: np.ndarray
-    #: Maximum change of the kept values, in normalized features. It is 0 if the method is exact.
+    #: Maximum change of the kept features, which are normalized. It is 0 if the method is exact.
     feature_error: float
     #: Maximum distance in meters between the world positions of kept joints before and after the
     #: edit.
@@ -60,13 +61,13 @@ class Edited(Motion):
 
 @dataclass(frozen=True)
 class ResolvedEdit:
-    """An edit resolved for one model, together with the original motion.
+    """An edit that was resolved for a model, together with the original motion.
 
     Attributes:
         resolved: the resolved request, which includes the kept part.
-        original: the original motion, with the model's features.
-        keep: (F, D) bool, features to keep.
-        kept_joints: (F, J) bool, joints to keep.
+        original: the original motion, with features in the model's representation.
+        keep: (F, D) bool, True = keep this feature in this frame.
+        kept_joints: (F, J) bool, True = keep this joint in this frame.
     """
 
     resolved: ResolvedRequest
@@ -88,30 +89,29 @@ def edit(
     """Resamples part of a motion and keeps the rest, without additional training.
 
     Only the `joints` in the frames of `region` are resampled. By default, all joints and all frames
-    are resampled. With `strength`, the result is a variation of the motion instead of a new motion.
+    are resampled. With `strength`, the result is a variation of the motion rather than a new one.
 
     Args:
         model: the model, from `flame_mdm.load`.
-        motion: a file or clip that `read_motion` reads; a generated or read motion; or joint
-            positions (F, J, 3) in meters, with y up and in the joint order of a known skeleton.
-        texts: what the person does in the new part; one text or several. Default: unconditioned,
-            unless `actions` are given.
-        fps: frames per second of an array or an .npy file. For other files, it overrides the rate
-            in the file.
+        motion: a `Motion`, a file or clip that `read_motion` can read, or joint positions (F, J, 3)
+            in meters, with y up and in the joint order of a known skeleton.
+        texts: what the person does in the new part, as one string or several. By default, the new
+            part is unconditioned, unless `actions` are given.
+        fps: frames per second of an array or an .npy file. For other files, it overrides the frame
+            rate that the file states.
         cut: the part of the motion to use, as [begin, end] in seconds. Default: the entire motion.
-        stages: list that receives clean estimates of the first motion, at equal intervals of the
-            sampling, and then the motion itself.
+        stages: list to which clean estimates of the first motion are appended, at equal intervals
+            of the sampling run, followed by the motion itself.
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
             `method`, `until` and `resample` select how it is resampled. All of them are described
             in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
             also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
-            changes the kept part, usually by millimeters; `Edited.joint_error` is the size of the
-            change.
+            changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
 
     Returns:
-        One edited motion per sample, `samples` for each text: all samples of the first text in
-        order, then all samples of the second text, and so on. The original is not in the list; it
-        is the attribute `original` of each edited motion.
+        The edited motions, `samples` for each text: first all samples of the first text, then all
+            samples of the second text, and so on. The list does not contain the original, which is
+            the attribute `original` of each edited motion.
 
     Raises:
         UserError: If the request is invalid, the process does not support the method, or the
@@ -141,12 +141,12 @@ def resolve_edit(
 ) -> ResolvedEdit:
     """Reads the motion and determines which of its features `request.editing` keeps.
 
-    `edit` describes the arguments `motion`, `fps` and `cut`, and the errors.
+    The docstring of `edit` describes the arguments `motion`, `fps` and `cut`, and the errors.
     """
     representation, editing = model.representation, request.editing or EditRequest()
     if model.denoiser.context_frames:
         raise UserError(
-            "this model continues frames and cannot edit. Use generate with after=, or another model"
+            "this model can only continue motions. Use generate with after=, or another model"
         )
     original = _original(representation, motion, fps, cut)
     length, longest = len(original.features), model.facts["max_frames"]
@@ -162,7 +162,7 @@ def resolve_edit(
 
     edit_options, options = method_options(model.process, editing, request.options)
     frames = [_part_length(parts, length, original.fps) for parts in request.parts]
-    # The sentence is not divided into actions, because an edit changes a single motion.
+    # The sentence is not split into actions, because an edit changes a single motion.
     fitted = replace(request, frames=frames, options=options, editing=None, split=False)
     features = torch.from_numpy(original.features).to(model.device)
     normalized = representation.normalize(features)[None]
@@ -174,10 +174,11 @@ def resolve_edit(
 def sample_edit(
     model: MotionGenerator, edit: ResolvedEdit, *, stages: list[Motion] | None = None
 ) -> list[Edited]:
-    """Samples the motions of a resolved edit, and measures the errors of the kept part."""
+    """Samples the motions of a resolved edit and measures the errors of their kept parts."""
     representation, original, request = model.representation, edit.original, edit.resolved.request
     keep, kept_joints = edit.keep.numpy(), edit.kept_joints.numpy()
-    # Normalization rounds, so kept values are compared with the input of the sampler.
+    # Normalization causes rounding errors, so the kept values are compared with the sampler's
+    # input.
     assert edit.resolved.edit is not None
     exact = representation.denormalize(edit.resolved.edit.known[0]).cpu().numpy()
     std = representation.std.cpu().numpy()
@@ -209,7 +210,7 @@ def _original(
     fps: float | None,
     cut: Sequence[float] | None,
 ) -> Motion:
-    """Returns the motion to edit (or its part `cut`) with features of the representation."""
+    """Returns the motion to edit, or its part `cut`, with features of the representation."""
     if isinstance(motion, str | Path):
         return read_motion(representation, motion, fps=fps, cut=cut)
     if not isinstance(motion, Motion):
@@ -221,16 +222,16 @@ def _original(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the number of frames of each part without a stated duration.
+    """Returns the number of frames of each part whose duration the text does not state.
 
-    Together, all parts must be as long as the motion.
+    The parts must add up to the length of the motion.
     """
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)
     fits = rest == 0 if others == 0 else rest >= others and rest % others == 0
     if not fits:
         raise UserError(
-            f"the parts are not as long as the motion, which lasts {length / fps:g} seconds. State the "
+            f"the parts do not add up to the length of the motion, {length / fps:g} seconds. State the "
             "duration of each part, as in 'walks @2 | sits @1'"
         )
     return rest // max(1, others)
@@ -239,9 +240,9 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
 def kept_parts(
     representation: Representation, length: int, editing: EditRequest
 ) -> tuple[Tensor, Tensor]:
-    """Returns which features (F, D) and joints (F, J) an edit keeps in each frame.
+    """Returns which features (F, D) and joints (F, J) an edit keeps in each of F frames.
 
-    The motion has `length` = F frames.
+    `length` is F, the number of frames of the motion.
     """
     new_frames = _new_frames(length, representation.fps, editing)[:, None]
     if editing.joints is None:
@@ -282,9 +283,9 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options for `Edit` and for the sampler.
+    """Returns the options for `Edit` and for the sampler that an editing method requires.
 
-    They belong to the requested method or, if none is requested, to the default method of the process.
+    If the request names no method, the default method of the process is used.
     """
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes

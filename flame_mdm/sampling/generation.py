@@ -24,9 +24,9 @@ from flame_mdm.sampling.sequences import overlap, windows
 from flame_mdm.sampling.streams import Schedule, Streams, starting_point
 
 BATCH = 32
-STAGES = 10  # number of clean estimates that are shown per sampling run, as in figure 5 of MFM
+STAGES = 10  # clean estimates to show per sampling run, as in MFM's figure 5
 Score = Callable[[Sequence[Motion]], Sequence[float]]
-"""A function that returns the scores of motions, such as the candidates for a text. Higher is better."""
+"""A function that scores motions, such as the candidates for a text. Higher scores are better."""
 
 
 def generate(
@@ -40,20 +40,20 @@ def generate(
 ) -> list[Motion]:
     """Generates motions for texts or actions, or unconditioned motions if neither is given.
 
-    A motion depends only on its text, its length, the sample number and the seed, not on other
-    texts. If a text is given several times, sample numbers continue, so its samples differ. "A
-    man walks, then sits down" becomes the sequence "A man walks | sits down", unless
-    `split=False`.
+    A motion depends only on its text, its length, its sample number and the seed, not on the other
+    texts. If the same text is given several times, sample numbers continue, so that all of its
+    samples differ. "A man walks, then sits down" becomes the sequence "A man walks | sits down",
+    unless `split=False`.
 
     Args:
         model: the model, from `flame_mdm.load`.
-        texts: what the person does; one text or several.
+        texts: what the person does, as one string or several.
         score: function that scores the `candidates` without faults. The candidate with the highest
-            score is kept. Default: the candidate with the fewest faulty frames is kept.
-        edit: an edit that keeps part of a motion of the same length in every sample. `known` and
-            `keep` have the shape (1, F, D).
-        stages: list that receives clean estimates of the first motion, at equal intervals of the
-            sampling, and then the motion itself (MFM, figure 5).
+            score is kept. By default, the candidate with the fewest faulty frames is kept.
+        edit: an edit that keeps part of a motion in every sample. The motion is as long as the
+            samples; `known` and `keep` have the shape (1, F, D).
+        stages: list to which clean estimates of the first motion are appended, at equal intervals
+            of the sampling run, followed by the motion itself (MFM, figure 5).
         keywords: number and length of the motions, and sampling options: `actions` (instead
             of texts), `seconds` or `frames` (default: 3 seconds, or less for one or two
             repetitions, as in "kicks twice"), `samples` (1) per text,
@@ -64,8 +64,8 @@ def generate(
             `flame_mdm.sampler_options.SamplerOptions` describe them.
 
     Returns:
-        One motion per sample, `samples` for each text: all samples of the first text in order,
-        then all samples of the second text, and so on.
+        The motions, `samples` for each text: first all samples of the first text, then all samples
+            of the second text, and so on.
 
     Raises:
         UserError: If the request is invalid, the model cannot do what is requested, or the model
@@ -101,11 +101,11 @@ def sample(
     if model.denoiser.context_frames and (stages is not None or resolved.edit is not None):
         keyword = "edit" if stages is None else "trajectory"
         raise UserError(
-            f"{keyword}: not supported by models that continue frames block by block. Omit {keyword}"
+            f"{keyword}: not supported by models that continue motions block by block. Omit {keyword}"
         )
     if stages is not None and request.candidates > 1:
         raise UserError(
-            "trajectory shows the estimates of a single motion: omit candidates or trajectory"
+            "trajectory shows estimates of a single motion. Omit candidates or trajectory"
         )
     rows = _rows(resolved)
     motions: list[Motion] = []
@@ -128,8 +128,8 @@ def sample(
 def best(candidates: Sequence[Motion], score: Score | None = None) -> Motion:
     """Returns the candidate without faults that has the highest score.
 
-    If all candidates have faults, all of them are scored. Without `score`, returns the candidate
-    with the fewest faulty frames.
+    If all candidates have faults, all of them are scored. Without `score`, the candidate with the
+    fewest faulty frames is returned.
     """
     faulty = [_faulty_frames(motion) for motion in candidates]
     if score is None:
@@ -147,7 +147,7 @@ def _faulty_frames(motion: Motion) -> int:
 
 @dataclass(frozen=True)
 class _Row:
-    """A motion of a batch: its prompt, and the name that seeds its noise."""
+    """A motion to sample: its prompt and the name that seeds its noise."""
 
     prompt: ResolvedPrompt
     id: str
@@ -209,7 +209,8 @@ def _sample_streams(
 ) -> list[Motion]:
     """Samples motions as the beginnings of streams.
 
-    Motions with targets are sampled one by one, because their guidance is for a single motion.
+    Motions with targets are sampled one by one, because guidance toward targets supports only a
+    single motion.
     """
     if resolved.targets is not None and len(rows) > 1:
         return [motion for row in rows for motion in _sample_streams(model, resolved, [row])]
@@ -219,7 +220,7 @@ def _sample_streams(
         features = before[-model.denoiser.context_frames :].to(model.device)
         prefix = model.representation.normalize(features)[None]
 
-    # The noise depends only on the first part, so later parts do not change earlier frames.
+    # The noise depends only on the first part, so that later parts do not affect earlier frames.
     numbers = [row.id.rpartition("#")[2] for row in rows]
     first = [row.prompt.conditions[0] for row in rows]
     ids = [f"{condition}#{number}" for condition, number in zip(first, numbers, strict=True)]
@@ -242,7 +243,7 @@ def _sample_streams(
 
 
 def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit | None:
-    """Returns the edit of a batch x (B, F, D): its kept parts and targets, padded to F frames."""
+    """Returns the edit for a batch x (B, F, D), including targets and padded to F frames."""
     edit, frames = resolved.edit, x.shape[1]
     if resolved.targets is not None:
         goal = resolved.targets.edit(model.representation, frames, model.device)
@@ -255,7 +256,7 @@ def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit 
 
 
 def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Tensor) -> Motion:
-    """Converts normalized features (F, D) to a motion, placed after the motion that it continues."""
+    """Converts normalized features (F, D) to a motion, which starts where the previous one ends."""
     representation, prompt = model.representation, row.prompt
     features = representation.denormalize(x[: sum(prompt.frames)].float())
     if resolved.before is not None:
@@ -283,7 +284,7 @@ class _First(list[Tensor]):
 def _stages(model: MotionGenerator, trajectory: Sequence[Tensor], result: Motion) -> list[Motion]:
     """Returns up to `STAGES` clean estimates of the first motion, followed by the motion.
 
-    The estimates are at equal intervals of the denoiser's calls.
+    The estimates come from calls of the denoiser at equal intervals.
     """
     count, stages = len(trajectory), []
     for call in sorted({index * count // STAGES for index in range(STAGES)}):

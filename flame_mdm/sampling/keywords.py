@@ -1,8 +1,8 @@
 # pyright: standard
 """Keywords of `flame_mdm.generate` and `flame_mdm.edit`, with their types.
 
-The keywords are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`. These classes
-contain the defaults and help texts.
+The keywords are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`. Their defaults
+and help texts are in these classes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ class SamplerKeywords(TypedDict, total=False):
 
 
 class SamplingKeywords(SamplerKeywords, total=False):
-    """Fields of `SamplingRequest`, except the texts, and of `SamplerOptions`."""
+    """Fields of `SamplingRequest` (except `texts`) and of `SamplerOptions`."""
 
     actions: str | Sequence[str] | None
     seconds: float | Sequence[float] | None
@@ -42,7 +42,7 @@ class SamplingKeywords(SamplerKeywords, total=False):
 
 
 class EditKeywords(SamplingKeywords, total=False):
-    """Fields of `EditRequest`, and `SamplingKeywords`."""
+    """Fields of `EditRequest`, in addition to `SamplingKeywords`."""
 
     region: str | Ranges | None
     region_seconds: Ranges | None

@@ -22,13 +22,13 @@ from flame_mdm.sampler_options import SamplerOptions
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-# Maximum number of samples per request. All samples are kept in memory until the last one is
-# complete.
+# Maximum number of samples per request. All samples are kept in memory until the last one has been
+# generated.
 MAX_SAMPLES = 10_000
 # Maximum number of characters per text. Captions in the data sets are far shorter.
 MAX_TEXT_LENGTH = 2000
-# Duration in seconds of a motion or a part, if neither the request nor a number of repetitions
-# determines it
+# Default duration of a motion or a part, in seconds, used when neither the request nor a number of
+# repetitions determines it
 USUAL_SECONDS = 3.0
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
@@ -41,8 +41,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "flame_code": {"mode": "x_t", "blend": "before"},
     "mfm": {"mode": "trajectory", "until": 0.2},
 }
-"""Editing methods of the papers, as options of `flame_mdm.batch.Edit`."""
-# Names that `region` accepts for the frames to resample
+"""Options of `flame_mdm.batch.Edit` for the editing methods from the papers."""
+# Names of the regions of frames that `region` accepts
 REGIONS = (
     "in_between",
     "prediction",
@@ -51,7 +51,7 @@ REGIONS = (
     "interpolate",
 )
 
-# Text of one part of a sequence, and its duration in seconds, or None if the text states no duration
+# Text of one part of a sequence and its duration in seconds, which is None if it is not stated
 Part = tuple[str, float | None]
 Waypoints = Sequence[tuple[float, float]]  # x and z in meters
 Ranges = Sequence[float] | Sequence[Sequence[float]]
@@ -60,10 +60,10 @@ ARRIVAL = 0.2  # seconds between the last waypoint of a path and the end of the 
 
 @dataclass(frozen=True, kw_only=True)
 class EditRequest:
-    """The part of a motion to resample, and the editing method: keywords of `flame_mdm.edit`.
+    """Keywords of `flame_mdm.edit`: the part of the motion to resample, and the editing method.
 
     Raises:
-        UserError: If a value is invalid regardless of the motion.
+        UserError: If a value is invalid for any motion.
 
     Example:
         >>> EditRequest(region_seconds=[[0, 1], [3, 4]], joints="left_arm").ranges
@@ -76,7 +76,7 @@ class EditRequest:
         "quarter), suffix (keeps the last quarter), interpolate (keeps every fifth frame), or one or more [begin, end]",
     )
     region_seconds: Ranges | None = option(
-        None, "one or more [begin, end] in seconds, instead of region"
+        None, "one or more [begin, end] in seconds, to be used instead of region"
     )
     joints: str | Sequence[str] | None = option(
         None,
@@ -100,12 +100,12 @@ class EditRequest:
     strength: float | None = option(
         None,
         "varies the motion: noise is added to it, and only this fraction of the sampling steps "
-        "(above 0, up to 1) is taken. A smaller fraction gives a result closer to the motion",
+        "(above 0, up to 1) is taken. A smaller fraction keeps the result closer to the motion",
     )
 
     def __post_init__(self) -> None:
         if self.region is not None and self.region_seconds is not None:
-            raise UserError("region and region_seconds exclude each other. Use one of them")
+            raise UserError("region and region_seconds cannot be combined. Use one of them")
         for name, choices in (("region", REGIONS), ("method", METHODS)):
             value = getattr(self, name)
             if isinstance(value, str) and value not in choices:
@@ -113,7 +113,7 @@ class EditRequest:
                     f"{name}={value} is unknown.{did_you_mean(value, choices)} Use one "
                     f"of {', '.join(choices)}"
                 )
-        _ = self.ranges  # raises if they are invalid
+        _ = self.ranges  # raises an error if they are invalid
         if self.joints is not None and not self.joints:
             raise UserError(
                 "joints: the list is empty. List the joints to resample, or omit joints to resample all of "
@@ -128,7 +128,7 @@ class EditRequest:
 
     @property
     def ranges(self) -> list[tuple[float, float]] | None:
-        """The ranges in `region` or `region_seconds`, or None if neither contains ranges."""
+        """The ranges given as `region` or `region_seconds`, or None if neither contains any."""
         name = "region" if self.region_seconds is None else "region_seconds"
         value: Any = getattr(self, name)
         if value is None or (name == "region" and isinstance(value, str)):
@@ -141,10 +141,10 @@ class EditRequest:
         return [(begin, end) for begin, end in listed]
 
     def method_options(self, method: str) -> dict[str, Any]:
-        """Returns the options of `flame_mdm.batch.Edit` for a method.
+        """Returns the options of `flame_mdm.batch.Edit` for an editing method.
 
         Raises:
-            UserError: If this request sets an option that the method does not have.
+            UserError: If the request sets an option that the method does not have.
         """
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
@@ -160,19 +160,20 @@ class EditRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingRequest:
-    """Motions to sample: keywords of `flame_mdm.generate`.
+    """Keywords of `flame_mdm.generate`: the motions to sample.
 
-    Motions are sampled for texts or actions. If neither is given, motions are unconditioned.
+    Motions are sampled for texts or actions, or without a condition if neither is given.
 
-    A text or action may consist of several parts, which may state their durations in seconds, as in
-    "walks forward @3 | turns left | sits down @2". The parts are generated together as one motion,
-    in overlapping windows; see docs/sequences.md. A single part with a duration, such as "walks
-    forward @10", is also generated in windows. Such a part may be longer than the training motions.
+    A text or action may consist of several parts, each of which may state its duration in seconds,
+    as in "walks forward @3 | turns left | sits down @2". The parts are generated together as one
+    motion, in overlapping windows; see docs/sequences.md. A single part with a duration, such as
+    "walks forward @10", is also generated in windows, so that it may be longer than the training
+    motions.
 
     `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
 
     Raises:
-        UserError: If a value is invalid for every model, or two values contradict each other.
+        UserError: If a value is invalid for all models, or if two values contradict each other.
 
     Example:
         >>> SamplingRequest(texts="walks forward @3 | turns left | sits down @2").parts
@@ -184,30 +185,30 @@ class SamplingRequest:
         'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)',
     )
     actions: str | Sequence[str] | None = option(
-        None, "an action label, for models trained on labels"
+        None, "an action label, for models that were trained on labels"
     )
     seconds: float | Sequence[float] | None = option(
         None,
-        "length of the motion in seconds, or a list with one length per text. In a sequence, the "
-        "length of each part whose text does not state its own (as @2 does). Default: the "
+        "length of the motion in seconds, or a list with one length per text. In a sequence, this "
+        "is the length of each part whose text does not state a length (as @2 does). Default: the "
         "time that a stated number of repetitions takes; otherwise 3, or the length of the longest "
         "training motion if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
-        None, "length in frames, or a list of lengths, instead of seconds"
+        None, "length in frames, or a list of lengths, to be used instead of seconds"
     )
     samples: int = option(1, "motions per text or action")
     candidates: int = option(
         1,
         "number of motions to generate for each motion that is kept. The best motion without "
-        "faults is kept or, if all have faults, the best of all",
+        "faults is kept or, if all of them have faults, the best of all",
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(None, "motion to continue: FILE or dataset:id")
     split: bool = option(
         True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
     )
-    loop: bool = option(False, "true = generate a loop: the last frame leads to the first one")
+    loop: bool = option(False, "true = generate a loop, whose last frame leads to the first one")
     targets: str | Path | Mapping[str, Any] | None = option(
         None, "JSON file with waypoints, joint positions and poses to reach; see docs/targets.md"
     )
@@ -253,7 +254,7 @@ class SamplingRequest:
     def __post_init__(self) -> None:
         for name in ("texts", "actions", "seconds", "frames"):
             value = getattr(self, name)
-            # NumPy arrays and numbers are converted to lists and numbers
+            # NumPy arrays and scalars are converted to lists and Python numbers
             value = value.tolist() if hasattr(value, "tolist") else value
             if isinstance(value, str) and name in ("texts", "actions"):
                 value = (value,)
@@ -273,7 +274,7 @@ class SamplingRequest:
         if self.path is not None:
             if self.targets is not None:
                 raise UserError(
-                    f"path={self.path}: path and targets exclude each other. Use one of them"
+                    f"path={self.path}: path and targets cannot be combined. Use one of them"
                 )
             object.__setattr__(self, "path", read_path(self.path))
 
@@ -289,12 +290,13 @@ class SamplingRequest:
             self.check_edit(edit.strength is not None and is_whole)
             if self.seconds is not None or self.frames is not None:
                 raise UserError(
-                    "an edit is as long as its motion. Omit seconds and frames, or select a part with cut=[begin, end]"
+                    "an edit is as long as the motion. Omit seconds and frames, or select a part with "
+                    "cut=[begin, end]"
                 )
 
     def _check_prompts(self) -> None:
         if self.texts is not None and self.actions is not None:
-            raise UserError("texts and actions exclude each other. Use one of them")
+            raise UserError("texts and actions cannot be combined. Use one of them")
         for prompt in self.prompts:
             if not isinstance(prompt, str):
                 raise UserError(
@@ -302,7 +304,7 @@ class SamplingRequest:
                 )
             check_length(prompt)
         if self.texts is not None and not all(text.strip() for text in self.prompts):
-            raise UserError("empty text. Omit the text to sample without a condition")
+            raise UserError("the text is empty. Omit it to sample without a condition")
 
         copies = self.samples * self.candidates
         if len(self.prompts) * copies > MAX_SAMPLES:
@@ -310,11 +312,11 @@ class SamplingRequest:
             raise UserError(
                 f"{key}={copies} for each text: a request may have at most {MAX_SAMPLES:,} motions"
             )
-        _ = self.parts  # raises if a part is invalid
+        _ = self.parts  # raises an error if a part is invalid
 
     def _check_lengths(self) -> None:
         if self.seconds is not None and self.frames is not None:
-            raise UserError("seconds and frames exclude each other. Use one of them")
+            raise UserError("seconds and frames cannot be combined. Use one of them")
         name = "frames" if self.seconds is None else "seconds"
         value: Any = getattr(self, name)
         if value is None:
@@ -337,7 +339,7 @@ class SamplingRequest:
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self, varies: bool) -> None:
-        """Checks a request to edit part of a motion or, if `varies`, to vary the entire motion.
+        """Checks a request that edits part of a motion or, if `varies`, varies the entire motion.
 
         Raises:
             UserError: If the request contains options that do not apply to edits or variations.
@@ -347,12 +349,12 @@ class SamplingRequest:
                 "Variations of an entire motion (strength=0.5) may have parts, loop and targets"
             )
             raise UserError(
-                f"an edit keeps a single motion: omit parts (|), after, loop and targets. {advice}"
+                f"an edit changes a single motion: omit parts (|), after, loop and targets. {advice}"
             )
 
     @property
     def kind(self) -> Literal["text", "action", "none"]:
-        """The kind of condition of the motions."""
+        """Kind of condition of the motions to sample."""
         return (
             "text" if self.texts is not None else "action" if self.actions is not None else "none"
         )
@@ -364,7 +366,7 @@ class SamplingRequest:
 
     @property
     def prompts(self) -> tuple[str, ...]:
-        """The texts or actions, or a single empty text if there are none."""
+        """The texts or actions, or a single empty string if there are none."""
         return tuple(self.texts or self.actions or ("",))
 
     @cached_property
@@ -379,15 +381,15 @@ class SamplingRequest:
     def is_sequence(self) -> bool:
         """Whether motions are generated in windows.
 
-        This is the case if a prompt has parts or seconds, or if motions loop or continue another
-        motion.
+        This is the case if a prompt has several parts or states a duration, or if the motions loop
+        or continue another motion.
         """
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
-        """Returns the requested length of each prompt as an unrounded number of frames.
+        """Returns the requested length of each prompt as a number of frames, not rounded.
 
-        The length is None if no length was requested.
+        The entries are None if no length was requested.
         """
         value: Any = self.frames if self.seconds is None else self.seconds
         lengths = value if isinstance(value, tuple) else [value] * len(self.prompts)
@@ -406,20 +408,20 @@ def _selected(keywords: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
 
 
 def check_length(text: str) -> None:
-    """Raises `UserError` if the text has too many characters."""
+    """Raises `UserError` if the text is too long."""
     if len(text) > MAX_TEXT_LENGTH:
         raise UserError(
-            f"{shortened(text, 60)}: {len(text):,} characters are too many. Use at most {MAX_TEXT_LENGTH:,}"
+            f"{shortened(text, 60)}: the text has {len(text):,} characters. Use at most {MAX_TEXT_LENGTH:,}"
         )
 
 
 def is_timed(parts: Sequence[Part]) -> bool:
-    """Returns whether a prompt has several parts, or a part with a stated duration."""
+    """Returns whether a prompt has several parts or states a duration."""
     return len(parts) > 1 or parts[0][1] is not None
 
 
 def read_parts(text: str) -> list[Part]:
-    """Splits "walks @3 | sits down" into parts, [("walks", 3.0), ("sits down", None)].
+    """Splits "walks @3 | sits down" into the parts [("walks", 3.0), ("sits down", None)].
 
     Raises:
         UserError: If a part is empty, or its duration is not a number of seconds above 0.
@@ -451,7 +453,7 @@ def is_range(value: Any) -> bool:
 
 
 def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
-    """Returns the waypoints (x, z) in meters from a string "x,z x,z ..." or from pairs.
+    """Returns the waypoints (x, z), in meters, in a string "x,z x,z ..." or a sequence of pairs.
 
     Raises:
         UserError: If there are no waypoints, or they cannot be read.
@@ -468,7 +470,7 @@ def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
 
 
 def path_targets(path: Waypoints, seconds: float) -> dict[str, Any]:
-    """Returns targets that lead a motion of `seconds` along a path at a constant speed.
+    """Returns targets that lead a motion along a path at a constant speed.
 
     The path starts at x = z = 0.
     """

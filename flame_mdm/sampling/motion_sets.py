@@ -1,7 +1,7 @@
 # pyright: standard
 """Sets of motions for game engines: loops, starts, stops and turns that fit together.
 
-A file lists the motions of a set.
+The motions of a set are listed in a YAML file.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,9 +42,10 @@ from flame_mdm.visualize import contact_sheet, write_player
 from flame_mdm.visualize.body import Mesh
 
 SETS = Path(__file__).parent / "sets"
-# Suffix of the names of files without a root trajectory
+# Suffix for the names of files without a root trajectory
 IN_PLACE = "_InPlace"
-# Seconds that are inserted between clips while the rotations of all clips are computed
+# Length, in seconds, of the gaps between clips when the rotations of all clips are computed
+# together
 SEPARATION = 1.0
 NAME = r"^[A-Za-z0-9_-]{1,60}$"
 WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
@@ -54,9 +55,8 @@ WRITERS: dict[str, Callable[[Path, RiggedClip], None]] = {
     "usdc": usd.write,
     "usdz": usd.write,
 }
-"""Functions that write a clip, by format."""
-# Penalty per meter that a foot slides, relative to the penalty per meter of difference between
-# poses
+"""Functions that write a clip, by file format."""
+# Penalty per meter of foot sliding, relative to the penalty per meter of difference between poses
 SLIDING = 200.0
 # Penalty per degree of rotation of a planted foot
 PIVOTING = 0.1
@@ -76,7 +76,7 @@ class SetMotion(ClosedSchema):
 
 
 class MotionSet(ClosedSchema):
-    """Content of a file that describes a set; docs/sampling.md explains the keys."""
+    """Content of a file that describes a set of motions; docs/sampling.md explains the keys."""
 
     stand: str
     motions: Annotated[
@@ -90,7 +90,7 @@ class MotionSet(ClosedSchema):
 
 
 def read_set(source: str) -> MotionSet:
-    """Reads a set by its name, such as "locomotion", or from a YAML file.
+    """Reads a set, given its name, such as "locomotion", or a YAML file.
 
     Raises:
         UserError: If the set is invalid.
@@ -126,7 +126,7 @@ def read_set(source: str) -> MotionSet:
 
 
 def changed(content: MotionSet, **values: Any) -> MotionSet:
-    """Returns a set with other values for `rig`, `format` or `fps`.
+    """Returns a set in which the values of `rig`, `format` or `fps` are replaced.
 
     Raises:
         UserError: If a value is invalid.
@@ -149,7 +149,7 @@ def _check_rig(content: MotionSet, name: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class MadeSet:
-    """The clips of a set, and the reasons for omitting motions, by the names of the motions."""
+    """The clips of a set, and the reasons why motions were omitted, by motion name."""
 
     clips: list[Clip]
     left_out: dict[str, str]
@@ -158,11 +158,12 @@ class MadeSet:
 def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **options: Any) -> MadeSet:
     """Generates the motions of a set and cuts them into clips, with a progress bar.
 
-    For each motion, the candidate with the best clips is kept: similar poses at the cuts, feet that
-    neither slide nor jerk, and few faults. A motion that the model cannot generate is left out.
+    For each motion, the candidate with the best clips is kept. In a good clip, the poses at the
+    cuts are similar, the feet neither slide nor jerk, and few frames have faults. Motions that the
+    model cannot generate are omitted.
 
     Args:
-        model: a text-conditioned model with SMPL's 22 joints that samples in windows.
+        model: a text-conditioned model that has SMPL's 22 joints and can sample in windows.
         content: the set.
         seed: seed of the noise.
         options: sampling options, as in `generate`.
@@ -173,7 +174,7 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
     """
     if model.representation.skeleton.joints != SMPL22.joints:
         raise UserError(
-            f"set: the model has the skeleton {model.representation.skeleton.name}, not SMPL's 22 joints"
+            f"set: expected a model with SMPL's 22 joints, not {model.representation.skeleton.name}"
         )
     others = [name for name in content.motions if name != content.stand]
     stand = np.zeros((0, 3))
@@ -205,7 +206,7 @@ def _takes(
 ) -> list[GroundedMotion]:
     """Samples the candidates for a motion.
 
-    Candidates for a loop have three repetitions plus one frame.
+    A candidate for a loop consists of three repetitions plus one frame.
     """
     is_loop, representation = motion.kind == "loop", model.representation
     sampling: SamplerKeywords = {**options}  # type: ignore[typeddict-item]
@@ -234,7 +235,7 @@ def _takes(
 def _clips(
     name: str, motion: SetMotion, take: GroundedMotion, stand: np.ndarray
 ) -> tuple[float, list[Clip]] | None:
-    """Returns the score of a candidate (lower is better) and its clips.
+    """Returns the score of a candidate (lower is better) and the clips that are cut from it.
 
     Returns None if the candidate does not show the motion.
     """
@@ -273,15 +274,15 @@ def _missing(motion: SetMotion) -> str:
 
 
 def motion_of(clip: Clip) -> Motion:
-    """Returns a clip as a motion on its path."""
+    """Converts a clip to a motion that follows the clip's root trajectory."""
     return Motion(clip.motion.world(), clip.motion.fps, SMPL22, clip.name, clip.name)
 
 
 def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
-    """Returns in-place clips that share one skeleton and one skin.
+    """Converts clips to in-place clips that share one skeleton and one skin.
 
-    The rotations of all clips are computed together. Programs apply all animations of a set to the
-    skeleton of the first file, so all clips must have the same rest pose.
+    The rotations of all clips are computed together, because all clips must have the same rest
+    pose: programs apply all animations of a set to the skeleton of the first file.
     """
     fps = clips[0].motion.fps
     joints, frames = gaits.with_neighbors(clips, round(SEPARATION * fps))
@@ -297,9 +298,9 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
 def write_set(
     folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh | None
 ) -> list[str]:
-    """Writes all files of a set into a folder, or none of them. Returns their names.
+    """Writes the files of a set to a folder, all or none of them, and returns their names.
 
-    Each clip is written to two files: one with the root trajectory, and one in place. `set.json`
+    Each clip is written to two files, one with the root trajectory and one in place. `set.json`
     describes the clips, and `set.png` and `player.html` show them.
     """
     in_place = rig_clips(clips.clips, content.rig, body)
@@ -365,8 +366,8 @@ def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str,
 def closure(clip: RiggedClip) -> tuple[float, float]:
     """Returns the differences between the first and the last pose of an in-place clip.
 
-    The first difference is a distance in meters, and the second one is an angle between local
-    rotations in degrees.
+    The first difference is a distance in meters, and the second one is an angle in degrees between
+    local rotations.
     """
     positions, _ = clip.world()
     distance = float(np.linalg.norm(positions[-1] - positions[0], axis=-1).max())

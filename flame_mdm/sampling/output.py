@@ -1,5 +1,5 @@
 # pyright: standard
-"""Output of the sampling commands: folders, files, and summaries of the written files."""
+"""Output of the sampling commands: folders, files, and summaries of what was written."""
 
 import hashlib
 import re
@@ -16,13 +16,13 @@ from flame_mdm.sampling.motion_request import TRAINED_ON
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.body import Mesh
 
-SAMPLES = "samples"  # default folder of the motions
+SAMPLES = "samples"  # default folder for motions
 REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
 """Files that only some requests write."""
 
 
 def refuse_no_condition(model: MotionGenerator) -> None:
-    """Raises the `UserError` for a missing condition, with examples that the model knows."""
+    """Raises a `UserError` that asks for a condition and lists examples that the model knows."""
     examples = list(
         model.facts["actions"]
         if model.conditioned_on == "action"
@@ -34,7 +34,7 @@ def refuse_no_condition(model: MotionGenerator) -> None:
 
 
 def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:
-    """Returns `samples/<experiment>/<title>-<hash>`. The hash covers the title and `request`.
+    """Returns `samples/<experiment>/<title>-<hash>`, where the hash covers the title and `request`.
 
     Requests for different motions thus have different folders, even if the file system ignores
     case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint contains a path
@@ -48,14 +48,14 @@ def default_folder(model: MotionGenerator, title: str, *request: object) -> Path
 
 
 def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
-    """Returns a line about the files that `write_motions` wrote to a folder."""
+    """Returns a line that summarizes the files that `write_motions` wrote to a folder."""
     count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
     files = f"{folder / 'player.html'}, motions.gif" + (", motions.mp4" if mp4 else "")
     return f"{count} of {len(motions[0].joints)} frames: {files}"
 
 
 def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
-    """Returns a warning if the features of some frames determine no rotations, or [] otherwise."""
+    """Returns a warning if features of some frames do not determine rotations, or [] otherwise."""
     degenerate = sum(motion.degenerate for motion in motions)
     if not degenerate:
         return []
@@ -74,11 +74,11 @@ def write_motions(
     *,
     within: str | Path | None = None,
 ) -> None:
-    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder.
+    """Writes `motion_000.npz`, ..., `motions.gif`, `motions.png` and `player.html` to a folder.
 
-    Either all files are written, or none. Files from an earlier request that are not written again
-    are removed. Only the first eight motions are drawn. The stages of a sampling run are drawn in
-    `trajectory.png`. `facts` are added to each `.npz`. Links must not lead out of `within`; see
+    Either all files are written or none, and files that remain from an earlier request are removed.
+    The pictures show only the first eight motions, and `trajectory.png` shows the stages of a
+    sampling run. `facts` are added to each `.npz`. Links must not lead out of `within`; see
     `flame_mdm.safe_io.atomic_folder`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]

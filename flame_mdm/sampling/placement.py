@@ -1,4 +1,4 @@
-"""Placements of bodies in the world, used to join the blocks of a motion."""
+"""Placement of bodies in the world, used to join the blocks of a motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flame_mdm.representations.rotation import rotate_y
 class Placement:
     """Placement of B bodies in the world: a rotation about the vertical axis and a shift on the floor.
 
-    The rotations (B,) are in radians. The shifts (B, 3) are in meters, with y = 0. Both are
+    The rotations (B,) are in radians, and the shifts (B, 3) are in meters, with y = 0. Both are
     float64.
     """
 
@@ -33,7 +33,7 @@ class Placement:
         """Returns the placement that moves poses `local` (B, J, 3) to `world` (B, J, 3).
 
         The placement minimizes the squared error (Kabsch 1976, for a rotation about one axis).
-        Heights are not changed. For equal poses, the error is 0.
+        Heights do not change. If the poses are equal, the error is 0.
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])
@@ -45,28 +45,27 @@ class Placement:
         return cls(turn, to_center - rotate_y(from_center, turn))
 
     def apply(self, joints: Tensor) -> Tensor:
-        """Moves joint positions (B, ..., 3) to the world, in float64."""
+        """Moves joint positions (B, ..., 3) from body coordinates to the world, in float64."""
         ones = (1,) * (joints.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(joints.shape[:-1])
         return rotate_y(joints.double(), turn) + self.shift.view(-1, *ones, 3)
 
     def undo(self, points: Tensor) -> Tensor:
-        """Moves points (B, ..., 3) from the world to body coordinates; the inverse of `apply`."""
+        """Inverts `apply`: moves points (B, ..., 3) from the world to body coordinates."""
         ones = (1,) * (points.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(points.shape[:-1])
         return rotate_y(points.double() - self.shift.view(-1, *ones, 3), -turn)
 
 
 def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
-    """Returns the placement of the next frame.
+    """Returns the placement at which the frames after `last` start when they are decoded.
 
-    A frame contains the turn and the step of the root to the next frame. Therefore, this placement
-    does not depend on the next frame. The next frames start at this placement when they are
-    decoded.
+    It does not depend on these frames, because each frame contains the turn and the step of the
+    root to the next frame.
 
     Args:
         representation: the representation of the features.
-        last: (B, D), features of the last frame.
+        last: (B, D), features of the last frame so far.
         world: (B, J, 3), world joint positions of the last frame.
     """
     joints = representation.decode(torch.stack([last, last], 1))

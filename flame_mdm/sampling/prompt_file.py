@@ -1,5 +1,5 @@
 # pyright: standard
-"""Prompt files. They are read without torch, so that invalid files fail quickly."""
+"""Prompt files, which are read without torch, so that invalid files fail quickly."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PromptFile:
 
     Attributes:
         path: the name of the file, as typed by the user.
-        lines: the prompts by line number, from 1. Blank lines are left out.
+        lines: the prompts by line number, which starts at 1. Blank lines are omitted.
         refused: reasons why prompts cannot be sampled, by line number.
     """
 
@@ -28,16 +28,16 @@ class PromptFile:
 
     @classmethod
     def read(cls, path: str) -> PromptFile:
-        """Reads a file, and refuses prompts that no model can sample.
+        """Reads a file and refuses the prompts that no model can sample.
 
         Raises:
-            UserError: If the file has no prompts.
+            UserError: If the file contains no prompts.
         """
         text = read_text(path, MEBIBYTE)
         lines = enumerate(text.removeprefix("\ufeff").splitlines(), start=1)
         prompts = {number: line.strip() for number, line in lines if line.strip()}
         if not prompts or "\0" in text:
-            raise UserError(f"{path}: no prompts. Write one per line")
+            raise UserError(f"{path} contains no prompts. Write one per line")
 
         file = cls(path, prompts)
         for number, prompt in prompts.items():
@@ -56,14 +56,14 @@ class PromptFile:
         }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
-        """Refuses prompts. The keys of `errors` are their positions among the accepted prompts."""
+        """Refuses prompts; the keys of `errors` are their indices among the accepted prompts."""
         numbers = list(self.accepted)
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 
     def lengths(self, key: str, lengths: Any) -> Any:
-        """Selects the lengths of the accepted prompts, if `lengths` has one entry per prompt.
+        """Returns the lengths of the accepted prompts.
 
-        Otherwise, returns `lengths` unchanged.
+        A single length, which applies to all prompts, is returned unchanged.
         """
         if not isinstance(lengths, Sequence):
             return lengths

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Reads motions from files and prepared data sets, and computes the features of a model."""
+"""Reads motions from files and prepared data sets and computes a model's features."""
 
 import math
 from collections.abc import Sequence
@@ -33,17 +33,16 @@ def read_motion(
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
 ) -> Motion:
-    """Reads a motion and computes the features of a model.
+    """Reads a motion and computes its features in a model's representation.
 
-    Features of the same representation and frame rate are kept. Other motions are converted as in
-    `flame_mdm.formats.conversion` and made canonical. If joints were fitted, the `notes` of the
-    result describe the fit and its error.
+    If the file contains features of the same representation and frame rate, they are kept.
+    Otherwise, the motion is converted as in `flame_mdm.formats.conversion` and made canonical. If
+    joints were fitted, the `notes` of the result describe the fit and its error.
 
     Args:
         representation: the representation of the model.
         source: a motion file, or `dataset:id` for a clip of a prepared data set.
-        fps, unit, up, animation: descriptions of the file, as in
-            `flame_mdm.formats.readers.read`.
+        fps, unit, up, animation: how to read the file; see `flame_mdm.formats.readers.read`.
         cut: the part to use, as [begin, end] in seconds. Default: the entire motion.
         data_root: folder of the prepared data sets.
 
@@ -60,7 +59,7 @@ def read_motion(
         store = Store(Path(data_root) / f"{dataset}-{representation.name}")
         if (rate := store.info["fps"]) != representation.fps:
             raise UserError(
-                f"{store.folder}: prepared at {rate:g} fps, but the model uses {representation.fps:g} fps"
+                f"{store.folder} was prepared at {rate:g} fps, but the model uses {representation.fps:g} fps"
             )
         clips = {clip.id: clip for clip in store.clips}
         if clip_id not in clips:
@@ -71,15 +70,15 @@ def read_motion(
         motion = decoded(representation, torch.from_numpy(features), next(iter(captions), ""), name)
     else:
         raise UserError(
-            f"{name}: not a motion. Use a {', '.join(ENDINGS)} file, or dataset:id for a prepared clip"
+            f"{name}: not a motion. Use a file of type {', '.join(ENDINGS)}, or dataset:id for a prepared clip"
         )
     return motion if cut is None else part_of(representation, motion, cut)
 
 
 def part_of(representation: Representation, motion: Motion, cut: Sequence[float]) -> Motion:
-    """Returns the part [begin, end], in seconds, of a motion with features.
+    """Returns the part [begin, end] (in seconds) of a motion that has features.
 
-    The part begins at the origin.
+    The returned motion begins at the origin.
 
     Raises:
         UserError: If [begin, end] is not a range within the motion.
@@ -97,9 +96,9 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns the motion with features of this representation.
+    """Returns the motion with features of the representation.
 
-    Missing features are computed from the joints of the motion.
+    If the motion has no features, they are computed from its joint positions.
     """
     name = f"{motion.id}: " if motion.id else ""
     if motion.representation == representation.name and math.isclose(
@@ -116,8 +115,8 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
             check_size(motion.joints, 1.0, children=True)
         raw = raw_motion(motion, representation)
         features = representation.encode(raw.values)
-        # Some representations have one row per pair of neighboring frames. A repeated frame keeps
-        # the number of frames.
+        # Some representations have one row per pair of neighboring frames. Repeating a frame
+        # preserves the number of frames.
         if len(features) < len(raw.values):
             step = (raw.values[-1:] - raw.values[-2:-1]) * raw.values.new_tensor([1.0, 0.0, 1.0])
             features = representation.encode(torch.cat([raw.values, raw.values[-1:] + step]))
@@ -129,7 +128,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
 
 
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
-    """Decodes features (F, D), in the data's units, to a motion."""
+    """Decodes features (F, D), which are not normalized, to a motion."""
     joints, fps, skeleton = (
         representation.decode(features).cpu().numpy(),
         representation.fps,

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Resolution of requests: everything that depends on the model is determined before sampling."""
+"""Resolution of requests: determines everything that depends on the model, before sampling."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,20 +31,20 @@ from flame_mdm.sampling.targets import Targets, read_targets
 
 @dataclass(frozen=True)
 class ResolvedPrompt:
-    """A text or an action, resolved for a model.
+    """A text or an action that was resolved for a model.
 
     Attributes:
         text: the prompt. A sentence with several actions becomes a sequence, "walks | sits".
         is_split: whether the original prompt was a sentence with several actions.
-        conditions: caption or action of each part, for the model.
+        conditions: caption or action of each part, as the model reads it.
         texts: the words of the prompt that belong to each part.
         frames: number of frames of each part. In a continued motion, the first part includes the
             frames that overlap with the previous motion.
         unknown: words of the text that never occur in the training captions, or that the model does
             not read.
-        summary: one line that states how the text was understood. It is "" unless each caption of the
-            model describes a single action.
-        changes: lines about differences between the text and the sampled prompt.
+        summary: one line that states how the text was understood, or "" if the model's captions may
+            describe several actions.
+        changes: lines that report differences between the text and the sampled prompt.
     """
 
     text: str
@@ -59,19 +59,19 @@ class ResolvedPrompt:
 
 @dataclass(frozen=True)
 class ResolvedRequest:
-    """A request for one model. Sentences are split, lengths are frames, and files have been read.
+    """A request for one model, with its sentences split, its lengths in frames and its files read.
 
     Attributes:
         request: the original request.
-        prompts: its texts or actions in order, without refused prompts.
+        prompts: the texts or actions of the request in order, without refused prompts.
         is_sequence: whether the motions are sampled in overlapping windows.
-        before: features (F, D), in the data's units, of the motion that all motions continue.
+        before: features (F, D), not normalized, of the motion that all sampled motions continue.
         targets: positions and poses to reach.
-        edit: an edit that keeps part of a motion in all motions. `known` and `keep` have the shape
-            (1, F, D).
-        warnings: lines for the user about the motion to continue (what was left out of its file, or
-            looks wrong), about differences between a text and what is sampled, and about words that
-            the model does not know or read.
+        edit: an edit that keeps part of a motion in all sampled motions. `known` and `keep` have
+            the shape (1, F, D).
+        warnings: warnings for the user about the motion to continue (what was omitted from its file
+            or looks wrong), about differences between a text and what is sampled, and about words
+            that the model does not know or does not read.
     """
 
     request: SamplingRequest
@@ -95,8 +95,8 @@ def resolve(
     Args:
         request: the request.
         model: the model that samples the motions.
-        refused: mapping that receives the errors of prompts that the model cannot sample, by prompt
-            index. All other prompts are resolved. Default: the first error is raised.
+        refused: mapping to which the errors of prompts that the model cannot sample are added, by
+            prompt index; all other prompts are resolved. By default, the first error is raised.
         check_words: whether to reject a text if the model knows none of its content words.
 
     Raises:
@@ -155,10 +155,11 @@ def resolve(
 def _usual_frames(
     prompt: ReadPrompt, requested: float | None, model: MotionGenerator
 ) -> list[float | None]:
-    """Returns the number of frames of each part without a stated duration, or None for the default.
+    """Returns the number of frames of each part whose duration the prompt does not state.
 
-    A requested number applies to all parts. Otherwise, a part with a stated number of repetitions
-    is as long as the repetitions take, because a longer motion would repeat the action more often.
+    The result has one entry per part, where None stands for the default length. The requested
+    number, if any, applies to all parts. Otherwise, a part that states a number of repetitions is
+    as long as the repetitions take, because a longer motion would repeat the action more often.
     """
     parts = len(prompt.parts)
     if requested is not None or not prompt.fitting:
@@ -182,12 +183,12 @@ def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[No
 
 
 def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks everything that applies to all prompts: the kind of condition, streams, and windows."""
+    """Checks that the model supports the request: its kind of condition, streams and windows."""
     if model.denoiser.context_frames:
         check_streams(model)
         if request.loop:
             raise UserError(
-                "loop=true: this model continues frames, and nothing leads back to the first one. Omit loop"
+                "loop=true: this model continues frames and cannot lead back to the first one. Omit loop"
             )
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
@@ -202,7 +203,8 @@ def _check_windows(model: MotionGenerator) -> None:
     if not model.representation.relative:
         name = model.representation.name
         raise UserError(
-            f"representation {name} has positions in the world, so windows of a sequence do not fit together. "
+            f"representation {name} contains world positions, so the windows of a "
+            "sequence do not fit together. "
             "Use a model of humanml3d features"
         )
 
@@ -210,7 +212,7 @@ def _check_windows(model: MotionGenerator) -> None:
 def _read(
     request: SamplingRequest, model: MotionGenerator, prompt: str, check_words: bool
 ) -> ReadPrompt:
-    """Returns a prompt as the model reads it. Each action of a sentence is a part."""
+    """Returns a prompt as the model reads it, with one part for each action of a sentence."""
     if request.kind == "none":
         return ReadPrompt([(prompt, None)], (prompt,))
     parts = read_parts(prompt)
@@ -239,8 +241,8 @@ def _read(
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
     """Returns warnings about prompts.
 
-    A warning is about a difference between a text and what is sampled, or about words that the
-    model does not know or read.
+    They concern differences between a text and what is sampled, and words that the model does not
+    know or does not read.
     """
     lines = []
     for prompt in prompts:

@@ -10,16 +10,16 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, cover, spans
 from flame_mdm.sampling.motion_request import USUAL_SECONDS, Part, SamplingRequest
 
-# Duration that neighboring windows share, in seconds; see docs/sequences.md
+# Overlap of neighboring windows in seconds; see docs/sequences.md
 OVERLAP = 0.5
-# Maximum length of a sequence, in seconds; all its windows are denoised at the same time
+# Maximum length of a sequence in seconds. All of its windows are denoised at the same time.
 MAX_SECONDS = 600
 
 
 def overlap(model: MotionGenerator) -> int:
     """Returns the number of frames that neighboring windows share.
 
-    The number is even. It is 0 for a model that continues frames.
+    The number is even, and 0 for a model that continues frames.
     """
     if model.denoiser.context_frames:
         return 0
@@ -39,11 +39,12 @@ def part_frames(
 
     Args:
         model: the model that samples the motion.
-        text: the prompt, for messages.
-        parts: its parts, with their durations in seconds if the prompt states them.
-        usual: the (unrounded) number of frames of each part whose duration the prompt does not state.
-            None = `USUAL_SECONDS`, or as many frames as fit into one window if that is less.
-        is_sequence: whether the motion is sampled in windows. Otherwise, it has a single part.
+        text: the prompt, as it is quoted in error messages.
+        parts: the parts of the prompt, with their durations in seconds if the prompt states them.
+        usual: the (unrounded) number of frames of each part whose duration the prompt does not
+            state. None stands for `USUAL_SECONDS` or, if that is too long for one window, as many
+            frames as fit into it.
+        is_sequence: whether the motion is sampled in windows. If not, it has a single part.
         loop: whether the last frame leads to the first one.
 
     Raises:
@@ -57,7 +58,7 @@ def part_frames(
     length = min(round(USUAL_SECONDS * fps), longest) if frames is None else round(frames)
     shown = f"{length / fps:g} seconds ({length} frames)"
     if length < 2:
-        raise UserError(f"{shown} are too short. Use at least {2 / fps:g} seconds")
+        raise UserError(f"{shown} is too short. Use at least {2 / fps:g} seconds")
     if length > longest:
         raise UserError(
             f"{shown} cannot be sampled: the model was trained on motions of up to {longest / fps:g} seconds. "
@@ -87,7 +88,7 @@ def _sequence_frames(
     for (name, _), length in zip(parts, lengths, strict=True):
         if length < 1:
             raise UserError(
-                f"'{name}': {length / fps:g} seconds are too short. Use at least {1 / fps:g} seconds"
+                f"'{name}': {length / fps:g} seconds is too short. Use at least {1 / fps:g} seconds"
             )
         if length < shared:
             raise UserError(
@@ -96,7 +97,7 @@ def _sequence_frames(
             )
     if sum(lengths) > MAX_SECONDS * fps:
         raise UserError(
-            f"'{text}': {sum(lengths) / fps:g} seconds are too long. Use at most {MAX_SECONDS} seconds"
+            f"'{text}': {sum(lengths) / fps:g} seconds is too long. Use at most {MAX_SECONDS} seconds"
         )
     return lengths
 
@@ -109,13 +110,14 @@ def windows(
 ) -> Windows:
     """Returns the windows of several sequences.
 
-    `conditions` and `lengths` are the texts or actions of the parts, and their numbers of frames.
+    For each sequence, `conditions` contains the texts or actions of its parts, and `lengths`
+    contains their numbers of frames.
     """
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
     spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]
     covering = [(row, *span) for row, parts in enumerate(spans_of) for span in parts]
     names = [conditions[row][part] for row, part, _, _ in covering]
-    # A denoiser that attends to its padding receives as many frames as in training.
+    # A denoiser that attends to padding receives as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
     covered = cover(positions, [sum(parts) for parts in lengths], shared, width, device)

@@ -1,7 +1,7 @@
 # pyright: standard
-"""Streams: endless motions with texts that can change.
+"""Streams: endless motions whose text can change at any time.
 
-Each block continues the frames before it.
+A stream is generated in blocks, each of which continues the frames before it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.targets import Targets
 from flame_mdm.sampling.waypoints import Route, RouteGuide
 
-# Number of blocks of a stream that can still be dropped, for example because a page has not shown
+# Number of past blocks of a stream that can still be dropped, for example if a page has not shown
 # them yet
 HELD = 4
 
@@ -50,20 +50,20 @@ def stream(
     cleanup: bool = False,
     **options: Unpack[SamplerKeywords],
 ) -> Stream:
-    """Starts an endless motion. Its text can be changed at any time.
+    """Starts an endless motion whose text can be changed at any time.
 
     Args:
         model: a model that continues frames (DiP), from `flame_mdm.load`.
         text: what the person does at first.
-        start: the motion to continue: a motion, a file, or "dataset:id" for a clip of a prepared
-            data set. Only its last frames are used. Default: a person who is standing still.
+        start: the motion to continue: a `Motion`, a file, or "dataset:id" for a clip of a prepared
+            data set. Only its last frames are used. By default, the person first stands still.
         seed: seed of the noise.
-        block: number of frames per block. The maximum, which is also the default, is the number of
-            frames that the model predicts at once. Shorter blocks react sooner to a new text, but
-            cost more per second of motion.
-        cleanup: smooth the motions, keep bone lengths constant, and keep feet from sliding. Each
-            block is returned only after the next one was computed, because the two must fit
-            together.
+        block: number of frames per block. The default and maximum is the number of frames that the
+            model predicts at once. Shorter blocks react sooner to a new text, but cost more time
+            per second of motion.
+        cleanup: whether to smooth the motion, keep bone lengths constant, and keep feet from
+            sliding. Each block is then returned only after the next one has been computed, because
+            the two must fit together.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:
             the model's.
 
@@ -93,11 +93,11 @@ def stream(
 
 
 class Stream(Iterator[Motion]):
-    """An endless motion, from `flame_mdm.stream`: an iterator of blocks. Its text may change.
+    """An endless motion, as an iterator of blocks; created by `flame_mdm.stream`.
 
-    Each block is a `Motion`, placed in the world after the previous block. A block is computed when
-    it is requested. With `cleanup`, the next block is also computed. The same seed and the same
-    texts at the same times result in the same motion.
+    Each block is a `Motion` that is placed in the world where the previous block ends. A block is
+    computed when it is requested; with `cleanup`, so is the next block. If the seed is the same and
+    the text changes in the same way at the same times, the motion is the same.
 
     Example:
         >>> import itertools, flame_mdm
@@ -113,7 +113,7 @@ class Stream(Iterator[Motion]):
 
     @property
     def frames(self) -> int:
-        """Number of frames of all blocks so far."""
+        """Total number of frames of the blocks so far."""
         return self._streams.frames[0]
 
     @property
@@ -123,24 +123,25 @@ class Stream(Iterator[Motion]):
         return self._streams.texts[condition]
 
     def change(self, text: str, at: float | None = None) -> None:
-        """Changes the text from the next block or a given time on.
+        """Changes the text from the next block on, or from a given time on.
 
-        If the text changes in the middle of a block, the block ends there. Blocks that were already
-        computed do not change.
+        A block in which the text changes ends at the change. Blocks that were already computed stay
+        the same.
 
         Args:
             text: what the person does from then on.
             at: time in seconds since the start of the stream. Default: the end of the last block.
 
         Raises:
-            UserError: If the model knows no content word of the text, or if the time has passed.
+            UserError: If the model knows no content word of the text, or if the time is in the
+                past.
         """
         fps = self._streams.model.representation.fps
         frame = self.frames if at is None else round(at * fps)
         if frame < self.frames:
             now = self.frames / fps
             raise UserError(
-                f"at={at:g}: the stream is already at {now:g} seconds. Set at to a later time, or omit it"
+                f"at={at:g}: the stream is already at {now:g} seconds. Use a later time, or omit at"
             )
         condition = read_text(self._streams.model, text)
         self._streams.texts[condition] = text
@@ -149,16 +150,16 @@ class Stream(Iterator[Motion]):
     def lead(self, waypoints: Sequence[Sequence[float]]) -> None:
         """Leads the person along waypoints from the next block on.
 
-        The path bends toward the next waypoint, and the text determines how the person moves. A
-        person who is standing does not move. After the last waypoint, the path no longer bends.
+        The path bends toward the next waypoint, while the text determines how the person moves; a
+        person who is standing stays there. After the last waypoint, the path no longer bends.
 
         Args:
-            waypoints: x and z in meters in the world, in order. They replace all earlier
-                waypoints. Empty = no waypoints.
+            waypoints: (x, z) in meters in the world, in order. They replace all earlier waypoints;
+                an empty list only removes these.
 
         Raises:
-            UserError: If a waypoint is not two finite numbers or is too far away, or the representation is not
-                `HumanML`.
+            UserError: If a waypoint does not consist of two finite numbers or is too far away, or
+                if the representation is not `HumanML`.
         """
         self._streams.lead(Route(waypoints))
 
@@ -170,10 +171,10 @@ class Stream(Iterator[Motion]):
     def go_back(self, at: float) -> None:
         """Drops the frames after a given time, so that the next block continues from there.
 
-        Call it before the dropped frames are used. A new text is then visible at once, even if
-        blocks were computed ahead. The result is the same as if the text had been changed at that
-        time. Changes of the text after that time are also dropped, and waypoints that were reached
-        after it are ahead again.
+        If this is called before the dropped frames are shown, a new text takes effect at once, even
+        if blocks were computed ahead. The result is the same as if the text had been changed at
+        that time. Later changes of the text are also dropped, and waypoints that were reached later
+        count as not yet reached.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
@@ -183,7 +184,7 @@ class Stream(Iterator[Motion]):
         """
         if self._cleanup is not None:
             raise UserError(
-                "cleanup=true: a cleaned block depends on the block after it, so frames cannot "
+                "cleanup=true: a cleaned block depends on the next block, so frames cannot "
                 "be dropped. Omit cleanup"
             )
         self._streams.go_back(round(at * self._streams.model.representation.fps))
@@ -200,18 +201,18 @@ class Stream(Iterator[Motion]):
 class OnlineCleanup:
     """Cleanup of a motion that arrives in blocks.
 
-    Each block is cleaned twice: first as the last of three blocks, then as the middle one. The
-    first version continues the previous block without a jump. The second version fits the next
-    block. The result blends from the first version to the second.
+    Each block is cleaned twice, first as the last of three blocks and then as the middle one. The
+    first version continues the previous block without a jump, and the second one fits the next
+    block. The result blends from the first version to the second one.
     """
 
     def __init__(self, representation: Representation):
         self.representation = representation
         self.blocks: list[Motion] = []
-        self.version: np.ndarray | None = None  # the first version of the middle block
+        self.version: np.ndarray | None = None  # first version of the middle block
 
     def add(self, block: Motion) -> Motion | None:
-        """Adds the next block and returns the previous block, cleaned. Returns None for the first block."""
+        """Adds a block and returns the cleaned previous block, or None for the first block."""
         self.blocks = [*self.blocks[-2:], block]
         if len(self.blocks) == 1:
             return None
@@ -224,8 +225,8 @@ class OnlineCleanup:
         begin = len(joints) - len(block.joints) - len(middle.joints)
         cleaned = joints[begin : begin + len(middle.joints)]
         if self.version is not None:
-            # The body follows its feet from the first frame of the three blocks on, so the
-            # positions of both versions differ.
+            # In each version, the body follows its feet from the first of the three blocks on, so
+            # that the positions in the two versions differ.
             shift = (self.version[0, 0] - cleaned[0, 0]) * np.array([1, 0, 1], np.float32)
             joints, cleaned = joints + shift, cleaned + shift
             weight = np.linspace(0, 1, len(cleaned), dtype=np.float32)[:, None, None]
@@ -243,8 +244,8 @@ class OnlineCleanup:
 class PastBlock(NamedTuple):
     """A past block of a single stream, which `go_back` can cut.
 
-    `begin` is the index of its first frame. `number` is the index of the block, which determines
-    its noise.
+    `begin` is the index of its first frame, and `number` is the index of the block, which
+    determines its noise.
     """
 
     begin: int
@@ -262,7 +263,7 @@ class Schedule:
 
     @classmethod
     def of_parts(cls, conditions: Sequence[str], lengths: Sequence[int]) -> Self:
-        """Returns the schedule of consecutive parts; `lengths` are their numbers of frames."""
+        """Returns the schedule of consecutive parts, whose numbers of frames are `lengths`."""
         schedule, begin = cls(conditions[0]), 0
         for condition, length in zip(conditions[1:], lengths, strict=False):
             begin += length
@@ -270,7 +271,7 @@ class Schedule:
         return schedule
 
     def add(self, frame: int, condition: str) -> None:
-        """Changes the condition from a frame on, until the next change."""
+        """Changes the condition from the given frame until the next change."""
         changes = {**dict(self.changes), frame: condition}
         self.changes = sorted(changes.items())
 
@@ -279,7 +280,7 @@ class Schedule:
         return [condition for begin, condition in self.changes if begin <= frame][-1]
 
     def drop(self, frame: int) -> None:
-        """Drops the changes from a frame on. The first condition stays."""
+        """Drops all changes from the given frame on, but keeps the first condition."""
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
@@ -290,28 +291,28 @@ class Schedule:
 class Streams(Iterator[list[Motion]]):
     """Several streams that are sampled in one batch.
 
-    Up to rounding, each stream is the same as if it were sampled alone.
+    Apart from rounding errors, each stream is the same as if it were sampled alone.
 
     Args:
         model: a model that continues frames.
-        ids: B names of the streams; they seed the noise.
-        conditions: B texts or actions at the beginning; "" for unconditioned motions.
+        ids: B names of the streams, which seed the noise.
+        conditions: B texts or actions with which the streams begin, or "" for unconditioned
+            motions.
         prefix: (B, C, D) normalized features of the frames before the streams.
-        placement: placement of the first frames in the world. None = the first frame is at
-            x = z = 0 and faces +z.
-        options: sampler options. For an option that is None, the model's value is used.
+        placement: placement of the first frames in the world. None = each stream starts at x = z =
+            0, facing +z.
+        options: sampler options. An option that is None has the model's value.
         kind: "text", "action", or "none" for unconditioned motions.
         seed: seed of the noise.
-        block: number of frames per block. Default: as many as the model predicts at once.
+        block: number of frames per block. Default: the number that the model predicts at once.
 
     Attributes:
-        schedules: conditions of each stream over its frames.
-        texts: the text as it was typed, by condition; used to name the blocks. A condition
-            without an entry is used as its own name.
+        schedules: for each stream, the condition of each frame.
+        texts: the text as it was typed, by condition. It becomes the text of the blocks; a
+            condition without an entry is used unchanged.
         frames: number of frames of each stream so far.
-        targets: positions that a single stream reaches. Guidance leads the motion to them. If the
-            model was trained with targets, they are also part of its condition. None = no
-            targets.
+        targets: positions that a single stream should reach, or None. Guidance leads the motion to
+            them. If the model was trained with targets, they are also part of its condition.
         waypoints: waypoints along which a single stream without targets is led.
     """
 
@@ -355,7 +356,7 @@ class Streams(Iterator[list[Motion]]):
         self._past: deque[PastBlock] = deque(maxlen=HELD)
 
     def __next__(self) -> list[Motion]:
-        """Returns the next block of each stream. A block ends where the next condition begins."""
+        """Returns the next block of each stream. A block ends early where the condition changes."""
         conditions = self._conditions()
         kept = [self._until_change(row) for row in range(len(self.frames))]
         x, joints = self._advance(kept)
@@ -372,8 +373,8 @@ class Streams(Iterator[list[Motion]]):
         representation = self.model.representation
         if waypoints.points and not isinstance(representation, HumanML):
             raise UserError(
-                f"representation {representation.name} has no column for the turn of the root, "
-                "which waypoints need. Use a model with humanml3d features"
+                f"representation {representation.name} has no feature for the turn of the root, "
+                "which waypoints require. Use a model with humanml3d features"
             )
         self.waypoints = waypoints
 
@@ -430,7 +431,8 @@ class Streams(Iterator[list[Motion]]):
     def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Samples the next block. Each stream keeps the first `kept` frames of the block.
 
-        Returns normalized features (B, P, D), and world joint positions (B, P, J, 3) in float64.
+        Returns the normalized features (B, P, D) and the float64 world joint positions (B, P, J,
+        3).
         """
         representation, count = (
             self.model.representation,
@@ -463,7 +465,7 @@ class Streams(Iterator[list[Motion]]):
         return x, joints
 
     def _aimed(self, cond: Condition) -> tuple[Condition, Edit | None]:
-        """Returns a condition and an edit that lead the next block to the targets.
+        """Returns the condition and the edit that lead the next block to the targets.
 
         Only the first stream has targets.
         """
@@ -482,7 +484,7 @@ class Streams(Iterator[list[Motion]]):
         return cond, edit
 
     def _led(self) -> Edit | None:
-        """Returns the edit that leads the next block to the waypoints, or None if none are left."""
+        """Returns the edit that leads the next block to the waypoints, or None if none remain."""
         representation, points = self.model.representation, self.waypoints.left
         if not points or not isinstance(representation, HumanML):
             return None
@@ -534,7 +536,7 @@ def in_world(representation: Representation, placement: Placement, x: Tensor) ->
 
 
 def root_target(window: Targets, frames: int, placement: Placement) -> Tensor | None:
-    """Returns the target condition (1, 8, 4) for the root's position in a block's last frame.
+    """Returns the target condition (1, 8, 4) for the root position in a block's last frame.
 
     Returns None if the window has no such target.
     """
@@ -560,7 +562,7 @@ def check_streams(model: MotionGenerator) -> None:
     if not model.representation.relative:
         name = model.representation.name
         raise UserError(
-            f"representation {name} has positions in the world, which a stream would leave. Use a "
+            f"representation {name} contains world positions, whose range a stream would leave. Use a "
             "model with humanml3d features"
         )
 
@@ -568,15 +570,15 @@ def check_streams(model: MotionGenerator) -> None:
 def read_text(model: MotionGenerator, text: str) -> str:
     """Returns the text in the form that the model reads.
 
-    If the text names one action of the model's captions, it is rewritten in the words of these
-    captions.
+    If the text names one action that occurs in the model's captions, it is rewritten in their
+    words.
 
     Raises:
         UserError: If the text is empty or too long, or if the model does not understand it.
     """
     if not isinstance(text, str) or not text.strip():
         raise UserError(
-            f"text={text!r}: expected a text that says what happens, such as 'a person walks'"
+            f"text={text!r}: expected a description of what happens, such as 'a person walks'"
         )
     check_length(text)
     if model.conditioned_on != "text":
@@ -590,7 +592,7 @@ def read_text(model: MotionGenerator, text: str) -> str:
 def starting_point(
     model: MotionGenerator, start: str | Path | Motion | None
 ) -> tuple[Tensor, Placement | None]:
-    """Returns the normalized frames (1, C, D) that a stream continues from, and the next placement.
+    """Returns the normalized frames (1, C, D) that precede a stream, and the stream's placement.
 
     Raises:
         UserError: If the model cannot stream, or the motion cannot be read or is too short.

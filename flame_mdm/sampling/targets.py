@@ -20,18 +20,18 @@ from flame_mdm.representations import Representation, rotation
 from flame_mdm.sampling.reading import read_motion
 from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 
-# Seconds over which a correction fades; see docs/targets.md
+# Time in seconds over which a correction fades; see docs/targets.md
 SMOOTHNESS = 0.2
 # Maximum speed, in meters per second, that waypoints may require
 MAX_SPEED = 8.0
 # Maximum height of a joint above the floor, and maximum horizontal distance of a joint from the
 # body, in meters
 REACH = 2.5
-# Maximum number of coordinates; every step solves for all of them together
+# Maximum number of coordinates of all targets. Every sampling step solves for all of them together.
 MAX_COORDINATES = 600
-# In meters; None = free
+# Coordinate in meters; None = free
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None
-# x and z
+# x and z of a position on the floor
 OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]
 
 
@@ -72,9 +72,9 @@ class TargetFile(ClosedSchema):
 
 
 class Goal(NamedTuple):
-    """A position (3,) in meters that a joint should reach in a given frame. NaN = free.
+    """A position (3,) in meters that a joint should reach in a given frame.
 
-    `source` is the name of the target in messages.
+    NaN marks a free coordinate. `source` names the target in error messages.
     """
 
     source: str
@@ -87,11 +87,11 @@ class Goal(NamedTuple):
 class PositionGuide:
     """A `flame_mdm.batch.Guide` that leads joints to world positions."""
 
-    # Converts normalized features (..., F, D) to joints (..., F, J, 3) in the world
+    # Converts normalized features (..., F, D) to world joint positions (..., F, J, 3)
     to_joints: Callable[[Tensor], Tensor]
     fps: float
     positions: Positions
-    # (3, N) frame, parent and child of each bone that keeps its length
+    # (3, N) frame, parent joint and child joint of each bone whose length is kept
     bones: Tensor
     # (1, F, D) features that are always imposed
     poses: Tensor
@@ -99,7 +99,7 @@ class PositionGuide:
     keep: Tensor
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns `x_t`, changed so that its clean estimate is closer to the positions."""
+        """Returns a version of `x_t` whose clean estimate is closer to the positions."""
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
@@ -112,12 +112,12 @@ class PositionGuide:
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets that motions should reach."""
+    """Positions and poses that motions should reach."""
 
     # Coordinates in the world
     positions: Positions
-    # Frames of poses, and their features (D,) in the units of the data. These poses may be
-    # anywhere.
+    # (frame, features (D,)) of each pose that may be reached anywhere. The features are not
+    # normalized.
     poses: tuple[tuple[int, Tensor], ...]
 
     def check_end(self, frames: int, fps: float) -> None:
@@ -125,7 +125,7 @@ class Targets:
         last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
         if last >= frames:
             raise UserError(
-                f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
+                f"targets: {last / fps:g} seconds is past the end of the motion, whose last frame is at "
                 f"{(frames - 1) / fps:g} seconds. Use an earlier time, or a longer motion"
             )
 
@@ -133,8 +133,9 @@ class Targets:
         """Returns the targets in a window of `frames` frames from `begin` on.
 
         Frames are counted from the beginning of the window. If the root has a target after the
-        window, it covers part of the way within the window. It moves at a constant speed from its
-        last target in the window or, if there is no such target, from `here`.
+        window, an additional target at the end of the window makes the root cover part of the
+        distance, at a constant speed, from its last target in the window or, if there is none, from
+        `here`.
 
         Args:
             begin: first frame of the window.
@@ -185,7 +186,8 @@ class Targets:
         """Returns the edit (1, F, D) that leads to the targets.
 
         Poses are imposed, and positions guide the clean estimates. `to_joints` maps normalized
-        features to world joint positions. By default, motions start at the origin.
+        features to world joint positions. The default places the beginning of the motion at the
+        origin.
         """
         imposed = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)
@@ -195,7 +197,7 @@ class Targets:
                 range(1, len(representation.skeleton))
             ).to(device)
         positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
-        # Joints that are reached by stretching the body, not by moving the root
+        # Joints whose targets are reached by stretching the body, not by moving the root
         stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
         edges = [(frame, *edge) for frame in stretched for edge in representation.skeleton.edges]
         bones = torch.tensor(edges, dtype=torch.long, device=device).reshape(-1, 3).T
@@ -205,7 +207,7 @@ class Targets:
 
 
 def errors(motion: Motion, targets: Targets) -> np.ndarray:
-    """Returns the distance in meters between a motion and each target position.
+    """Returns how far a motion is from each target position, in meters.
 
     Free coordinates are ignored.
     """
@@ -216,7 +218,7 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
-    """Reads targets from a JSON file, or from its content (docs/targets.md).
+    """Reads targets from a JSON file or from its content, which docs/targets.md describes.
 
     Raises:
         UserError: If the targets are invalid.
@@ -259,7 +261,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
     numbers, axes = np.nonzero(~np.isnan(positions))
     if len(numbers) > MAX_COORDINATES:
         raise UserError(
-            f"{name}: {len(numbers)} coordinates are too many. Use at most {MAX_COORDINATES}"
+            f"{name}: the targets have {len(numbers)} coordinates. Use at most {MAX_COORDINATES}"
         )
     frames, joints = (
         np.array([(goal.frame, goal.joint) for goal in goals], dtype=int).reshape(-1, 2)[numbers].T
@@ -272,7 +274,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
 def _pose(
     representation: Representation, entry: PoseTarget, folder: Path, where: str
 ) -> tuple[np.ndarray, Tensor]:
-    """Returns the joints (J, 3) of a pose with the root at x = z = 0, and its features (D,)."""
+    """Returns the joint positions (J, 3) of a pose, whose root is at x = z = 0, and its features."""
     motion = read_motion(
         representation, folder / entry.file if Path(entry.file).suffix else entry.file
     )

@@ -1,6 +1,6 @@
 """Waypoints on the floor for streams.
 
-The path of the person bends toward the waypoints. The text determines how the person moves.
+The path of the person bends toward the waypoints, while the text determines how the person moves.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampling.placement import Placement
 
 Point = tuple[float, float]
-"""x and z in meters in the world."""
+"""World coordinates (x, z) in meters."""
 
-# The web page that samples in the browser uses the same numbers and loop (tools/web/waypoints.js).
-# Distance in meters from the root at which a waypoint is reached
+# The web page that samples in the browser uses the same numbers and the same loop
+# (tools/web/waypoints.js). Distance from the root, in meters, within which a waypoint counts as
+# reached
 NEAR = 0.3
-# Maximum bend in radians per second. With faster bends, feet on the floor would visibly slide.
+# Maximum bend in radians per second. If the path bent faster, feet on the floor would visibly
+# slide.
 FASTEST = 1.3
 # Minimum radius of a bend in meters. It keeps a standing person from turning.
 TIGHTEST = 0.7
-# Radius of the circle within which waypoints are too near, relative to the smallest circle that
-# the person can walk. With 1, a runner would circle around a waypoint because a bend begins
-# slowly.
+# Radius of the circle within which waypoints are too near, relative to the smallest circle on which
+# the person can walk. With a value of 1, a runner would circle around a waypoint, because bends
+# begin slowly.
 ROOM = 1.2
 PATIENCE = 0.4  # time constant, in seconds, of the decay of deviations
 SMOOTHING = (
@@ -46,18 +48,18 @@ def bends(
     points: Sequence[Point],
     fps: float,
 ) -> list[float]:
-    """Returns the angles in radians to add to the turns of the root so that it passes waypoints.
+    """Returns the angles (F,) to add to the turns of the root so that it passes the waypoints.
 
-    The direction of travel approaches the direction of the next waypoint. The angle is bounded
-    per second and per meter of the path. If a waypoint is beside the person and too near, the
-    path stays straight until there is room for a curve.
+    The direction of travel approaches the direction of the next waypoint. The added angle, in
+    radians, is limited per second and per meter of the path. If a waypoint is beside the person and
+    too near, the path stays straight until there is room for a curve.
 
     Args:
-        turns: (F) turns in radians from each frame to the next, positive to the left.
-        steps: (F, 2) steps of the root to the next frame in meters, to the left of the body and
+        turns: (F,) turns of the root from each frame to the next in radians, positive to the left.
+        steps: (F, 2) steps of the root to the next frame in meters: to the left of the body, and
             forward.
         heading: direction of the body in the first frame in radians, as in `Placement.turn`.
-        position: position of the root in the first frame.
+        position: position of the root in the first frame, in meters.
         points: waypoints in order.
         fps: frames per second.
 
@@ -88,13 +90,13 @@ def bends(
 
 
 def _bend(travel: float, length: float, position: Point, goal: Point, fps: float) -> float:
-    """Returns the angle to add in a frame.
+    """Returns the angle in radians to add in a frame; see `bends`.
 
     Args:
         travel: direction of the step to the next frame in radians.
         length: length of this step in meters.
         position: position of the root.
-        goal: the next waypoint.
+        goal: position of the next waypoint.
         fps: frames per second.
     """
     most = min(FASTEST / fps, length / TIGHTEST)
@@ -111,9 +113,9 @@ def _bend(travel: float, length: float, position: Point, goal: Point, fps: float
 
 @dataclass(frozen=True)
 class RouteGuide:
-    """Bends the path of a block at each sampling step; a `flame_mdm.batch.Guide`.
+    """A `flame_mdm.batch.Guide` that bends the path of a block at each sampling step.
 
-    The denoiser sees the bent path in the next steps and adapts the rest of the body to it.
+    In the next steps, the denoiser sees the bent path and adapts the rest of the motion to it.
     """
 
     representation: HumanML
@@ -125,7 +127,7 @@ class RouteGuide:
         return x_t
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (1, F, D) with a path that bends to the waypoints."""
+        """Returns the clean estimate (1, F, D) with its path bent toward the waypoints."""
         representation, column = self.representation, self.representation.slices["turn"].start
         turns, steps = representation.root_steps(representation.denormalize(x0_hat[0].float()))
         added = bends(
@@ -143,15 +145,15 @@ class RouteGuide:
 
 
 class Route:
-    """Waypoints of a stream, and when they were reached.
+    """Waypoints of a stream and the frames in which they were reached.
 
     Attributes:
         points: all waypoints in order.
-        reached: for each waypoint that was reached, the index of the stream frame in which it was
-            reached.
+        reached: indices of the stream frames in which waypoints were reached, in the order of
+            `points`.
 
     Raises:
-        UserError: If a point is not two numbers from -`FARTHEST` to `FARTHEST`.
+        UserError: If a point does not consist of two numbers from -`FARTHEST` to `FARTHEST`.
     """
 
     def __init__(self, points: Sequence[Sequence[float]] = ()):
@@ -176,5 +178,5 @@ class Route:
                 self.reached.append(frame)
 
     def go_back(self, frame: int) -> None:
-        """Marks the waypoints that were reached from a frame on as not yet reached."""
+        """Marks the waypoints that were reached in or after the given frame as not yet reached."""
         self.reached = [number for number in self.reached if number < frame]

@@ -444,7 +444,7 @@ def test_pages_mark_the_evidence_and_the_demo_lists_the_verdicts(tmp_path):
     [
         (np.zeros((30, 21, 3)), {"fps": 20}, "joints have shape (30, 21, 3)"),
         (np.full((30, 22, 3), np.nan), {"fps": 20}, "joints contain NaN"),
-        (np.zeros((30, 22, 3)), {"fps": 20}, "the legs have no length"),
+        (np.zeros((30, 22, 3)), {"fps": 20}, "the legs have length 0"),
         (np.ones((30, 22, 3)), {}, "fps is missing"),
     ],
 )

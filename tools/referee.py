@@ -54,8 +54,8 @@ BESIDE = {"travel", "veer", "pace"}
 """Claims that are compatible with walking or running from the first to the last frame."""
 MOST_SYNTHETIC = 600  # maximum number of procedural motions, from the test split
 HEAD = """# Thresholds of the referee by kind of claim, written by `tools/referee.py`: the score up to which a claim is
-# false, the score from which it is true, and the numbers of true and falsified claims that they come from. The units
-# are stated by the functions in `postures.py` and `movements.py`; a score is negated if lower values support the claim.
+# false, the score from which it is true, and the numbers of true and falsified claims used to calibrate them. The
+# functions in `postures.py` and `movements.py` state the units. Scores are negated if lower values support the claim.
 """
 
 

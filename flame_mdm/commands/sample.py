@@ -335,7 +335,7 @@ def claims_score(model: MotionGenerator) -> Score:
     skeleton = model.representation.skeleton
     if skeleton != SMPL22:
         raise UserError(
-            f"scorer={CLAIMS}: the model's motions have the skeleton {skeleton.name}, but the referee needs "
+            f"scorer={CLAIMS}: the model's motions have the skeleton {skeleton.name}, but the referee requires "
             f"{SMPL22.name}. Use a motion-CLIP"
         )
     return claim_score

@@ -1,1 +1,1 @@
-"""The referee: reads claims from a sentence, measures them on a motion, and shows evidence."""
+"""The referee: reads the claims in a sentence, measures them on a motion and shows evidence."""

@@ -1,4 +1,4 @@
-"""`Body`: a motion with normalized frame rate, size and position, for measuring claims."""
+"""`Body`: a motion, normalized in frame rate and size, on which claims are measured."""
 
 from functools import cached_property
 
@@ -11,16 +11,16 @@ from flame_mdm.representations.skeleton import JOINT
 
 # Frames per second at which motions are measured
 RATE = 30.0
-# Standard deviation of the filter over time, in seconds
+# Standard deviation, in seconds, of the filter that smooths motions over time
 SMOOTHING = 0.05
-# Length of the legs from hip to ankle, in meters, to which bodies are scaled
+# Leg length from hip to ankle, in meters, to which bodies are scaled
 LEG = 0.8
-# Seconds around a frame within which the lowest foot must touch the floor; a jump is shorter
+# Length, in seconds, of a window in which the lowest foot must touch the floor. Jumps are shorter.
 FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the left and the right joint for a name: "wrist" stands for left_wrist and right_wrist."""
+    """Returns the indices of a left and a right joint: "wrist" means left_wrist and right_wrist."""
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 
@@ -30,25 +30,25 @@ SHOULDERS, ELBOWS, WRISTS = (pair(name) for name in ("shoulder", "elbow", "wrist
 
 
 class Body:
-    """A motion that is resampled, smoothed, and scaled so that the legs are `LEG` meters long.
+    """A motion that was resampled, smoothed and scaled for measurement.
 
-    Its frame rate is `RATE`. All distances are measured on the scaled body, in meters. Body
-    coordinates have the axes left, up and forward, relative to the heading of the body. Their
-    origin is the point on the floor below the pelvis.
+    The frame rate is `RATE`, and the legs are `LEG` meters long. All distances are measured on the
+    scaled body, in meters. Body coordinates have the axes left, up and forward, relative to the
+    heading of the body; their origin is the point on the floor below the pelvis.
 
     Args:
-        joints: (F, 22, 3) positions of SMPL's joints in meters, y up.
+        joints: (F, 22, 3) positions of SMPL's joints in meters, with y up.
         fps: frames per second.
 
     Raises:
-        UserError: If the joints have the wrong shape or contain NaN, or if the legs have no length.
+        UserError: If `joints` has the wrong shape or contains NaN, or if the legs have length 0.
     """
 
     def __init__(self, joints: np.ndarray, fps: float):
         joints = np.asarray(joints, np.float64)
         if joints.ndim != 3 or joints.shape[1:] != (22, 3) or not len(joints):
             raise UserError(
-                f"joints have shape {joints.shape}. The referee needs SMPL's joints, (frames, 22, 3)"
+                f"joints have shape {joints.shape}. The referee requires SMPL's joints, (frames, 22, 3)"
             )
         if not np.isfinite(joints).all():
             raise UserError("joints contain NaN or infinity. Did the model diverge?")
@@ -56,7 +56,7 @@ class Body:
         shin = np.linalg.norm(joints[:, ANKLES] - joints[:, KNEES], axis=-1)
         leg = float(np.median(thigh + shin))
         if leg < 1e-3:
-            raise UserError("the legs have no length. The referee needs a body in meters")
+            raise UserError("the legs have length 0. The referee requires positions in meters")
         if len(joints) > 1:
             joints = resample(joints, fps, RATE, cubic=len(joints) > 3)
         self.scale = LEG / leg
@@ -75,7 +75,7 @@ class Body:
     def floor(self) -> np.ndarray:
         """Height (F,) of the floor: the height of the lowest joint within `FLOOR_WINDOW`.
 
-        The height can change, because floors may have steps.
+        The height may change during a motion, because floors may have steps.
         """
         lowest = self.joints[..., 1].min(1)
         return minimum_filter1d(lowest, max(1, round(FLOOR_WINDOW * RATE)), mode="nearest")
@@ -87,7 +87,7 @@ class Body:
 
     @cached_property
     def forward(self) -> np.ndarray:
-        """Direction (F, 2) in x and z that the body faces, computed from the hips and shoulders."""
+        """Direction (F, 2) in x and z that the body faces, given by the hips and shoulders."""
         across = self.joints[:, HIPS[0]] - self.joints[:, HIPS[1]]
         across = across + self.joints[:, SHOULDERS[0]] - self.joints[:, SHOULDERS[1]]
         left = gaussian_filter1d(across[:, [0, 2]], 0.1 * RATE, axis=0, mode="nearest")
@@ -119,7 +119,7 @@ class Body:
     def velocity(self) -> np.ndarray:
         """Velocity (F, 2) of the pelvis to the left and forward, in m/s.
 
-        The sway of individual steps is filtered out.
+        The sway of the individual steps is filtered out.
         """
         ground = gaussian_filter1d(
             self.joints[:, PELVIS][:, [0, 2]], 0.15 * RATE, axis=0, mode="nearest"
@@ -129,30 +129,30 @@ class Body:
 
     @cached_property
     def speed(self) -> np.ndarray:
-        """Horizontal speed (F,) of the pelvis in m/s."""
+        """Horizontal speed (F,) of the pelvis, in m/s."""
         return np.linalg.norm(self.velocity, axis=-1)
 
     @cached_property
     def tilt(self) -> np.ndarray:
-        """Angle (F,) between the trunk and the vertical in degrees."""
+        """Angle (F,) between the trunk and the vertical, in degrees."""
         trunk = self.joints[:, NECK] - self.joints[:, PELVIS]
         return np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1]))
 
     @cached_property
     def hand_speed(self) -> np.ndarray:
-        """Speed (F, 2) of the wrists relative to the chest, in body coordinates and m/s."""
+        """Speed (F, 2) of the wrists relative to the chest in body coordinates, in m/s."""
         hands = self.seen[:, WRISTS] - self.seen[:, [CHEST]]
         return np.linalg.norm(rate_of(hands), axis=-1)
 
     @cached_property
     def foot_speed(self) -> np.ndarray:
-        """Speed (F, 2) of the ankles relative to the pelvis, in body coordinates and m/s."""
+        """Speed (F, 2) of the ankles relative to the pelvis in body coordinates, in m/s."""
         feet = self.seen[:, ANKLES] - self.seen[:, [PELVIS]]
         return np.linalg.norm(rate_of(feet), axis=-1)
 
     @cached_property
     def reach(self) -> float:
-        """Length of an arm from shoulder to wrist."""
+        """Arm length from shoulder to wrist, in meters."""
         upper = np.linalg.norm(self.joints[:, ELBOWS] - self.joints[:, SHOULDERS], axis=-1)
         fore = np.linalg.norm(self.joints[:, WRISTS] - self.joints[:, ELBOWS], axis=-1)
         return float(np.median(upper + fore))

@@ -1,4 +1,4 @@
-"""Claims: checkable statements in a sentence about a motion, and their false variants."""
+"""Claims: the checkable statements in a sentence about a motion, and false variants of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ FLIPPED = {**MIRRORED, "forward": "backward", "backward": "forward"}
 FLIPPED_SPEED = {"slow": "fast", "fast": "slow"}
 FLIPPED_END = {"start": "end", "end": "start"}
 EXCLUDED = {"upright": "lie", "sit": "upright", "kneel": "upright", "lie": "upright"}
-"""For each posture, a posture that a body cannot have at the same time."""
+"""For each posture, another one that a body cannot have at the same time."""
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,16 @@ class Claim:
     Attributes:
         kind: what is claimed, a key of `flame_mdm.sampling.referee.kinds.KINDS`.
         words: the part of the sentence that states the claim.
-        side: "left", "right" or "both", the side of the limbs; "" = any side.
+        side: side of the limb: "left", "right" or "both"; "" = any side.
         direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" =
             any direction.
         speed: "slow" or "fast"; "" = any speed.
-        amount: number of repetitions or steps, or angle of a turn in degrees; None = not stated.
+        amount: number of repetitions or steps, or the angle of a turn in degrees; None = not
+            stated.
         when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
             time.
         seconds: claimed duration; None = not stated.
-        parts: for an order, its two claims, the earlier one first.
+        parts: the two claims of an order, of which the first one happens earlier.
     """
 
     kind: str
@@ -56,7 +57,7 @@ class Claim:
 
     @property
     def mirrored(self) -> "Claim":
-        """The claim about the mirror image of the motion."""
+        """The same claim about the mirror image of the motion."""
         return replace(
             self,
             side=MIRRORED.get(self.side, self.side),
@@ -66,11 +67,11 @@ class Claim:
 
 
 def falsified(claim: Claim) -> list[tuple[str, Claim]]:
-    """Returns claims that are false if `claim` is true, each with the kind of change.
+    """Returns variants of a claim that are false if the claim is true, with the kinds of change.
 
     The kinds of change are "side", "direction", "speed", "count" (one more, and one fewer),
-    "duration" (twice and half as long), "start or end" (the other end), "posture" (a posture that
-    excludes the claimed one at that time) and "order".
+    "duration" (twice and half as long), "start or end" (the other end), "posture" (one that
+    excludes the claimed posture at that time) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]

@@ -1,4 +1,4 @@
-"""`judge`: verdicts on the claims in a sentence about a motion, with evidence."""
+"""`judge`: verdicts, with evidence, on the claims in a sentence about a motion."""
 
 import math
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ from flame_mdm.sampling.referee.sentences import read_claims
 Answer = Literal["yes", "no", "cannot tell"]
 # Minimum duration of a motion that is judged, in seconds
 SHORTEST = 0.4
-# Length, in seconds, of the start and of the end of a motion, where postures are measured
+# Length, in seconds, of the start and the end of a motion, in which postures are measured
 END = 0.6
-# Seconds for which a posture must be held within this time
+# Time in seconds for which a posture must be held within the start or the end
 HELD = 0.2
 # Maximum interruption, in seconds, of a state or activity whose duration is measured
 BREAK = 0.5
@@ -29,14 +29,14 @@ BREAK = 0.5
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer to the question of whether a claim about a motion is true, with the evidence.
+    """The answer to whether a claim about a motion is true, with the evidence.
 
     Attributes:
         claim: the claim.
         answer: "yes", "no" or "cannot tell".
         reading: the measurement.
-        band: two scores. The answer is "no" for scores up to the first one, "yes" for scores from
-            the second one on, and "cannot tell" in between.
+        band: two thresholds of the score. The answer is "no" up to the first one, "yes" from the
+            second one on, and "cannot tell" in between.
     """
 
     claim: Claim
@@ -51,9 +51,9 @@ class Verdict:
 
     @property
     def evidence(self) -> str:
-        """The decisive number with its unit, joint and times.
+        """The decisive number, with its joint, unit and times.
 
-        An example is "left wrist: 0.21 m above the head, 1.2-1.9 s".
+        Example: "left wrist: 0.21 m above the head, 1.2-1.9 s".
         """
         reading = self.reading
         shown = ", ".join(f"{start:.1f}-{end:.1f} s" for start, end in reading.spans[:3])
@@ -65,7 +65,7 @@ class Verdict:
         return f"{self.answer}: {self.claim}; {self.evidence}"
 
     def marks(self, fps: float, frames: int) -> list[tuple[int, int, str, str]]:
-        """Returns the time spans of the evidence, in frames, for the timeline of a player."""
+        """Returns the time spans of the evidence as marks for a player's timeline, in frames."""
         marks = []
         for start, end in self.reading.spans[:3]:
             first = min(max(0, round(start * fps)), frames - 1)
@@ -80,8 +80,8 @@ class Judgment:
 
     Attributes:
         text: the sentence.
-        verdicts: one per claim, in the order of the sentence; empty if the sentence has no claim
-            that can be checked.
+        verdicts: one verdict per claim, in the order of the sentence. The list is empty if no claim
+            in the sentence can be checked.
     """
 
     text: str
@@ -99,7 +99,7 @@ class Judgment:
 
     @property
     def accuracy(self) -> float | None:
-        """Fraction of the decided claims that are true, or None if no claim is decided."""
+        """Fraction of the decided claims that are true, or None if none was decided."""
         return self.true / self.decided if self.decided else None
 
     def __str__(self) -> str:
@@ -113,11 +113,11 @@ def judge(
 ) -> Judgment:
     """Judges whether a motion does what a sentence says.
 
-    The claims in the sentence are read, and each is measured on the motion. The answer is "yes",
-    "no" or "cannot tell". docs/referee.md lists what can be checked.
+    Reads the claims in the sentence and measures each of them on the motion. The answer to each is
+    "yes", "no" or "cannot tell". docs/referee.md lists what can be checked.
 
     Args:
-        motion: a motion on SMPL's 22 joints, or joint positions (F, 22, 3) in meters, y up.
+        motion: a motion of SMPL's 22 joints, or joint positions (F, 22, 3) in meters, with y up.
         text: the sentence. Default: the motion's own text.
         fps: frames per second; required for joint positions.
 
@@ -128,17 +128,19 @@ def judge(
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
             raise UserError(
-                f"motion {motion.id!r} has the skeleton {motion.skeleton.name}. The referee needs {SMPL22.name}"
+                f"motion {motion.id!r} has the skeleton {motion.skeleton.name}. Use {SMPL22.name}"
             )
         joints, fps = motion.joints, motion.fps
         text = motion.text if text is None else text
     else:
         joints = motion
     if fps is None:
-        raise UserError("fps is missing: joints have no frame rate. Pass it, for example fps=20")
+        raise UserError(
+            "fps is missing: joint positions have no frame rate. Pass one, for example fps=20"
+        )
     if not text or not text.strip():
         raise UserError(
-            "text is missing: the motion has none. Pass the sentence to judge the motion by"
+            "text is missing, and so is the motion's text. Pass the sentence to judge the motion by"
         )
     return Judgment(text, tuple(verdicts(joints, fps, read_claims(text))))
 
@@ -146,7 +148,7 @@ def judge(
 def try_judge(motion: Motion) -> Judgment | None:
     """Judges a motion by its own text.
 
-    Returns None if the motion cannot be judged, or if its text has no claim.
+    Returns None if the motion cannot be judged or if its text contains no claim.
     """
     is_long = len(motion.joints) > (SHORTEST + 0.1) * motion.fps
     if motion.skeleton != SMPL22 or not motion.text.strip() or not is_long:
@@ -174,13 +176,13 @@ def claim_score(motions: Sequence[Motion]) -> list[float]:
 
 
 def verdicts(joints: np.ndarray, fps: float, claims: Sequence[Claim]) -> list[Verdict]:
-    """Returns the verdict on each claim about joint positions (F, 22, 3) in meters, y up."""
+    """Returns the verdicts on claims about a motion with joint positions (F, 22, 3) in meters."""
     if not claims:
         return []
     body = Body(joints, fps)
     if len(body) < SHORTEST * RATE:
         raise UserError(
-            f"the motion is {body.seconds:.2f} s long. The referee needs at least {SHORTEST} s"
+            f"the motion is {body.seconds:.2f} s long. The referee requires at least {SHORTEST} s"
         )
     return [decide(body, claim) for claim in claims]
 
@@ -205,16 +207,17 @@ def decide(body: Body, claim: Claim) -> Verdict:
 
 
 def _order(body: Body, claim: Claim) -> Reading:
-    """Measures the seconds from the start of an order's first part to the start of its second part.
+    """Measures the time in seconds between the starts of the two parts of an order.
 
-    If a part happens several times, the pair of times with the largest difference counts. An order
-    is undecided if the answer for one of its parts is not "yes", or if the reverse order also happens.
+    If a part happens several times, the pair of starts with the largest difference counts. The
+    order is undecided if the answer for either part is not "yes", or if the reverse order also
+    happens.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]
     seconds = [start for start, _ in second.reading.spans]
     if first.answer != "yes" or second.answer != "yes" or not firsts or not seconds:
-        return Reading(math.nan, 0.0, "s later", "body", (), "its parts are not clearly there")
+        return Reading(math.nan, 0.0, "s later", "body", (), "not both parts are clear")
     later, reverse = max(seconds) - min(firsts), max(firsts) - min(seconds)
     unclear = "the reverse order also happens" if min(later, reverse) > 0.3 else ""
     spans = (
@@ -225,11 +228,11 @@ def _order(body: Body, claim: Claim) -> Reading:
 
 
 def _at_an_end(body: Body, claim: Claim) -> Reading:
-    """Measures a claim at the start or at the end.
+    """Measures a claim about the start or the end of a motion.
 
     Postures and contacts are measured in the first or last `END` seconds, and movements in the
     first or second half of the motion. The claim is unclear if the other end shows the same posture
-    or movement. Standing is an exception because it is common at both ends.
+    or movement. Standing is an exception, because it is common at both ends.
     """
     kind = KINDS[claim.kind]
     reading = kind.measure(body, replace(claim, when=""))
@@ -251,14 +254,14 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 
 
 def _duration(body: Body, claim: Claim) -> Reading:
-    """Measures for how long a claim is true, including interruptions of up to `BREAK` seconds.
+    """Measures how long a claim is true, including interruptions of up to `BREAK` seconds.
 
-    The score is -|log2(measured / claimed)|. The claim is undecided if it is not true without its
-    duration.
+    The score is -|log2(measured / claimed)|. The claim is undecided if it is not even true without
+    its duration.
     """
     verdict = decide(body, replace(claim, seconds=None))
     reading = verdict.reading
-    undecided = Reading(math.nan, 0.0, "s", reading.joint, (), "it is not clearly there")
+    undecided = Reading(math.nan, 0.0, "s", reading.joint, (), "it is not clearly visible")
     if verdict.answer != "yes" or reading.signal is None or claim.seconds is None:
         return undecided
     level = sum(verdict.band) / 2 if reading.level is None else reading.level

@@ -1,9 +1,9 @@
 """All kinds of claims: their measurements, groups and thresholds.
 
-Each kind consists of a function in `postures.py` or `movements.py`, a row of `KINDS`, and a pattern
-in `sentences.yaml`. `tools/referee.py` calibrates the thresholds in `thresholds.yaml` on captioned
-motions. If a kind has no thresholds or too few motions, the values `no` and `yes` of its row are
-used.
+A kind consists of a function in `postures.py` or `movements.py`, a row in `KINDS` and a pattern in
+`sentences.yaml`. Its thresholds are in `thresholds.yaml`, which `tools/referee.py` calibrates on
+captioned motions. If they are missing or were calibrated on too few motions, the values `no` and
+`yes` in the row are used.
 """
 
 from collections.abc import Callable
@@ -33,8 +33,8 @@ GROUPS = (
     "end",
 )
 ORDER = "order"
-# In binary logarithms: a duration is false if it is off by at least 0.7, and true if it is off by
-# at most 0.4
+# Scores of a duration, the negated error in binary logarithms: a duration is false if it is off by
+# at least 0.7, and true if it is off by at most 0.4
 DURATION = (-0.7, -0.4)
 
 
@@ -46,10 +46,10 @@ class Kind:
         group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration, a
             side, a direction or a speed belongs to that group instead.
         measure: function that measures a claim on a body.
-        no, yes: scores that were set by hand. A claim is false for scores up to `no`, and true from
-            `yes` on. In between, the claim is undecided.
-        is_timed: whether the spans of the reading show when the claimed event happens, so that an
-            order can be read from them.
+        no, yes: thresholds that were set by hand. A claim is false for scores up to `no`, true for
+            scores from `yes` on, and undecided in between.
+        is_timed: whether the spans of the reading tell when the claimed event happens. Only such
+            events can be part of an order.
     """
 
     group: str
@@ -121,7 +121,7 @@ KINDS: dict[str, Kind] = {
     "count steps": Kind("count", movements.steps, -1.5, -0.25, is_timed=False),
 }
 # fmt: on
-"""Measurement and thresholds by kind."""
+"""Measurements and thresholds by kind of claim."""
 
 
 def group_of(claim: Claim) -> str:
@@ -145,8 +145,8 @@ def group_of(claim: Claim) -> str:
 def threshold_key(claim: Claim) -> str:
     """Returns the name of the thresholds for a claim.
 
-    The name consists of the kind and the stated speed. Without a speed, it states whether the claim
-    has a side or a direction.
+    The name consists of the kind and the speed that the claim states. If it states no speed, the
+    name tells whether it has a side or a direction.
     """
     if claim.parts:
         return ORDER
@@ -159,14 +159,14 @@ def threshold_key(claim: Claim) -> str:
 
 @cache
 def thresholds() -> dict[str, Any]:
-    """Returns the calibrated thresholds by `threshold_key`: "no", "yes" and the number of motions."""
+    """Returns the calibrated thresholds and their numbers of motions, by `threshold_key`."""
     return read_package_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns two scores: a claim is false up to the first one, and true from the second one on.
+    """Returns the two thresholds between which a score leaves the claim undecided.
 
-    A claim about a start or an end has the same band as a claim of the same kind about any time.
+    They do not depend on whether the claim is about the start, the end or any time.
     """
     if claim.seconds is not None:
         return DURATION

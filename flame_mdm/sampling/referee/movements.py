@@ -35,9 +35,10 @@ SEEN = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "forward": (0.0, 1.0), "backwa
 
 
 def travel(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled in the claimed direction, or in any if none is claimed.
+    """Measures the distance traveled, in meters.
 
-    The direction is relative to the body.
+    If a direction is claimed, only travel in this direction counts. Directions are relative to the
+    body.
     """
     speed = body.speed
     if claim.direction:
@@ -57,10 +58,10 @@ def travel(body: Body, claim: Claim) -> Reading:
 def veer(body: Body, claim: Claim) -> Reading:
     """Measures the largest displacement to the claimed side, in meters.
 
-    Two displacements are measured: the displacement from the start, relative to the initial heading,
-    and the sum of all sideways steps, relative to the current heading. The larger displacement
-    counts. The reading is unclear if it exceeds 0.2 m and the displacement to the other side is more
-    than half as large.
+    The larger of two displacements counts: the displacement from the start, relative to the initial
+    heading, and the sum of all sideways steps, relative to the current heading. The reading is
+    unclear if this displacement exceeds 0.2 m and the displacement to the other side is more than
+    half as large.
     """
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0
@@ -81,10 +82,10 @@ def veer(body: Body, claim: Claim) -> Reading:
 
 
 def turn(body: Body, claim: Claim) -> Reading:
-    """Measures the largest turn in degrees, in the claimed direction if there is one.
+    """Measures the largest turn in degrees.
 
-    With a claimed direction, the reading is unclear if the largest turn in the other direction
-    exceeds 60 % of the turn in the claimed direction.
+    If a direction is claimed, only turns in this direction count. The reading is then unclear if
+    the largest turn in the other direction exceeds 60 % of the turn in the claimed one.
     """
     left, right = _turn(body.yaw, "left"), _turn(-body.yaw, "right")
     if not claim.direction:
@@ -97,7 +98,7 @@ def turn(body: Body, claim: Claim) -> Reading:
 
 
 def turn_amount(body: Body, claim: Claim) -> Reading:
-    """Measures the relative error of the largest turn, compared with the claimed angle."""
+    """Measures the relative error of the largest turn with respect to the claimed angle."""
     reading = turn(body, claim)
     claimed = claim.amount or 180
     score = -abs(reading.number - claimed) / claimed
@@ -107,7 +108,7 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
     """Measures the largest rise of an angle (F,) in degrees.
 
-    The span of the reading is the time during which the angle rises from 10 % to 90 % of this rise.
+    The span of the reading covers the time in which the angle completes 10 % to 90 % of this rise.
     """
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())
@@ -139,7 +140,7 @@ def circle(body: Body, claim: Claim) -> Reading:
 
 
 def gait_speed(body: Body) -> float:
-    """Returns the highest mean speed of the pelvis over 0.8 seconds in m/s."""
+    """Returns the highest mean speed of the pelvis, in m/s, over any 0.8 seconds."""
     window = min(len(body), round(0.8 * RATE))
     return float(uniform_filter1d(body.speed, window, mode="nearest").max())
 
@@ -150,7 +151,7 @@ def run(body: Body, claim: Claim) -> Reading:
 
 
 def walk(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled at less than running speed, 2.2 m/s."""
+    """Measures the distance traveled below running speed, which begins at 2.2 m/s."""
     is_walk = (body.speed > MOVING) & (body.speed < 2.2)
     distance = float(body.speed[is_walk].sum() / RATE)
     spans = spans_of(is_walk, 0.3)
@@ -169,7 +170,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures the fraction by which the last 0.3 seconds are slower than the fastest 0.3 seconds."""
+    """Measures by which fraction the last 0.3 seconds are slower than the fastest 0.3 seconds."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan
@@ -179,8 +180,8 @@ def stop(body: Body, claim: Claim) -> Reading:
 def steps(body: Body, claim: Claim) -> Reading:
     """Counts steps.
 
-    In a step, the distance between the ankles along the heading changes its sign and grows to 15
-    cm.
+    A step is counted when the offset between the ankles along the heading changes its sign and then
+    grows to 15 cm.
     """
     ahead = body.seen[:, ANKLES, 2]
     stride = ahead[:, 0] - ahead[:, 1]
@@ -257,7 +258,7 @@ def count_kicks(body: Body, claim: Claim) -> Reading:
 
 
 def count_punches(body: Body, claim: Claim) -> Reading:
-    """Counts how often a wrist moves away from its shoulder, in body coordinates."""
+    """Counts how often a wrist moves away from its shoulder in body coordinates."""
     away = np.linalg.norm(body.seen[:, WRISTS] - body.seen[:, SHOULDERS], axis=-1) / body.reach
     if claim.side in SIDES:
         signal = away[:, SIDES.index(claim.side)]
@@ -286,7 +287,7 @@ def count_raises(body: Body, claim: Claim) -> Reading:
 
 
 def count_spins(body: Body, claim: Claim) -> Reading:
-    """Counts the full turns in the largest rotation of the body, in either direction."""
+    """Counts the full turns in the largest turn of the body in either direction."""
     reading = turn(body, claim)
     turns = reading.number / 360
     claimed = claim.amount or 1
@@ -310,9 +311,9 @@ def strike(body: Body, claim: Claim) -> Reading:
 
 
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
-    """Compares how much a limb moves with how much the other limb moves.
+    """Compares how much a limb and the other limb of the same kind move.
 
-    The score is the binary logarithm of the ratio.
+    The score is the binary logarithm of the ratio of their movements.
     """
     total = activity.mean(0)
     chosen = SIDES.index(claim.side)
@@ -327,7 +328,10 @@ def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> R
 
 
 def use_hand(body: Body, claim: Claim) -> Reading:
-    """Compares the mean speeds of the wrists relative to the chest. Raised hands have a larger weight."""
+    """Compares the mean speeds of the wrists relative to the chest.
+
+    Raised hands have more weight.
+    """
     raised = body.joints[:, WRISTS, 1] - body.joints[:, [PELVIS], 1]
     weight = np.clip(raised / 0.3, 0.1, 1.0)
     return _dominance(body.hand_speed * weight, claim, "hand", 0.05)
@@ -340,7 +344,7 @@ def use_foot(body: Body, claim: Claim) -> Reading:
 
 
 def lean(body: Body, claim: Claim) -> Reading:
-    """Measures how far the middle of the shoulders is to the left or right of the hips."""
+    """Measures how far the midpoint of the shoulders is to the left or right of the hips."""
     aside = body.seen[:, SHOULDERS, 0].mean(1) - body.seen[:, HIPS, 0].mean(1)
     signal = aside if claim.direction == "left" else -aside
     return existence(signal, f"m to the {claim.direction}", "trunk", 0.2)

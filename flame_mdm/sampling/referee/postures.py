@@ -1,4 +1,4 @@
-"""Measurements of postures, and of contacts between body parts. `kinds.py` lists them."""
+"""Measurements of postures and of contacts between body parts. `kinds.py` lists them."""
 
 from dataclasses import replace
 
@@ -22,20 +22,20 @@ from flame_mdm.sampling.referee.claims import Claim
 from flame_mdm.sampling.referee.readings import Reading, existence, of_side, spans_of
 
 SIDES = ("left", "right")
-# Speed of the pelvis in m/s above which the body travels
+# Speed of the pelvis, in m/s, above which the body counts as traveling
 MOVING = 0.25
 # Pelvis height of a standing body of normal size, in meters
 STANDING = 0.9
 # Smallest change in height, in meters, that undoubtedly counts as standing up or getting down
 RISE = 0.25
-# A body is low from the beginning if its pelvis starts more than this many meters below `STANDING`
+# Distance in meters below `STANDING` beyond which the pelvis counts as low at the beginning
 LOW = 0.1
-# Change of the angle of the trunk, in degrees, by which a person straightens up
+# Minimum change in the angle of the trunk, in degrees, when a person straightens up
 STRAIGHTENED = 30
 
 
 def thighs(body: Body) -> np.ndarray:
-    """Returns the angle (F, 2) between each thigh and the vertical in degrees; 90 = level."""
+    """Returns the angles (F, 2) between the thighs and the vertical, in degrees; 90 = level."""
     thigh = body.joints[:, KNEES] - body.joints[:, HIPS]
     return np.degrees(np.arctan2(np.linalg.norm(thigh[..., [0, 2]], axis=-1), -thigh[..., 1]))
 
@@ -49,7 +49,7 @@ def upright(body: Body, claim: Claim) -> Reading:
 def sit(body: Body, claim: Claim) -> Reading:
     """Measures how far the pelvis is below its standing height.
 
-    The thighs must be raised, and the trunk must be upright.
+    Only frames in which the thighs are raised and the trunk is upright count.
     """
     lowered = STANDING - body.height[:, PELVIS]
     is_folded = (thighs(body).min(1) > 40) & (body.tilt < 60)
@@ -105,7 +105,7 @@ def hand_down(body: Body, claim: Claim) -> Reading:
 def stand_up(body: Body, claim: Claim) -> Reading:
     """Measures the largest rise of the pelvis.
 
-    A person who straightens up after a bow also "stands up", so that claim is left undecided.
+    A person who only straightens up after a bow also "stands up"; the claim is then left undecided.
     """
     reading = _change(body.height[:, PELVIS])
     straightened = _change(-body.tilt)
@@ -126,7 +126,7 @@ def get_down(body: Body, claim: Claim) -> Reading:
 
 
 def _change(signal: np.ndarray) -> Reading:
-    """Returns a reading of the largest rise of a signal (F,) in meters, with its start and end."""
+    """Returns a reading of the largest rise of a signal (F,), in meters, whose span is the rise."""
     lowest = np.minimum.accumulate(signal)
     end = int((signal - lowest).argmax())
     start = int(signal[: end + 1].argmin())
@@ -147,9 +147,9 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 
 
 def return_pose(body: Body, claim: Claim) -> Reading:
-    """Measures the distance of each joint between the first and the last pose, in body coordinates.
+    """Measures the distances between the joints of the first and the last pose.
 
-    The joint with the largest distance counts.
+    Distances are measured in body coordinates, and the largest one counts.
     """
     ends = max(1, round(0.2 * RATE))
     first, last = body.seen[:ends].mean(0), body.seen[-ends:].mean(0)
@@ -161,7 +161,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the final distance from the start as a fraction of the largest one."""
+    """Measures the final distance from the start as a fraction of the largest distance from it."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])
@@ -172,7 +172,7 @@ def return_place(body: Body, claim: Claim) -> Reading:
 
 
 def last_part(body: Body) -> tuple[float, float]:
-    """Returns the times in seconds at which the final part of a motion begins and ends."""
+    """Returns the times in seconds at which the last part of a motion begins and ends."""
     return max(0.0, body.seconds - 0.3), body.seconds
 
 
@@ -223,7 +223,7 @@ def hand_on_hip(body: Body, claim: Claim) -> Reading:
 
 
 def arms_out(body: Body, claim: Claim) -> Reading:
-    """Measures how far both wrists are out to the sides of the shoulders, in arm lengths."""
+    """Measures how far both wrists reach to the sides of the shoulders, in arm lengths."""
     aside = body.seen[:, WRISTS, 0] - body.seen[:, SHOULDERS, 0]
     outward = np.minimum(aside[:, 0], -aside[:, 1]) / body.reach
     is_up = (body.joints[:, WRISTS, 1] - body.joints[:, SHOULDERS, 1]).min(1) > -0.35

@@ -1,4 +1,4 @@
-"""`Reading`, the evidence for or against a claim, and helpers that find it in signals."""
+"""`Reading`: the evidence for or against a claim, with functions that find it in signals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +9,7 @@ from flame_mdm.sampling.referee.body import RATE
 
 Spans = tuple[tuple[float, float], ...]
 
-# Units of distances. A smaller distance supports a claim.
+# Units of distances that support a claim when they are small
 AWAY = ("m above the floor", "m apart", "m from")
 
 
@@ -18,14 +18,15 @@ class Reading:
     """The measurement for a claim.
 
     Attributes:
-        score: number that is compared with the thresholds of the kind. A higher score supports the
+        score: number that is compared with the thresholds of the kind. Higher scores support the
             claim. NaN = undecided.
         number, unit: the measured value, in a readable unit.
-        joint: joint or part of the body.
-        spans: start and end, in seconds, of each time span where the claim is true or nearly true.
-        unclear: reason why a high score does not make the claim true; "" = none.
-        signal: values (F,) that show for each frame whether the claim is true, or None if
-            individual frames do not show it.
+        joint: joint or body part that was measured.
+        spans: start and end, in seconds, of each time span in which the claim is true or nearly
+            true.
+        unclear: reason why the claim is undecided despite a high score; "" = none.
+        signal: values (F,) that tell for each frame whether the claim is true, or None if this
+            cannot be told from single frames.
         level: minimum value of `signal` at which the claim is true; None = the middle of the kind's
             band.
     """
@@ -41,9 +42,9 @@ class Reading:
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
-    """Returns the start and the end, in seconds, of each run of true frames (F,).
+    """Returns the start and the end, in seconds, of each run of frames whose flag (F,) is True.
 
-    Runs shorter than `shortest` seconds are left out.
+    Runs shorter than `shortest` seconds are omitted.
     """
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0])).reshape(-1, 2)
     return tuple(
@@ -62,25 +63,26 @@ def held(signal: np.ndarray, seconds: float) -> float:
 def existence(
     signal: np.ndarray, unit: str, joint: str, seconds: float = 0.1, share: float = 0.5
 ) -> Reading:
-    """Returns a reading of the value that a signal (F,) reaches for `seconds` seconds.
+    """Returns a reading of the highest value that a signal (F,) holds for `seconds` seconds.
 
-    The spans are the frames above a level. The level lies between the median and the highest value,
-    at the fraction `share`. For a short signal, the lowest value replaces the median.
+    Its spans consist of the frames above a level, which lies between the median and the highest
+    value of the signal, at the fraction `share`. If the signal is short, its lowest value replaces
+    the median.
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))
     bound = low + share * (score - low)
-    # The signal of a distance is negative: a smaller distance supports the claim.
+    # The signal of a distance is negated, because smaller distances support the claim.
     number = -score if unit.startswith(AWAY) else score
     return Reading(score, number, unit, joint, spans_of(signal >= bound), signal=signal)
 
 
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
-    """Returns the reading of a limb, given the readings of the left and the right limb.
+    """Combines the readings of the left and the right limb into the reading of a side.
 
-    For "both", the lower reading counts. For "", the higher reading counts. The reading of a left
-    or right limb is unclear if the readings differ by less than `margin`, because the other limb
-    then does the same.
+    For "both", the lower reading counts, and for "", the higher one. For "left" and "right", the
+    reading is unclear if the two readings differ by less than `margin`, because the other limb then
+    does the same.
     """
     left, right = readings
     if side == "both":
@@ -99,7 +101,7 @@ def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
 
 
 def cycles(signal: np.ndarray, depth: float) -> list[int]:
-    """Returns the frames of the peaks of a signal (F,).
+    """Returns the frames in which a signal (F,) has peaks.
 
     A peak is `depth` above the valleys on both sides. If a signal begins or ends high, the outer
     valley exists only if the signal returns to a low value within the motion.
@@ -124,11 +126,11 @@ def cycles(signal: np.ndarray, depth: float) -> list[int]:
 def counted(
     signal: np.ndarray, depths: tuple[float, float], amount: int | None, joint: str, unit: str
 ) -> Reading:
-    """Returns a reading of the number of repetitions, which are peaks of a signal.
+    """Returns a reading of the number of repetitions, counted as peaks of a signal.
 
-    Peaks are counted with a lower and a higher depth. The score is 0 if both counts equal the
-    claimed count, and -0.5 if the claimed count is between them. Otherwise, the score is the
-    negative distance between the claimed count and the nearest count, at most -1.
+    Peaks are counted twice, with a lower and a higher minimum depth. The score is 0 if both counts
+    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, it is the
+    negative distance from the claimed count to the nearer count, which is at most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))
@@ -147,7 +149,7 @@ def counted(
 def _is_cut(signal: np.ndarray, depth: float) -> bool:
     """Returns whether a signal (F,) begins in the middle of a repetition.
 
-    In this case, the signal falls by `depth` before it rises by `depth`.
+    This is the case if the signal falls by `depth` before it rises by `depth`.
     """
     falls = np.flatnonzero(signal < signal[0] - depth)
     rises = np.flatnonzero(signal > signal[0] + depth)

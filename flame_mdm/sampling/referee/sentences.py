@@ -1,9 +1,9 @@
 """Reads the claims in a sentence by rules. Parts that are not understood are ignored.
 
-The rules are precise rather than complete. The patterns are in `sentences.yaml`, and the verb forms
-are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or several people
-are left out. Comparisons ("like a zombie") and everything that matches no pattern are also left
-out.
+The rules aim at precision rather than completeness. The patterns are in `sentences.yaml`, and the
+verb forms are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or
+several people are ignored, and so are comparisons ("like a zombie") and everything else that
+matches no pattern.
 """
 
 import re
@@ -24,7 +24,7 @@ BOUNDARY = re.compile(
 )
 LATER = ("then", "followed by", "before", "|")
 SIDES = re.compile(r"\b(left|right)\b")
-# Maximum length of a sentence in characters. The rest is not read.
+# Maximum length of a sentence in characters. The rest is ignored.
 LONGEST = 600
 COUNT_NOUNS = {
     "count jumps": "jumps?|hops?|leaps?",
@@ -53,7 +53,7 @@ POSTURES = {
     "arms crossed",
 }
 LASTING = {"walk", "run", "stand still", *POSTURES}
-"""Kinds of claims that may state seconds."""
+"""Kinds of claims that may state a duration."""
 AT_AN_END = {"walk", "run", "jump", "hop", "kick", "strike", *POSTURES}
 """Kinds of claims that may refer to the start or the end."""
 DIRECTIONS = {
@@ -73,7 +73,7 @@ class Clause:
 
 @dataclass(frozen=True)
 class Pattern:
-    """A row of `sentences.yaml`."""
+    """A pattern for claims: one row of `sentences.yaml`."""
 
     kind: str
     when: re.Pattern[str]
@@ -84,7 +84,7 @@ class Pattern:
 def read_claims(text: str) -> list[Claim]:
     """Returns the claims in a sentence in order, without duplicates.
 
-    The list is empty if the sentence has no claim that can be checked.
+    The list is empty if the sentence contains no claim that can be checked.
     """
     plain = _plain(text)
     if any(pattern.search(plain) for pattern in _unread()):
@@ -107,9 +107,9 @@ def read_claims(text: str) -> list[Claim]:
 
 
 def _plain(text: str) -> str:
-    """Converts text to lower case, and removes hyphens and apostrophes.
+    """Converts text to lower case and removes hyphens and apostrophes.
 
-    Joined phrases become one word.
+    Phrases that contain a connective are joined to one word.
     """
     plain = re.sub(r"[-'’\"]", " ", text[:LONGEST].lower())
     plain = re.sub(r"\b(?:counter|anti) ?clockwise\b", "counterclockwise", plain)
@@ -120,7 +120,7 @@ def _plain(text: str) -> str:
 
 
 def _clauses(plain: str) -> list[Clause]:
-    """Splits a sentence at its connectives, and cuts each clause off at a comparison."""
+    """Splits a sentence into clauses at its connectives, and cuts clauses off at a comparison."""
     clauses: list[Clause] = []
     start, is_later = 0, False
     for match in [*BOUNDARY.finditer(plain), None]:
@@ -166,7 +166,7 @@ def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
     for state in _states():
         if state.when.search(text) and not (state.unless and state.unless.search(text)):
             claims += _claims(state, text)
-    # "Starts to walk" may mean that the person stood before.
+    # "Starts to walk" may mean that the person was standing before.
     if not claims and (when == "end" or _has(text, "by")):
         claims = [claim for claim in _of_clause(text) if claim.kind in AT_AN_END]
     return [replace(claim, when=when) for claim in claims]
@@ -215,7 +215,7 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
 
 
 def _further(take: str, claim: Claim, text: str) -> list[Claim]:
-    """Returns the claims that a clause makes in addition to the claim of its pattern."""
+    """Returns the claims that a clause makes in addition to the one of its pattern."""
     if take == "travel" or take == "jumped":
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"
@@ -248,9 +248,9 @@ def _is_turning(text: str) -> bool:
 
 
 def _way(text: str) -> str | None:
-    """Returns left, right, clockwise or counterclockwise as a direction.
+    """Returns the direction that a clause states: left, right, clockwise or counterclockwise.
 
-    Returns None if there is no direction, or if there are several.
+    Returns None if it states no direction or several.
     """
     ways = set()
     for match in re.finditer(r"\b(left|right|clockwise|counterclockwise)\b", text):
@@ -264,9 +264,9 @@ def _way(text: str) -> str | None:
 
 
 def _direction(text: str) -> str:
-    """Returns forward or backward as a direction of travel.
+    """Returns the direction of travel that a clause states: forward or backward.
 
-    Returns "" if no direction is stated, if both are stated, or if the direction is diagonal.
+    Returns "" if it states neither or both, or if the direction is diagonal.
     """
     if re.search(r"\b(?:diagonal|diagonally|sideways|backandforth|zig ?zag)\b", text):
         return ""
@@ -281,9 +281,9 @@ def _direction(text: str) -> str:
 
 
 def _side(text: str, limb: str) -> str | None:
-    """Returns the side of a limb in a clause: left, right, both, or "" if none is stated.
+    """Returns the side of a limb in a clause: left, right or both, or "" if no side is stated.
 
-    Returns None if it is ambiguous.
+    Returns None if the side is ambiguous.
     """
     limbs = _content()[limb]
     stated = {match[1] for match in re.finditer(rf"\b(left|right) (?:\w+ )?(?:{limbs})\b", text)}
@@ -293,14 +293,14 @@ def _side(text: str, limb: str) -> str | None:
         return None
     if stated:
         return stated.pop()
-    # "Kicks his legs" does not mean both at the same time.
+    # "Kicks his legs" does not mean that both legs kick at the same time.
     if limb == "legs" or re.search(r"\bone of\b", text):
         return ""
     return "both" if re.search(r"\b(?:hands|arms|fists|wrists)\b", text) else ""
 
 
 def _amount(text: str, kind: str) -> int | None:
-    """Returns the number of repetitions that a clause states for a kind, or None."""
+    """Returns the number of repetitions that a clause states for a kind of claim, or None."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     nouns = COUNT_NOUNS[kind]
@@ -318,9 +318,9 @@ def _amount(text: str, kind: str) -> int | None:
 
 
 def _speed(text: str) -> str:
-    """Returns "slow" or "fast" if a clause states one of them.
+    """Returns "slow" or "fast" if a clause states that speed.
 
-    Returns "" if it states neither or both, or "normal".
+    Returns "" if it states neither speed or both, or "normal".
     """
     words = text.split()
     values = {value for word, value in word_values("speed").items() if word in words}
@@ -328,7 +328,7 @@ def _speed(text: str) -> str:
 
 
 def _orders(before: Sequence[Claim], after: Sequence[Claim]) -> list[Claim]:
-    """Returns the claim that the first event of a clause precedes the first event of the next."""
+    """Returns the claim that a clause's first event precedes the first event of the next clause."""
     first = next((claim for claim in before if _is_event(claim)), None)
     second = next((claim for claim in after if _is_event(claim)), None)
     if first is None or second is None or first.kind == second.kind:
@@ -345,8 +345,8 @@ def _is_event(claim: Claim) -> bool:
 def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
     """Removes the claims that the rest of the sentence makes doubtful.
 
-    A body that also travels does not stand still all the time. A person who stands up after a bow
-    was already standing. If a sentence names both sides, it does not claim that one side moves
+    A body that also travels does not stand still all the time, and a person who stands up after a
+    bow was already standing. A sentence that names both sides does not claim that one of them moves
     more.
     """
     doubtful: set[str] = set()
@@ -372,12 +372,12 @@ def _content() -> dict[str, Any]:
 
 @cache
 def _sided_words() -> str:
-    """Returns a pattern of words that can have a side, as in "left hand"."""
+    """Returns a pattern for words that can have a side, as in "left hand"."""
     return "|".join(phrases()["sides_of"].split())
 
 
 def _expanded(pattern: str) -> re.Pattern[str]:
-    """Compiles a pattern of `sentences.yaml`."""
+    """Compiles a pattern from `sentences.yaml`."""
     content = _content()
     pattern = re.sub(r"\s+(?=\[)", "", pattern) if pattern.startswith(r"\b(?:like") else pattern
     pattern = re.sub(r"\[(\w+)\]", lambda match: _forms(match[1]), pattern)

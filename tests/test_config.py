@@ -489,7 +489,7 @@ def test_evaluations_are_swept_and_launched(tmp_path, monkeypatch, capsys, subte
         (["--fast", "--multirun"], "unknown option --fast"),
         (
             [],
-            "guidance_scale=1,2.5: several values make a sweep with one job per value. Add --multirun",
+            "guidance_scale=1,2.5: several values define a sweep with one job per value. Add --multirun",
         ),
     ):
         with subtests.test(extra=extra, message=message):

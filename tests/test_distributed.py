@@ -250,7 +250,7 @@ REFUSED = {
     "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "unknown logger 'nothing'",
     "train quickstart launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
     "train quickstart launch=slurm": "launch=slurm: this machine has no srun. Run the command on a",
-    "train quickstart seed=0,1": "seed=0,1: several values make a sweep with one run per value. Add --multirun",
+    "train quickstart seed=0,1": "seed=0,1: several values define a sweep with one run per value. Add --multirun",
     "convert a b launch=slurm": "unknown config key 'launch'",
     "convert a b --multirun": "unknown option --multirun",
 }

@@ -179,7 +179,7 @@ def test_a_file_is_not_converted_into_itself_under_any_name(
     (tmp_path / "link.bvh").symlink_to("a.bvh")
     (tmp_path / "second.bvh").hardlink_to("a.bvh")
     before = Path("a.bvh").read_bytes()
-    assert "the output would overwrite the input" in error_of(capsys, "convert", "a.bvh", name)
+    assert "this would overwrite the input" in error_of(capsys, "convert", "a.bvh", name)
     assert Path("a.bvh").read_bytes() == before
 
 

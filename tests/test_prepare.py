@@ -102,7 +102,7 @@ def test_differences_from_published_figures_are_loud_but_not_fatal(
     report = verified(tmp_path / "data", "data=humanml3d", f"source={folder}")
     output = capsys.readouterr().out
     assert (
-        "DIFFERS from the published figures:\n  motions: 3 found, 14,616 published (-14,613, -99.98%)\n"
+        "DIFFERS from the published numbers:\n  motions: 3 found, 14,616 published (-14,613, -99.98%)\n"
         in output
     )
     assert "  words per caption: 4.0 found, 12 published (-8, -66.67%)" in output

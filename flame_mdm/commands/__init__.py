@@ -32,12 +32,12 @@ STORE = "store.json"
 
 
 def usual_data_root() -> str:
-    """Returns the folder of the prepared data sets: FLAME_MDM_DATA, by default `data`."""
+    """Returns the folder of the prepared data sets: `FLAME_MDM_DATA` or, by default, `data`."""
     return os.environ.get("FLAME_MDM_DATA", "data")
 
 
 def existing(key: str, source: str) -> None:
-    """Checks that a file or folder exists."""
+    """Raises `FileNotFoundError` if a file or folder does not exist."""
     if not Path(source).exists():
         raise FileNotFoundError(f"{source}: no such file")
 
@@ -58,9 +58,9 @@ def motion_file(key: str, source: str) -> None:
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """If any motions failed, prints their errors and exits with code 1.
+    """Prints the errors of failed motions, if any, and then exits with code 1.
 
-    `done` is the verb for the message, such as "converted".
+    `done` is the participle for the error message, such as "converted".
     """
     if failures:
         say(*(f"error: {failure}" for failure in failures), error=True)
@@ -69,7 +69,7 @@ def finish(failures: Sequence[str], total: int, done: str) -> None:
 
 
 def model_source(key: str, source: str) -> None:
-    """Checks that the files of an extractor or of another model exist."""
+    """Checks that the files of an extractor or another model exist."""
     if source != "none" and not Path(source).exists():
         try:
             find(source)
@@ -125,7 +125,7 @@ class AdaptedSettings(ModelSettings):
     """Keys that specify a model and its adapters."""
 
     adapter: list[str] | None = option(
-        None, "adapters of this model, written by `flame-mdm adapt`, separated by spaces"
+        None, "adapters for this model, written by `flame-mdm adapt` and separated by spaces"
     )
     adapter_strength: float | Sequence[float] = option(
         1.0,
@@ -133,7 +133,7 @@ class AdaptedSettings(ModelSettings):
     )
 
     def adapters(self) -> dict[str, Any]:
-        """Returns the keyword arguments of `flame_mdm.load` that describe the adapters."""
+        """Returns the keyword arguments for `flame_mdm.load` that specify the adapters."""
         return {"adapter": self.adapter or (), "strength": self.adapter_strength}
 
 
@@ -142,7 +142,7 @@ class FileSettings:
     """Keys that describe a motion file."""
 
     fps: float | None = option(
-        None, "frames per second, instead of the value in the file; required for .npy and .amc"
+        None, "frames per second, which overrides the value in the file; required for .npy and .amc"
     )
     unit: float | None = option(
         None, "meters per unit of length in the file; default: 0.01 for most .bvh files, 1 for .npy"
@@ -159,9 +159,9 @@ class FileSettings:
 def read_motions(
     source: str, settings: FileSettings, failures: list[str]
 ) -> tuple[str, int, Iterator[Motion]]:
-    """Returns the name of a file or folder, the number of its motions, and the motions.
+    """Returns the name of a file or folder, its number of motions, and the motions themselves.
 
-    If files in a folder cannot be read, their errors are added to `failures`.
+    The errors of files in a folder that cannot be read are added to `failures`.
     """
     from flame_mdm.formats.readers import read
 
@@ -189,7 +189,7 @@ def read_motions(
 
 @dataclass(frozen=True, kw_only=True)
 class BodySettings:
-    """Key that selects the body in pictures, pages and files."""
+    """Key that selects the body to show in pictures, pages and files."""
 
     body: str = option(
         "mannequin",
@@ -198,7 +198,7 @@ class BodySettings:
     )
 
     def read_body(self) -> Mesh | None:
-        """Reads `body`. Returns None for the default body, the mannequin."""
+        """Reads `body`, and returns None for the mannequin, which is the default."""
         if self.body == "mannequin":
             return None
         from flame_mdm.formats.people import load_body
@@ -221,7 +221,7 @@ class WritingSettings:
     )
     character: str | None = option(
         None,
-        "your own character to move: a .glb with a skin, or a .bvh; see docs/characters.md",
+        "your own character to animate: a .glb with a skin, or a .bvh; see docs/characters.md",
         existing,
     )
 
@@ -240,7 +240,7 @@ class WritingSettings:
             raise
 
     def at_rate(self, motion: Motion) -> Motion:
-        """Returns a motion at the frame rate `resample`."""
+        """Resamples a motion to the frame rate `resample`, if it is set."""
         from flame_mdm.formats.resampling import frame_rate
 
         return (
@@ -252,7 +252,7 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model for sampling, and the body to draw (None = the mannequin)."""
+    """A model for sampling, and the body to draw, which is None for the mannequin."""
 
     model: MotionGenerator
     body: Mesh | None
@@ -270,22 +270,22 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     targets: str | None = same_option(SamplingRequest, "targets", existing)
     trajectory: bool = option(
         False,
-        "also draw the clean estimates of the first motion during sampling, as trajectory.png",
+        "also draw the first motion's clean estimates during sampling, as trajectory.png",
     )
     mp4: bool = option(
-        False, 'also write motions.mp4; requires pip install "flame-mdm[video]"', video
+        False, 'also write motions.mp4, which requires pip install "flame-mdm[video]"', video
     )
     device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:
-        """Returns the keys with values that determine the content of the motions."""
+        """Returns the keys that have a value and determine the content of the motions."""
         names = [name for name in ("text", "action") if getattr(self, name) is not None]
         return names + (["unconditioned"] if self.unconditioned else [])
 
     def request(self, **values: Any) -> SamplingRequest:
-        """Returns the request to the model. `values` override the values of these keys.
+        """Returns the sampling request that the keys describe; `values` override the keys.
 
-        Raises `UserError` if more than one condition is requested, or if a value is invalid.
+        Raises `UserError` if several conditions are requested or a value is invalid.
         """
         if len(conditions := self.conditions()) > 1:
             raise UserError(f"{' and '.join(conditions)} cannot be combined. Use only one of them")
@@ -314,9 +314,9 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     def load(self) -> LoadedModel:
         """Loads the model and the body.
 
-        Raises a `UserError` with examples if no key determines the content of the motions.
+        If no key determines the content of the motions, raises a `UserError` that lists examples.
         """
-        file = find(self.ckpt, self.which)  # before PyTorch is imported
+        file = find(self.ckpt, self.which)  # reports a missing file before PyTorch is imported
         import torch
 
         from flame_mdm.checkpoints.loading import load
@@ -332,14 +332,14 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class DataSettings:
-    """Keys for commands that open a data set."""
+    """Keys of commands that open a data set."""
 
     data: str | None = option(
-        None, "data set, a file in experiments/data; data.KEY=... overrides its keys"
+        None, "name of a data set in experiments/data; data.KEY=... overrides its keys"
     )
     representation: str | None = option(
         None,
-        "motion representation, a file in experiments/representation; default: the "
+        "name of a motion representation in experiments/representation; default: the "
         "representation of the data set",
     )
     data_root: str = option(
@@ -350,21 +350,21 @@ class DataSettings:
 
     def __post_init__(self) -> None:
         if self.data is not None:
-            _ = self.nodes  # composed here, so that errors are reported before any work is done
+            _ = self.nodes  # reports errors before any work is done
         elif self.composed:
             raise UserError(
-                f"{self.composed[0]} is an option of a data set, but no data set was given. "
+                f"{self.composed[0]} is an option of a data set, but no data set was specified. "
                 "Add data=NAME"
             )
 
     @cached_property
     def nodes(self) -> Config:
-        """The composed configuration of the data set and its representation: `data` and `representation`."""
+        """The composed nodes `data` and `representation`, which configure the data set."""
         if self.data is None:
             names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
             raise UserError(
-                f"no data set was given. Add data=NAME, where NAME is one of: {names}. For your "
-                "own motions, use data=folder"
+                f"no data set was specified. Add data=NAME, where NAME is one of: {names}. "
+                "For your own motions, use data=folder"
             )
         chosen = [f"representation={self.representation}"] if self.representation else []
         return compose_data(
@@ -372,7 +372,7 @@ class DataSettings:
         )
 
     def data_node(self, source: str | None = None) -> Config:
-        """Returns the configuration of the data set with the path in `source`."""
+        """Returns the configuration of the data set, in which `source` replaces the source path."""
         node = self.nodes["data"]
         if source is not None:
             if "path" not in node["source"]:

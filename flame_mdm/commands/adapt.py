@@ -11,9 +11,9 @@ from flame_mdm.config.options import option, required
 class AdaptSettings(ModelSettings):
     """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
 
-    Teaches a trained model the motions in a folder; the model keeps its other abilities. Prompts
+    Teaches a trained model the motions in a folder, without losing its other abilities. Prompts
     that end with "in limp style" then request motions in this style. Writes the adapter
-    OUT/limp.safetensors, for `sample` and `load`, and a page that compares motions before and
+    OUT/limp.safetensors for `sample` and `load`, and a page that compares motions before and
     after training. Run the same command again to resume. docs/own-motion.md explains the steps.
     """
 
@@ -22,11 +22,9 @@ class AdaptSettings(ModelSettings):
     source: str = required("folder of motions with captions; see docs/own-data.md")
     name: str = required("one word for prompts such as 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default: runs/adapt/NAME")
-    action: bool = option(
-        False, "true = the clips show an action that the model does not know, instead of a style"
-    )
+    action: bool = option(False, "true = the clips show a new action rather than a style")
     full: bool = option(
-        False, "true = train all weights; the result is a model instead of an adapter"
+        False, "true = train all weights, which results in a model instead of an adapter"
     )
     force: bool = option(False, "true = accept clips that drift upward or float")
     rank: int = option(

@@ -17,16 +17,16 @@ class AuditSettings(DataSettings):
            flame-mdm audit cards="A.json B.json"
 
     Perturbs the real motions of a data set at graded strengths, measures them like generated
-    motions, and writes a card. The card shows which perturbations each metric detects, starting
-    at which strength, and which ones it does not detect. extractor=none audits the metrics of
-    joint positions. After an interruption, the same command continues where it stopped. cards=
-    renders one card again, or two cards side by side.
+    motions, and writes a card. For each metric, the card shows which perturbations it detects, at
+    which strength, and which ones it misses. extractor=none audits the metrics that are computed
+    from joint positions. After an interruption, the same command continues where it stopped.
+    cards= renders one card again, or two cards side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
     extractor: str | None = option(
         None,
-        "path of the motion-CLIP or other extractor that the protocol requires; none = audit "
+        "path of the motion-CLIP or other extractor required by the protocol; none = audit "
         "only metrics that need no extractor",
         model_source,
     )
@@ -40,7 +40,7 @@ class AuditSettings(DataSettings):
     )
     samples: int | None = option(None, "number of motions; default: all motions of the split")
     resamples: int = option(
-        100, "number of bootstrap resamples of the motions for the confidence intervals"
+        100, "number of bootstrap resamples of the motions, for the confidence intervals"
     )
     cards: list[str] | None = option(
         None, "one card (.json) to render again, or two cards to render side by side"
@@ -54,7 +54,7 @@ class AuditSettings(DataSettings):
 
 
 def main(settings: AuditSettings) -> None:
-    """Audits an extractor or metrics, or compares two audits, and writes the cards."""
+    """Audits an extractor or metrics, or renders existing cards, and writes the cards."""
     out = Path(settings.out)
     if settings.cards is not None:
         if len(settings.cards) > 2:
@@ -67,7 +67,8 @@ def main(settings: AuditSettings) -> None:
         return
     if settings.data is None or settings.extractor is None:
         raise UserError(
-            "an audit needs a data set and an extractor: data=NAME extractor=FILE, or extractor=none"
+            "an audit requires a data set and an extractor: data=NAME extractor=FILE, "
+            "or extractor=none"
         )
     if settings.resamples < 100 or (settings.samples or 64) < 8:
         raise UserError(

@@ -1,4 +1,4 @@
-"""`flame-mdm benchmark NAME`: trains and evaluates a set of small models, and writes their table."""
+"""`flame-mdm benchmark NAME`: trains and evaluates a set of small models and writes their table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from flame_mdm.safe_io import read_package_yaml
 class BenchmarkSettings:
     """usage: flame-mdm benchmark NAME [out=FOLDER] [jobs=N]
 
-    Trains a motion-CLIP and a model of each kind, evaluates them, writes a table, and compares
-    its values with the expected ranges. After an interruption, the same command continues where it
-    stopped.
+    Trains a motion-CLIP and one model of each kind, evaluates the models, writes a table, and
+    compares its values with the expected ranges. After an interruption, the same command continues
+    where it stopped.
 
     NAME is a file in experiments/benchmark: synthetic, synthetic_medium, bandai, few_steps or
     bandai_full. The first two need no download, and bandai_full is for one GPU.
@@ -33,7 +33,8 @@ class BenchmarkSettings:
     out: str | None = option(None, "folder; default: runs/benchmark/<exp>")
     jobs: int = option(
         1,
-        "number of models to train at the same time; they share the CPU cores, and each needs about 2 GiB of memory",
+        "number of models to train at the same time, which share the CPU cores and take about "
+        "2 GiB of memory each",
     )
     device: str | None = option(
         None, "device for the evaluations, such as cpu or cuda; default: cuda if available"
@@ -51,11 +52,11 @@ def main(settings: BenchmarkSettings) -> None:
         raise UserError(f"unknown benchmark '{settings.exp}'. Available: {', '.join(names)}")
     if settings.jobs < 1:
         raise UserError(
-            f"jobs={settings.jobs}: must be at least 1. Set it to the number of models to train at the same time"
+            f"jobs={settings.jobs}: expected the number of models to train at the same time, at least 1"
         )
     described = read_package_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
     out = Path(settings.out or Path("runs") / "benchmark" / settings.exp)
-    out.mkdir(parents=True, exist_ok=True)  # reports an error before hours of work, not after
+    out.mkdir(parents=True, exist_ok=True)  # reports errors before hours of work
     run_trainings(plan(described["train"], settings.data_root), settings.jobs, out)
     name, spec = described["table"], load_spec(described["table"])
     options = TablesSettings(
@@ -75,7 +76,7 @@ def main(settings: BenchmarkSettings) -> None:
 def check(
     table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
 ) -> list[tuple[str, bool]]:
-    """Returns one line per expected range, and whether the value in the table is within it."""
+    """Returns, for each expected range, a line and whether the value in the table is within it."""
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():

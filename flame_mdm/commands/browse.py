@@ -16,27 +16,29 @@ class BrowseSettings(BodySettings, DataSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
            flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
-    NAME is a data set, as in `prepare`; for your own motions, use data=folder data.name=NAME.
-    Writes a single web page that opens from disk. It shows clips of the data set with their
-    captions, and mirrored copies next to their originals. It also has a search field, a split
-    filter, and statistics. motions=FOLDER also writes the shown clips as motion files, so that you
-    can compare generated motions with them.
+    Writes a single web page that can be opened from disk. It shows clips of the data set NAME with
+    their captions, mirrored copies next to their originals, and statistics, and has a search field
+    and a split filter. motions=FOLDER also writes the shown clips as motion files, so that
+    generated motions can be compared with them. Data sets are named as in `prepare`; for your own
+    motions, use data=folder data.name=NAME.
     """
 
     OBJECTS: ClassVar = ("data", "out")
     out: str | None = option(None, "HTML file; default: runs/browse/<store>.html")
     source: str | None = option(
-        None, "source folder or archive, if the data set is not prepared yet and requires a source"
+        None, "source folder or archive, required by some data sets if they are not prepared yet"
     )
     split: Split | None = option(None, "split: train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
     clips: int = option(
         200,
-        "maximum number of clips, taken at even intervals; mirrored copies are shown with "
+        "maximum number of clips, selected at even intervals; mirrored copies are shown with "
         "their originals",
         above_zero,
     )
-    motions: str | None = option(None, "also write the shown clips to this folder, as motion files")
+    motions: str | None = option(
+        None, "folder to which the shown clips are also written as motion files"
+    )
 
 
 def main(settings: BrowseSettings) -> None:
@@ -50,11 +52,11 @@ def main(settings: BrowseSettings) -> None:
     representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
-        info = Store(data.folder).info  # the user's own data is shown as prepared
+        info = Store(data.folder).info  # the user's own data is shown as it was prepared
         data.source.options, data.source.version = info.get("source", {}), info.get("version", 1)
         if settings.source is not None:
             say(
-                f"{data.folder}: already prepared, so source={settings.source} is not read. To "
+                f"{data.folder} is already prepared, so source={settings.source} is not read. To "
                 f"read it, prepare the data set with force=true"
             )
     data.prepare_data()

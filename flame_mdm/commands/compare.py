@@ -40,10 +40,11 @@ class CompareSettings(BodySettings):
     Compares runs side by side on one page: configuration differences, curves, evaluations and
     motions for the same prompts. If the runs have results for the same protocol, data and
     extractor, prints the difference in each metric with its 95 % interval, and whether the
-    interval contains 0. A FOLDER of motion files can take the place of a run, such as real motions
-    (`browse motions=FOLDER`) or motions from another program. The runs are then sampled for the
-    captions and lengths of these motions. rate=true writes a blind user study instead: a page
-    that asks which of two motions fits a text better. ratings= counts the answers.
+    interval contains 0. Instead of a run, you can name a FOLDER of motion files, such as real
+    motions (`browse motions=FOLDER`) or motions from another program. The runs are then sampled
+    for the captions and lengths of these motions. rate=true writes a blind user
+    study instead: a page that asks which of two motions fits a text better. ratings= counts the
+    answers.
     """
 
     OBJECTS: ClassVar = ("runs",)
@@ -52,9 +53,9 @@ class CompareSettings(BodySettings):
     )
     prompts: str | None = option(
         None,
-        "file with one prompt per line; the last.ckpt of each run is sampled for these prompts. "
-        "Default: the captions of the first folder of motion files; without such a folder, the "
-        "newest samples of each run are compared",
+        "file with one prompt per line, for which the last.ckpt of each run is sampled. Default: the "
+        "captions of the first folder of motion files or, without such a folder, the newest samples "
+        "of each run",
     )
     seconds: float | None = option(
         None,
@@ -64,10 +65,10 @@ class CompareSettings(BodySettings):
     seed: int = option(0, "seed for sampling, and for the order in which motions are rated")
     rate: bool = option(
         False,
-        "write a rating page that compares motions of the first run with motions of each other run",
+        "write a rating page that compares motions of the first run with motions of every other run",
     )
     ratings: list[str] | None = option(
-        None, "files saved by the rating page, whose ratings are counted"
+        None, "files of ratings to count, as saved by the rating page"
     )
     out: str | None = option(
         None, "file to write; default: runs/compare.html, runs/rate.html or runs/ratings.json"
@@ -75,7 +76,7 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
-    """Writes a page that compares runs, or counts the ratings of a user study."""
+    """Writes a page that compares runs, or counts the ratings in a user study."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError(
             'use either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings'
@@ -131,9 +132,9 @@ def _motions(
 ) -> list[dict[Prompt, Motion]]:
     """Returns the motions of each run and folder, by prompt.
 
-    The last checkpoint of each run is sampled for the requested prompts. Without prompts, the
-    checkpoint is sampled for the captions and lengths of the motions in the first folder. Without
-    a folder, the newest samples of each run are shown.
+    The last checkpoint of each run is sampled for the requested prompts or, if there are none, for
+    the captions and lengths of the motions in the first folder. Without prompts and folders, the
+    newest samples of each run are returned.
     """
     from_files = {
         entry.label: read_motions(entry.folder) for entry in compared if entry.run is None
@@ -162,7 +163,10 @@ def _motions(
 
 
 def _texts(prompts: PromptFile) -> list[str]:
-    """Returns the prompts in a file. Raises the error for the first prompt that no model can sample."""
+    """Returns the prompts in a file.
+
+    Raises the error of the first prompt that no model can sample.
+    """
     for number in sorted(prompts.refused):
         raise prompts.refused[number]
     return list(prompts.lines.values())
@@ -176,8 +180,8 @@ def _sampled(
     Args:
         entry: the run.
         prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
-            numbers, or all are None, which means the default length. Lengths above the model's
-            maximum are shortened.
+            numbers, or all of them are None, which stands for the default length. Lengths above the
+            model's maximum are reduced to it.
         seed: seed for the noise. If a prompt is listed twice, its motions have different noise.
     """
     import torch
@@ -204,6 +208,6 @@ def _sampled(
         seed=seed,
         split=False,
     )
-    # Runs may know different words. Every run is compared on all prompts.
+    # Runs may know different words, but all of them are compared on all prompts.
     motions = sample(model, resolve(request, model, check_words=False))
     return dict(zip(prompts, motions, strict=True))

@@ -24,7 +24,7 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
            flame-mdm convert FOLDER OUT format=glb ...
 
     Converts a motion file, or all motion files in a folder and its subfolders. The nearest
-    skeleton.yaml, in the folder of the file or above it, applies (docs/own-data.md).
+    skeleton.yaml in the file's folder or a folder above it applies; see docs/own-data.md.
 
     Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from
     `make sample` or AMASS; .json; and .npy with joint positions.
@@ -33,23 +33,23 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
     avatars; .npz in the layout of AMASS; .json and .npy with joint positions; and .mp4 and .gif
     for viewing.
 
-    docs/engines.md lists which files a program reads. docs/formats.md explains units, axes and
-    joint names.
+    docs/engines.md lists the files that each program can read. docs/formats.md explains units,
+    axes and joint names.
     """
 
     OBJECTS: ClassVar = ("motion", "out")
     motion: str = required(
-        "a motion file, or a folder of motion files; .npy contains joint positions (frames, "
-        "joints, 3)"
+        "a motion file, or a folder of motion files; an .npy file contains joint positions "
+        "(frames, joints, 3)"
     )
     out: str = required(
         ".fbx, .glb, .bvh, .usdz, .vrma, .npz (AMASS), .json or .npy; or .mp4 or .gif for viewing"
     )
     format: str | None = option(
-        None, "if MOTION is a folder: format of the files in the folder OUT, such as glb"
+        None, "format of the files in the folder OUT, such as glb, if MOTION is a folder"
     )
     rest_pose: bool = option(
-        False, "true = the first frame of a .bvh file is the rest pose, with the arms stretched out"
+        False, "true = the first frame of a .bvh file is its rest pose, with outstretched arms"
     )
 
 
@@ -91,8 +91,8 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
     targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
     if double := [file for file in files if file not in targets.values()]:
         raise UserError(
-            f"{double[0]}: another motion has the same name, so both would be written to the same "
-            f"file. Rename one of them"
+            f"{double[0]}: another motion has the same name, so that both would be written to "
+            f"the same file. Rename one of them"
         )
     return targets
 
@@ -108,7 +108,7 @@ def _convert(
     motion = read(path, settings.fps, settings.unit, settings.up, animation=settings.animation)
     if out.exists() and out.samefile(path):
         raise UserError(
-            f"{out}: the output would overwrite the input. Choose another name for the output"
+            f"{out}: this would overwrite the input. Choose another name for the output"
         )
     motion = settings.at_rate(motion)
     if out.suffix.lower() == ".npz":

@@ -12,7 +12,7 @@ from flame_mdm.errors import UserError
 class DemoSettings:
     """usage: flame-mdm demo [CKPT ...] [adapter=FILE] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
-    Serves a page where you type a sentence, watch the motion, edit it and download it. Without
+    Serves a page on which you type a sentence, and watch, edit and download the motion. Without
     CKPT, the demo uses the models in the package. It requires the demo extra: pip install
     "flame-mdm[demo]". docs/demo.md explains the page.
     """
@@ -23,16 +23,16 @@ class DemoSettings:
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(
-        list, "adapters for the first model, separated by spaces; users can choose one of them"
+        list, "adapters for the first model, separated by spaces, of which users can choose one"
     )
     host: str = option(
         "127.0.0.1",
-        "address to listen on; the default accepts only this computer; 0.0.0.0 = all networks",
+        "address to listen on. The default accepts only this computer; 0.0.0.0 = all networks",
     )
     port: int = option(7860, "port to listen on; 0 = any free port")
     hosts: list[str] = option(
         list,
-        "host names of this server, such as motion.example.org; localhost and IP addresses "
+        "host names of this server, such as motion.example.org. localhost and IP addresses "
         "always work",
     )
     device: str | None = option(None, "cpu or cuda; default: cuda if available")

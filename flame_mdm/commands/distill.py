@@ -20,7 +20,7 @@ from flame_mdm.safe_io.paths import check_tree
 RECIPE = "student.yaml"
 """File name of the student's recipe in its run directory.
 
-All training processes read this file, including jobs that a launcher starts.
+All training processes read this file, including the jobs of launchers.
 """
 SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
 
@@ -30,12 +30,12 @@ class DistillSettings(ModelSettings):
     """usage: flame-mdm distill CKPT [OUT] [key=value ...]
 
     Trains a student of a model that predicts the clean motion or the velocity (MDM, MFM). The
-    student samples in 1, 2 or 4 steps, with built-in guidance. Its recipe is the model's recipe
+    student samples in 1, 2 or 4 steps, with guidance built in. Its recipe is the model's recipe
     with the keys in experiments/distillation/consistency.yaml, a fifth of the training steps and a
-    tenth of the learning rate. The data set is read from FLAME_MDM_DATA or, by default, from the
-    data folder in the model's recipe. Keys such as trainer.max_steps=1000 override the recipe.
-    Running the same command again resumes the run. --multirun seed=1,2 and launch= start sweeps
-    and jobs, as in train. See docs/few-steps.md.
+    tenth of the learning rate. The data set is read from FLAME_MDM_DATA or, if that is not set,
+    from the data folder in the model's recipe. Keys such as trainer.max_steps=1000 override the
+    recipe. Running the same command again resumes the run. --multirun seed=1,2 and launch= start
+    sweeps and jobs, as in train. See docs/few-steps.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -45,7 +45,7 @@ class DistillSettings(ModelSettings):
 
 
 def main(settings: DistillSettings) -> None:
-    """Writes the recipe of a student, and trains it."""
+    """Writes the recipe of a student and trains it."""
     recipe = student_recipe(settings)
     folder = Path(recipe["run"]["dir"])
     path, new = folder / RECIPE, not folder.exists()
@@ -59,7 +59,7 @@ def main(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
-    """Returns the recipe of a student: the teacher's recipe, with changes for distillation.
+    """Returns the recipe of a student: the teacher's recipe with changes for distillation.
 
     Raises `UserError` if the model was not trained with this framework.
     """
@@ -70,8 +70,8 @@ def student_recipe(settings: DistillSettings) -> Config:
     recipe: Any = teacher.config
     if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
         raise UserError(
-            f"{settings.ckpt}: not trained with this framework, so its data and number of training "
-            f"steps are unknown"
+            f"{settings.ckpt} was not trained with this framework, so its data and number of "
+            f"training steps are unknown"
         )
     name = f"{recipe['experiment']}_distilled"
     root = os.environ.get("FLAME_MDM_DATA", recipe["data_root"])

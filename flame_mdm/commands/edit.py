@@ -17,8 +17,8 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
            flame-mdm edit CKPT take.bvh cut=[0,3] joints=upper_body unconditioned=true
            flame-mdm edit CKPT bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
 
-    Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF, and a player that
-    opens in any browser. docs/editing.md explains the keys.
+    Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a
+    GIF, and a player that opens in any browser. docs/editing.md explains the keys.
     """
 
     OBJECTS: ClassVar = ("ckpt", "motion", "out")
@@ -98,9 +98,9 @@ def main(settings: EditSettings) -> None:
 
 
 def origin(settings: EditSettings) -> tuple[object, ...]:
-    """Returns the keys that determine, with the request, which motion is edited by which model.
+    """Returns the values that, with the request, determine which model edits which motion.
 
-    Edits with other keys are written to another folder.
+    Edits that differ in these values are written to different folders.
     """
     reading = (settings.fps, settings.unit, settings.up, settings.animation)
     return settings.motion, settings.cut, reading, settings.adapter, settings.adapter_strength

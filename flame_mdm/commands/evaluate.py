@@ -1,4 +1,4 @@
-"""`flame-mdm evaluate CKPT`: evaluates a checkpoint, a folder of motions or a baseline under a protocol."""
+"""`flame-mdm evaluate CKPT`: evaluates a checkpoint, motions or a baseline under a protocol."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -17,11 +17,11 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
            torchrun --nproc-per-node 8 -m flame_mdm evaluate ckpt=FILE ...
            flame-mdm evaluate ckpt=FILE extractor=FILE guidance_scale=1,2.5,4 --multirun
 
-    Evaluates generated and real motions under a protocol, and writes a JSON file with all values and their provenance.
-    After an interruption, the same command continues where it stopped. quick=true checks within a minute that
-    everything works. experiments/evaluation contains the protocols.
-    --multirun evaluates once per combination of values, and launch=slurm or launch=local starts a job for each
-    combination; see docs/clusters.md.
+    Evaluates generated and real motions under a protocol in experiments/evaluation, and writes a
+    JSON file with all values and their provenance. After an interruption, the same command
+    continues where it stopped. quick=true checks within a minute that everything works.
+    --multirun evaluates once per combination of values, and launch=slurm or launch=local starts a
+    job for each combination; see docs/clusters.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")

@@ -12,13 +12,13 @@ from flame_mdm.errors import say
 class ExportSettings(AdaptedSettings):
     """usage: flame-mdm export CKPT OUT [half=true] [format=onnx] [adapter=limp.safetensors]
 
-    Writes one .safetensors file with the averaged weights of a checkpoint, its recipe and the
+    Writes a single .safetensors file with the averaged weights of a checkpoint, its recipe and the
     metadata of its data set. Adapters are merged into the weights. With format=onnx, writes a
-    folder for sampling without PyTorch instead. See docs/export.md.
+    folder for sampling without PyTorch instead; see docs/export.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    out: str = required("a .safetensors file or a folder; with format=onnx, a folder")
+    out: str = required("a .safetensors file or a folder; must be a folder with format=onnx")
     format: Literal["safetensors", "onnx"] = option(
         "safetensors",
         "format: safetensors, or onnx (graphs for onnxruntime, with a script that samples)",
@@ -27,7 +27,7 @@ class ExportSettings(AdaptedSettings):
 
 
 def main(settings: ExportSettings) -> None:
-    """Writes a model as a single file, or as ONNX graphs."""
+    """Writes a model as a single file or as ONNX graphs."""
     file = settings.model_file()
     if settings.format == "onnx":
         from flame_mdm.checkpoints.onnx_export import export_onnx as export

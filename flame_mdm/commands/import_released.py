@@ -14,8 +14,8 @@ class ImportSettings:
            flame-mdm import mfm model.pt .hydra/config.yaml out=mfm.safetensors stats=FOLDER
            flame-mdm import flame model.ckpt out=flame.safetensors
 
-    Converts a released checkpoint of MDM, MFM, FLAME, or FLAME's motion-CLIP (mclip) into a model file for all
-    commands.
+    Converts a released checkpoint of MDM, MFM, FLAME, or FLAME's motion-CLIP (mclip) to a model
+    file that all commands accept.
     """
 
     OBJECTS: ClassVar = ("kind", "file", "args")
@@ -36,7 +36,7 @@ class ImportSettings:
     )
     time_token: bool = option(
         False,
-        "true = the decoder's input token contains only the time, as in MDM's code since 2025",
+        "true = the decoder's input token encodes only the time, as in MDM's code since 2025",
     )
     run_code: bool = option(
         False, "also load pickles that contain more than weights: THIS RUNS ANY CODE IN THE FILE"

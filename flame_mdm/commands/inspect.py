@@ -27,7 +27,7 @@ from flame_mdm.progress import ProgressBar
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
-MOST_LINES = 20  # number of faults that are printed per motion; the player shows all faults
+MOST_LINES = 20  # maximum number of faults printed per motion; the player shows all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,19 +37,19 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     Finds physical faults, such as sliding feet and jumps, in a motion file, in all motion files
     in a folder, or in a prepared data set. docs/motion-faults.md lists the limits.
 
-    Prints the faults per frame and joint, and writes a player with marks on its timeline. For a
-    data set or a large folder, the player shows the worst `clips` motions. Exits with code 3 if
-    there are faults.
+    Prints the faults by frame and joint, and writes a player that marks them on its timeline. For a
+    data set or a large folder, the player shows only the worst motions (`clips`). Exits with code 3
+    if there are faults.
     """
 
     OBJECTS: ClassVar = ("motion", "out")
     motion: str = required(
-        "a motion file, a folder of motion files, or the name of a data set, which may be your "
+        "a motion file, a folder of motion files, or the name of a data set, possibly your "
         "own (data.name)"
     )
     out: str | None = option(None, "HTML file; default: runs/inspect/<name>.html")
     clips: int = option(
-        24, "maximum number of motions in the player, which shows the worst motions", above_zero
+        24, "maximum number of motions in the player, which shows the worst ones", above_zero
     )
     split: str | None = option(None, "split of a data set: train, val or test; default: all")
 
@@ -57,9 +57,9 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
         name = self.motion
         if not (
             Path(name).suffix or Path(name).exists() or "/" in name
-        ):  # the name of a data set, because there is no such file
+        ):  # must be the name of a data set, because there is no such file
             is_prepared = any(Path(self.data_root).glob(f"{escape(name)}-*/{STORE}"))
-            # If no recipe has this name, the data set was prepared from the user's folder.
+            # If no recipe has this name, the data set was prepared from a folder of the user.
             if is_prepared and not (EXPERIMENTS / "data" / f"{name}.yaml").exists():
                 object.__setattr__(self, "data", "folder")
                 object.__setattr__(self, "composed", (*self.composed, f"data.name={name}"))

@@ -28,10 +28,10 @@ class JudgeSettings(BodySettings, FileSettings):
     """usage: flame-mdm judge MOTION text="a person waves with the left hand" [OUT.html] [fps=20] [unit=0.01] [up=z]
            flame-mdm judge FOLDER [OUT.html] [clips=24]
 
-    Reads the claims in a sentence, such as side, count, direction, posture and order, and
-    measures each claim on the motion. The verdict is yes, no or cannot tell, with the joint, the
-    measured number and the time. Without text=, motions are judged by their own texts. Writes a
-    player whose timeline marks the evidence. Exits with code 3 if a claim is false. See
+    Reads the claims in a sentence, such as claims about side, count, direction, posture and order,
+    and measures each of them on the motion. A verdict is yes, no or cannot tell, with the joint,
+    the measured number and the time. Without text=, motions are judged by their own texts. Writes
+    a player whose timeline marks the evidence. Exits with code 3 if a claim is false. See
     docs/referee.md.
     """
 
@@ -40,11 +40,11 @@ class JudgeSettings(BodySettings, FileSettings):
         "a motion file with SMPL's 22 joints, or a folder of motion files", existing
     )
     text: str | None = option(
-        None, "sentence to check the motions against; default: the text in each motion file"
+        None, "sentence by which the motions are judged; default: the text in each motion file"
     )
     out: str | None = option(None, "HTML file; default: runs/judge/<name>.html")
     clips: int = option(
-        24, "maximum number of motions in the player, which shows the worst motions", above_zero
+        24, "maximum number of motions in the player, which shows the worst ones", above_zero
     )
 
 

@@ -14,13 +14,13 @@ class PrepareSettings(DataSettings):
     """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
     Converts the original files of a data set into a packed store in data/. `check=true` only lists
-    the existing and the missing files. `verify=true` checks an existing store.
-    `force=true` rewrites the store.
+    which of these files exist and which are missing, `verify=true` checks an existing store, and
+    `force=true` rewrites it.
     """
 
     OBJECTS: ClassVar = ("data",)
-    source: str | None = option(None, "source folder or archive, if the data set requires one")
-    check: bool = option(False, "only list the existing and the missing files")
+    source: str | None = option(None, "source folder or archive, required by some data sets")
+    check: bool = option(False, "only list which files exist and which are missing")
     verify: bool = option(False, "only check an existing store and report on it")
     force: bool = option(False, "rewrite an existing store")
 
@@ -44,7 +44,7 @@ def main(settings: PrepareSettings) -> None:
         checked = report(data)
         say(*lines(checked))
         if differ := deviations(checked):
-            say("DIFFERS from the published figures:", *(f"  {line}" for line in differ))
+            say("DIFFERS from the published numbers:", *(f"  {line}" for line in differ))
         say(f"{data.folder}: complete, and every hash matches. The report is in verify.json")
         return
     if (data.folder / STORE).exists() and not settings.force:

@@ -15,8 +15,9 @@ from flame_mdm.runs import check_run
 class ReportSettings(BodySettings):
     """usage: flame-mdm report RUN ...
 
-    Writes report.html into a run directory: curves, newest samples, evaluations and provenance on one page that needs
-    neither a server nor a network. Training also writes it at the end.
+    Writes report.html to each run directory: a single page with training curves, the newest
+    samples, evaluations and provenance, which needs neither a server nor a network connection. It
+    is also written at the end of training.
     """
 
     OBJECTS: ClassVar = ("runs",)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flame_mdm.sampling.targets import Targets
     from flame_mdm.visualize.body import Mesh
 
-# Maximum number of motions on the page for a prompt file; each motion takes about 20 kB
+# Maximum number of motions on the page for a prompt file. Each motion takes about 20 kB.
 GALLERY = 200
 CLAIMS = "claims"  # scorer that checks the claims of the text; see docs/referee.md
 
@@ -50,16 +50,17 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT action=walk
            flame-mdm sample CKPT unconditioned=true
 
-    Writes motions (.npz), a GIF, and a player that opens in any browser. A prompt file has
-    one prompt per line. Each prompt gets its own folder, and one page shows the first motion of
-    each prompt. Prompts that cannot be sampled are listed at the end, and the exit code is 1. A
-    set is a folder of clips that fit together, for game engines: loops, starts, stops and turns. If OUT is a file
-    (.fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif), only this file is written.
+    Writes motions (.npz), a GIF, and a player that opens in any browser. For a prompt file, which
+    contains one prompt per line, each prompt gets its own folder, and one page shows the first
+    motion of each prompt. Prompts that cannot be sampled are listed at the end, and the exit code
+    is then 1. A set is a folder of matching clips for game engines: loops, starts, stops and turns.
+    If OUT is a file (.fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif), only this
+    file is written.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
     prompts: str | None = option(
-        None, "file with one prompt per line, instead of text; each prompt gets its own folder"
+        None, "file with one prompt per line, used instead of text. Each prompt gets its own folder"
     )
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
@@ -70,7 +71,7 @@ class SampleSettings(OutputSettings, WritingSettings):
     candidates: int = same_option(SamplingRequest, "candidates")
     set: str | None = option(
         None,
-        "set of clips to sample, instead of text: locomotion, or a .yaml file; see "
+        "set of clips to sample instead of a text: locomotion, or a .yaml file; see "
         "docs/sampling.md#sets-for-game-engines",
     )
     format: str | None = option(None, "format of a set's files: fbx, glb, usda, usdc or usdz")
@@ -95,7 +96,7 @@ class SampleSettings(OutputSettings, WritingSettings):
         return path if path.suffix.lower() in WRITTEN and not path.is_dir() else None
 
     def check_output(self) -> None:
-        """Raises `UserError` for keys that do not match the kind of output."""
+        """Raises `UserError` if a key does not apply to the requested kind of output."""
         if self.set is not None:
             of_sets = {
                 "out",
@@ -147,7 +148,7 @@ class SampleSettings(OutputSettings, WritingSettings):
                 )
 
     def set_content(self, source: str) -> MotionSet:
-        """Returns the description of a set after applying the keys for written files."""
+        """Returns the description of a set, changed by the keys for the written files."""
         from flame_mdm.sampling.motion_sets import changed, read_set
 
         keys = {"rig": self.rig, "format": self.format, "fps": self.resample}
@@ -156,12 +157,12 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
-        """Returns the keys that determine the motions, including a prompt file and a set."""
+        """Returns the keys that determine the motions, which include a prompt file and a set."""
         sources = [key for key in ("prompts", "set") if getattr(self, key) is not None]
         return [*super().conditions(), *sources]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
-        """Returns the request to the model. With a prompt file, it contains the accepted prompts."""
+        """Returns the sampling request, with the accepted prompts if there is a prompt file."""
         default = 3 if self.file is None else 1
         samples = default if self.samples is None else self.samples
         if prompts is None:
@@ -202,9 +203,9 @@ def main(settings: SampleSettings) -> None:
 
 
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
-    """Samples and writes the motions for a request.
+    """Samples the motions for a request and writes them.
 
-    In a prompt file, prompts that the model cannot sample are refused.
+    Prompts in a prompt file that the model cannot sample are refused.
     """
     loaded = settings.load()  # a missing file is reported before PyTorch is imported
     character = settings.read_character()
@@ -262,7 +263,7 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
 
 
 def _sample_set(settings: SampleSettings, source: str) -> None:
-    """Samples and writes a set of clips."""
+    """Samples a set of clips and writes it."""
     content = settings.set_content(source)
     texts = [motion.text for motion in content.motions.values()]
     _ = settings.request(texts=texts, samples=1)  # raises errors before the model is loaded
@@ -300,7 +301,7 @@ def _write_files(
     body: Mesh | None,
     facts: dict[str, Any],
 ) -> None:
-    """Writes the first motion as `file`, and the others as numbered files, such as walk_2.fbx."""
+    """Writes the first motion to `file` and the others to numbered files, such as walk_2.fbx."""
     for number, motion in enumerate(motions, 1):
         path = file if number == 1 else file.with_stem(f"{file.stem}_{number}")
         written = settings.at_rate(motion)
@@ -308,7 +309,7 @@ def _write_files(
 
 
 def _score(source: str, model: MotionGenerator) -> Score:
-    """Returns the function that scores candidates, by claims or by a motion-CLIP.
+    """Returns the function that scores candidates, based on claims or a motion-CLIP.
 
     Raises `UserError` if the scorer cannot read the model's motions.
     """
@@ -325,7 +326,7 @@ def _score(source: str, model: MotionGenerator) -> Score:
 
 
 def claims_score(model: MotionGenerator) -> Score:
-    """Returns the function that scores candidates by the claims of their texts.
+    """Returns the function that scores candidates by the claims in their texts.
 
     Raises `UserError` if the motions have a skeleton that the referee does not support.
     """
@@ -335,7 +336,7 @@ def claims_score(model: MotionGenerator) -> Score:
     skeleton = model.representation.skeleton
     if skeleton != SMPL22:
         raise UserError(
-            f"scorer={CLAIMS}: the model's motions have the skeleton {skeleton.name}, but the referee requires "
+            f"scorer={CLAIMS}: this model's skeleton is {skeleton.name}, but the referee requires "
             f"{SMPL22.name}. Use a motion-CLIP"
         )
     return claim_score
@@ -347,9 +348,9 @@ def _folders(
     model: MotionGenerator,
     motions: Sequence[Motion],
 ) -> dict[Path, list[Motion]]:
-    """Returns the folders to write, with the motions in each folder.
+    """Returns the folders to write, each with its motions.
 
-    A prompt that is listed twice has a single folder.
+    A prompt that is listed twice gets a single folder.
     """
     from flame_mdm.sampling.output import default_folder
 
@@ -383,7 +384,7 @@ def _distance(targets: Targets, motions: Sequence[Motion]) -> str:
 
 
 def _gallery(prompts: PromptFile, folders: Mapping[Path, list[Motion]], body: Mesh | None) -> str:
-    """Writes the page that shows the first motion of each prompt, and returns a message with its path."""
+    """Writes a page with the first motion of each prompt, and returns a message with its path."""
     from flame_mdm.visualize import write_player
 
     page = next(iter(folders)).with_name(f"{Path(prompts.path).stem}.html")

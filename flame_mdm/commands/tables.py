@@ -1,4 +1,4 @@
-"""`flame-mdm tables [NAME ...]`: renders tables and figures from results, and evaluates missing results."""
+"""`flame-mdm tables [NAME ...]`: evaluates missing results and renders tables and figures."""
 
 import os
 from collections.abc import Mapping, Set
@@ -24,11 +24,11 @@ INVALID = 3  # exit code if a requested row is not valid
 class TablesSettings:
     """usage: flame-mdm tables [NAME ...] [evaluate=false] [out=FOLDER]
 
-    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in
-    experiments/tables, or by your own file, which lists checkpoints, a protocol and columns.
-    Checkpoints without a result are evaluated first; evaluate=false only uses existing results.
-    The same results produce the same bytes. Exit codes: 0 = success; 1 = invalid input, or an
-    evaluation failed; 3 = the tables are written, but a requested row is NOT VALID.
+    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A file in experiments/tables, or
+    your own file, describes a table by its checkpoints, protocol and columns. Checkpoints without a
+    result are evaluated first, unless evaluate=false. The same results always produce the same
+    bytes. Exit codes: 0 = success; 1 = invalid input, or an evaluation failed; 3 = the tables are
+    written, but a requested row is NOT VALID.
     """
 
     OBJECTS: ClassVar = ("table",)
@@ -97,7 +97,7 @@ def evaluate_missing(
     from evaluators.protocol import protocol_config
 
     listed: dict[Path, Evaluation] = {}
-    shown: dict[Path, set[str]] = {}  # for each result, the values that the tables show
+    shown: dict[Path, set[str]] = {}  # by result file, the values that the tables show
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
         for dataset in part.get("lengths", []):
             count_lengths(dataset, results, settings)
@@ -135,7 +135,7 @@ def evaluate_missing(
 
 
 def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
-    """Returns whether some of `values` need several motions per prompt.
+    """Returns whether some of the `values` require several motions per prompt.
 
     Generating these motions takes most of the evaluation time.
     """
@@ -148,12 +148,12 @@ def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
 def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset()) -> bool:
     """Returns whether a result must be measured again.
 
-    A result is outdated if its checkpoint, extractor or motion files have changed, if SMPL's
-    model file has become available, or if it lacks metrics that need several motions per prompt.
+    A result is outdated if its checkpoint, extractor or motion files have changed, if SMPL's model
+    file has become available, or if it lacks metrics that require several motions per prompt.
 
     Args:
-        path: the result.
-        evaluation: the evaluation that a table needs.
+        path: path of the result file.
+        evaluation: the evaluation that a table requires.
         values: the values in the result that the tables show.
     """
     from evaluators.sources import sample_files, sha256_of_samples
@@ -181,14 +181,14 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
 
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
-    """Writes the motion lengths of a data set to `results`, or prints that it is not prepared."""
+    """Writes the motion lengths of a data set to `results`, or reports that it is not prepared."""
     nodes = compose_data(
         dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data")
     )
     data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))
     if not (data.folder / "store.json").exists():
         say(
-            f"{dataset}: not prepared, so its motion lengths are omitted. Run make prepare DATA={dataset}"
+            f"{dataset} is not prepared, so its motion lengths are omitted. Run make prepare DATA={dataset}"
         )
         return
     store = data.open()

@@ -15,9 +15,9 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import open_in_place
 
 GIB_PER_JOB = 2.0
-"""Free memory in GiB that is required to start another training run in parallel."""
+"""Free memory, in GiB, required to start another training run in parallel."""
 POLL = 0.2
-"""Seconds between two checks on the running processes."""
+"""Time in seconds between two checks of the running processes."""
 
 
 @dataclass
@@ -27,7 +27,7 @@ class Training:
     Attributes:
         words: arguments of `flame-mdm train`.
         folder: the run directory.
-        needs: indices of the earlier training runs whose files this run reads.
+        needs: indices of earlier training runs whose files this run reads.
     """
 
     words: Sequence[str]
@@ -62,11 +62,11 @@ def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
 
 
 def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
-    """Trains the models of a benchmark, up to `jobs` at the same time.
+    """Trains the models of a benchmark, at most `jobs` of them at the same time.
 
     With several jobs, each run gets an equal share of the cores and writes its output to a file in
-    `logs`. Another run starts in parallel only if `GIB_PER_JOB` GiB of memory are free. The batches
-    and random draws of a run do not depend on other runs.
+    `logs`. A run starts in parallel with others only if `GIB_PER_JOB` GiB of memory are free. The
+    batches and random draws of a run do not depend on other runs.
 
     Raises:
         UserError: If a run failed. The other runs are stopped and can be resumed.

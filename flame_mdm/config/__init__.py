@@ -1,6 +1,6 @@
-"""Configuration: command lines, recipes composed by Hydra, checks against signatures, instantiation.
+"""Configuration: command lines, recipes composed by Hydra, checks of signatures, instantiation.
 
-These modules do not import torch or Lightning, so that `--help` and errors about misspelled keys
+These modules import neither torch nor Lightning, so that `--help` and errors about misspelled keys
 appear immediately.
 """
 

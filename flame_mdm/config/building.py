@@ -1,4 +1,4 @@
-"""Instantiates configurations, checks untrusted configurations, and reads and writes their files."""
+"""Instantiates configurations, checks untrusted ones, and reads and writes their files."""
 
 import ast
 import copy
@@ -21,7 +21,7 @@ EXPERIMENTS = (
     if (_PACKAGE / "experiments").is_dir()
     else _PACKAGE.parent / "experiments"
 )
-"""Folder of the recipes, inside the installed package or next to it in a clone."""
+"""Folder of the recipes, which is inside the installed package or, in a clone, next to it."""
 
 MODULES = {
     "task": ("flame_mdm.task", "flame_mdm.training.adaptation", "flame_mdm.training.distillation"),
@@ -31,30 +31,33 @@ MODULES = {
     "representation": ("flame_mdm.representations",),
     "data": ("flame_mdm.data",),
 }
-"""Modules whose classes may be named in a checkpoint's configuration, by part of the configuration."""
+"""Modules whose classes a checkpoint's configuration may name, by part of the configuration."""
 RENAMED = {
     "flame_mdm.task.MotionGeneration": "flame_mdm.task.GeneratorTask",
     "flame_mdm.training.distillation.ConsistencyDistillation": "flame_mdm.training.distillation.DistillationTask",
 }
-"""Names of classes in configurations of version 0.2, and their current names."""
+"""Current names of classes, by their names in configurations of version 0.2."""
 ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
-"""Names, in version 0.2 and now, of the task that adapts models. Its configuration has a key `base`."""
+"""Current name of the task that adapts models, by its name in version 0.2.
+
+The configuration of this task has a key `base`.
+"""
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
-"""Limits for a configuration file: number of values, and depth of nested mappings and lists."""
+"""Limits of a configuration file: number of values, and depth of nested mappings and lists."""
 RUN_DIR = "${run.dir}"
 """Placeholder for the run directory in a saved `config.yaml`.
 
-With the placeholder, `run.dir=...` changes all paths in the run directory.
+Thanks to the placeholder, `run.dir=...` changes all paths inside the run directory.
 """
 
 
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
-    """Checks that the content of the untrusted file `where` has only plain values and no interpolations.
+    """Checks that an untrusted configuration contains only plain values and no interpolations.
 
-    Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any
+    Hydra and OmegaConf would resolve interpolations (`${...}`), which can run any code and read any
     environment variable. Only the interpolation `but` is allowed, at the start of a string. Raises
-    `UserError` if the check fails, or if the content is too large, nested too deeply or contains
-    itself.
+    `UserError`, which names the file `where`, if the check fails or if the content is too large, is
+    nested too deeply or contains itself.
     """
     count = 0
 
@@ -66,7 +69,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
         if isinstance(value, dict | list | tuple):
             for name, child in value.items() if isinstance(value, dict) else enumerate(value):
                 if not isinstance(name, str | int):
-                    raise UserError(f"{where}: {'.'.join(path)} has a key that is not text")
+                    raise UserError(f"{where}: {'.'.join(path)} has a key that is not a string")
                 check_value(child, (*path, str(name)))
                 check_value(name, path)
         elif isinstance(value, str) and "${" in value.removeprefix(but):
@@ -84,7 +87,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Returns a configuration, which may be from an earlier version, with the current names of its classes."""
+    """Replaces the class names of earlier versions in a configuration with the current ones."""
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config
@@ -96,10 +99,10 @@ def renamed(config: Config) -> Config:
 
 
 def read_saved(path: Path) -> Config:
-    """Returns the saved configuration of a run, in which `RUN_DIR` stands for its directory."""
+    """Reads the saved configuration of a run, in which `RUN_DIR` stands for the run directory."""
     config = read_yaml(path)
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
-        raise UserError(f"{path}: not the configuration of a run: it has no key `run`")
+        raise UserError(f"{path}: not the configuration of a run, because it has no key `run`")
     plain(config, path, but=RUN_DIR)
     return renamed(config)
 
@@ -107,7 +110,7 @@ def read_saved(path: Path) -> Config:
 def movable(config: Config) -> Config:
     """Returns a configuration in which `RUN_DIR` stands for the run directory.
 
-    `run.dir` then changes all paths in the run directory.
+    `run.dir` then changes all paths inside the run directory.
     """
     folders = {str(config["run"]["dir"]): RUN_DIR}
     return {
@@ -116,7 +119,7 @@ def movable(config: Config) -> Config:
 
 
 def moved(node: Any, folders: Mapping[str, str]) -> Any:
-    """Returns a configuration with moved paths; `folders` maps old to new folders."""
+    """Returns a configuration in which paths are moved from old to new folders (`folders`)."""
     if isinstance(node, dict):
         return {name: moved(value, folders) for name, value in node.items()}
     folder = next(
@@ -127,19 +130,20 @@ def moved(node: Any, folders: Mapping[str, str]) -> Any:
 
 
 def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **derived: Any) -> Any:
-    """Instantiates the object described by a mapping with a `_target_`, including nested objects.
+    """Instantiates the object that a mapping with a `_target_` describes, and all nested objects.
 
-    The function supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as
-    plain text. Mappings and lists are passed as plain copies, as with Hydra's `_convert_: all`.
+    Supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text,
+    and mappings and lists are passed as plain copies, as with Hydra's `_convert_: all`.
 
     Args:
         node: the mapping.
-        offered: additional arguments. Only those that the class or function accepts are passed.
+        offered: additional arguments, of which only those that the class or function accepts are
+            passed.
         derived: additional arguments, all of which are passed.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(name, str):
-        raise UserError(f"missing _target_, the name of a class, in {str(node)[:80]}")
+        raise UserError(f"_target_, the name of a class, is missing in {str(node)[:80]}")
     if offered:
         legal = parameters(name)
         derived |= {key: value for key, value in offered.items() if key in legal or "**" in legal}
@@ -166,7 +170,7 @@ def _instances(node: Any) -> Any:
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Flattens nested mappings to dotted keys. Lists are leaves."""
+    """Flattens nested mappings to a mapping with dotted keys. Lists are not flattened."""
     if not isinstance(config, Mapping) or not config:
         return {prefix: config}
     flat: dict[str, Any] = {}
@@ -176,17 +180,17 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def save(config: Config, path: Path, head: str = "") -> None:
-    """Writes the configuration atomically as YAML. If `head` is given, it becomes a comment on the first line."""
+    """Writes a configuration atomically as YAML, with the comment `head` on the first line."""
     content = OmegaConf.to_yaml(OmegaConf.create(config))
     write_text(path, f"# {head}\n{content}" if head else content)
 
 
 def trust(config: Config) -> None:
-    """Checks that the parts of a checkpoint's configuration name only permitted classes and arguments.
+    """Checks that a checkpoint's configuration names only permitted classes and arguments.
 
     A class is permitted for a part if `MODULES` lists its module for this part, or if a file in the
-    part's folder of `experiments/` names it. The environment variable FLAME_MDM_TRUST adds
-    packages, separated by commas. This check does not import the classes.
+    part's folder of `experiments/` names it. The environment variable FLAME_MDM_TRUST permits
+    additional packages, separated by commas. The check does not import the classes.
     """
     names = [name.strip() for name in os.environ.get("FLAME_MDM_TRUST", "").split(",")]
     added = [name for name in names if name]

@@ -1,4 +1,4 @@
-"""Command lines, whose keys are declared by one dataclass per command, and their signals, errors and exit codes."""
+"""Command lines: keys, declared by one dataclass per command, signals, errors and exit codes."""
 
 import os
 import re
@@ -22,14 +22,14 @@ from flame_mdm.signals import stoppable
 Settings = TypeVar("Settings")
 """Dataclass of a command.
 
-The docstring of the class is the usage, and its fields made by `option` are the keys. `OBJECTS`
-lists the keys of leading words that are given without a key. If the last of these keys is a list,
-it takes all remaining words. `SWEEPS` is True if the command accepts --multirun and launch=, as in
-`flame_mdm.config.jobs`. A field `composed` receives the arguments for Hydra: keys with a dot, such
-as `data.source.path`, and the keys and options in `COMPOSED`.
+The docstring of the class is the usage message, and the fields created by `option` are the keys.
+`OBJECTS` lists the keys to which leading words without a key are assigned; if the last of these
+keys is a list, it takes all remaining words. `SWEEPS` is True if the command accepts --multirun and
+launch= (see `flame_mdm.config.jobs`). A field `composed` receives the arguments for Hydra: keys
+with a dot, such as `data.source.path`, and the keys and options in `COMPOSED`.
 """
 
-STOP = (signal.SIGINT, signal.SIGTERM)  # signals after which a command cleans up and exits
+STOP = (signal.SIGINT, signal.SIGTERM)  # signals upon which a command cleans up and exits
 
 TEXT = ("str", "str | None")  # annotations of keys that take any text
 
@@ -38,11 +38,11 @@ BUG = 70  # exit code for a bug, as in sysexits.h
 NO_MEMORY = re.compile(
     "allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map"
 )
-"""Error messages that a lack of memory causes in torch, in threads, and when libraries are loaded."""
+"""Error messages when torch, a thread or the loading of a library runs out of memory."""
 
 
 def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
-    """Runs a command line `[OBJECT [OUT]] key=value ...` and returns the exit code."""
+    """Runs a command line `[OBJECT [OUT]] key=value ...` and returns its exit code."""
     words = make_variables() if "--from-make" in argv else list(argv)
     if any(word in ("-h", "--help") for word in words):
         say(*_help(kind))
@@ -52,7 +52,7 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns the settings from `read_settings` after running the checks that their fields declare."""
+    """Reads the settings of a command and runs the checks that their fields declare."""
     settings = read_settings(kind, words)
     for entry in fields(kind):  # type: ignore[arg-type]
         value, check = getattr(settings, entry.name), entry.metadata.get("check")
@@ -62,10 +62,10 @@ def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Reads the settings of a command from its words.
+    """Reads the settings of a command from its command-line arguments.
 
-    Text is taken literally, lists of strings are split as in a shell, and other values follow
-    Hydra's grammar.
+    Strings are taken literally, lists of strings are split as in a shell, and all other values
+    follow Hydra's grammar.
     """
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
@@ -127,7 +127,7 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
     override = parse([f"{key}={text}"])[0]
     if override.is_sweep_override() and sweeps:
         raise UserError(
-            f"{key}={text}: several values make a sweep with one job per value. Add --multirun, "
+            f"{key}={text}: several values define a sweep with one job per value. Add --multirun, "
             f"or use a single value"
         )
     if override.is_sweep_override():
@@ -140,12 +140,12 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
 
 
 def is_text(kind: type[Any], key: str) -> bool:
-    """Returns whether a key of a command takes any text literally."""
+    """Returns whether a key of a command takes any text, and takes it literally."""
     return _annotations(kind).get(key) in TEXT
 
 
 def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
-    """Adds the keys of a command's objects to its leading words, which have no key."""
+    """Adds the keys of a command's objects to the leading words, which have no keys."""
     objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])
@@ -160,19 +160,19 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
             raise UserError(
                 f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
             )
-    # Additional words remain unchanged, and are rejected later because they have no key
+    # Additional words stay unchanged and are rejected later, because they have no key
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
     return keyed + leading[len(objects) :] + rest
 
 
 def _is_object(word: str) -> bool:
-    # The path of an existing file may contain "=" and is still an object, not a key.
+    # The path of an existing file is an object, even if it contains "=".
     is_path = "/" in word.partition("=")[0] and len(word) < 1000 and Path(word).exists()
     return not word.startswith("-") and ("=" not in word or is_path)
 
 
 def _help(kind: type[Any]) -> list[str]:
-    """Returns the usage of a command, and its keys with their defaults and help texts."""
+    """Returns the usage message of a command and its keys, with their defaults and help texts."""
     lines = [*cleandoc(kind.__doc__ or "").splitlines(), "", "Keys, with their defaults:"]
     objects = getattr(kind, "OBJECTS", ())
     annotations = [vars(base).get("__annotations__", {}) for base in kind.__mro__]
@@ -202,10 +202,10 @@ def _help(kind: type[Any]) -> list[str]:
 
 
 def make_variables() -> list[str]:
-    """Returns the variables of make as command-line arguments.
+    """Returns the variables passed to make as command-line arguments.
 
-    `EXP` names the recipe, and other upper-case names are keys. Make passes the variables in
-    MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs.
+    `EXP` names the recipe, and other upper-case variables are keys. Make lists the variables in
+    MAKEFLAGS after ` -- `, the latest one first, with escaped spaces and doubled dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
     words = [
@@ -221,10 +221,10 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code.
 
-    A signal in `signums` ends the action after it has cleaned up. An error that the user can fix is
-    printed on one line, and 1 is returned. FLAME_MDM_TRACEBACK=1 prints the traceback first. Any
-    other exception is a bug: the traceback is printed with a request to report it, and `BUG` is
-    returned.
+    A signal in `signums` ends the action, which cleans up first. An error that the user can fix is
+    printed on one line, and the exit code is 1; FLAME_MDM_TRACEBACK=1 prints the traceback first.
+    Any other exception is a bug: the traceback is printed with a request to report it, and the exit
+    code is `BUG`.
     """
     try:
         with stoppable(signums):
@@ -237,7 +237,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except Exception as error:
         verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
         if isinstance(error, MemoryError) and not verbose:
-            # Frees the variables of the stack frames, because printing a line also takes memory
+            # Free the variables of the stack frames, because printing a line also requires memory
             error.__traceback__ = None
         line = explanation(error)
         if line is None or verbose:
@@ -254,9 +254,9 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 
 
 def explanation(error: Exception) -> str | None:
-    """Returns the line for an error that the user can fix, or None for a bug.
+    """Returns the line to print for an error that the user can fix, or None for a bug.
 
-    The user can fix a `UserError`, a file error, and a lack of memory.
+    Users can fix a `UserError`, a file error and a lack of memory.
     """
     if isinstance(error, UserError):
         return first_line(error)

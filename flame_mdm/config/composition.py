@@ -1,4 +1,4 @@
-"""Composition of recipes by Hydra, resolved to plain dicts."""
+"""Composition of recipes by Hydra. The result is resolved to plain dicts."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -27,20 +27,20 @@ from flame_mdm.config.signatures import (
 from flame_mdm.errors import UserError, did_you_mean, first_line
 from flame_mdm.safe_io import read_yaml
 
-LAUNCH = "launch"  # folder of `experiments/` with launchers, which start jobs on a cluster
+LAUNCH = "launch"  # folder in `experiments/` of the launchers, which start jobs on a cluster
 
 
 def groups() -> list[str]:
     """Returns the names of the parts that can be replaced in a recipe.
 
-    They are the folders of `experiments/` whose files are options for a part instead of recipes.
+    They are the folders in `experiments/` whose files are options for a part rather than recipes.
     """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
 
 
 def recipes() -> list[str]:
-    """Returns the names of all experiments, as used in `EXP=`."""
+    """Returns the names of all experiments, as they are used in `EXP=`."""
     files = (p for p in EXPERIMENTS.rglob("*.yaml") if "@package _global_" in p.read_text()[:200])
     return sorted(p.relative_to(EXPERIMENTS).with_suffix("").as_posix() for p in files)
 
@@ -53,7 +53,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
         overrides: words such as `denoiser=mdm_unet` or `optimizer.lr=1e-4`.
 
     Raises:
-        UserError: For an unknown recipe, group or key, or for a value of the wrong type.
+        UserError: If a recipe, group or key is unknown, or if a value has the wrong type.
     """
     source = find_recipe(name)
     return resolve(source, *prepare_overrides(source, overrides))
@@ -64,7 +64,7 @@ def compose_data(
 ) -> Config:
     """Composes the configuration of a data set in experiments/data, including its representation.
 
-    Returns the keys `data` and `representation`. Raises the same errors as `compose`.
+    The result has the keys `data` and `representation`. The errors are the same as in `compose`.
     """
     source = ConfigSource(EXPERIMENTS, None)
     first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
@@ -76,9 +76,9 @@ class ConfigSource(NamedTuple):
     """Location and kind of a configuration."""
 
     folder: Path
-    # Name of the file in `folder` without its suffix; None = an empty configuration
+    # Name of the file in `folder`, without suffix; None = an empty configuration
     stem: str | None
-    # Whether the configuration is resolved, so that its parts cannot be replaced
+    # Whether the configuration is already resolved, so that its parts cannot be replaced
     saved: bool = False
 
 
@@ -111,14 +111,14 @@ def prepare_overrides(
 
 
 def first_choice(override: Override) -> str:
-    """Returns the override. If it sweeps over several values, only its first value is kept."""
+    """Returns the override as text, with only the first value if it sweeps over several values."""
     if override.is_sweep_override():
         return f"{override.get_key_element()}={choices(override)[0]}"
     return str(override.input_line)
 
 
 def choices(override: Override) -> list[str]:
-    """Returns the values of an override as text: one value, or all values of a sweep."""
+    """Returns the values of an override as text: a single value, or all values of a sweep."""
     value = override.value()
     if isinstance(value, Glob):
         return value.filter(_options(override.key_or_group)) or [str(value)]
@@ -132,8 +132,8 @@ def _options(group: str) -> list[str]:
 def find_recipe(name: str) -> ConfigSource:
     """Returns the location of an experiment's recipe.
 
-    `name` is the path of a .yaml file, or a name in `experiments/` such as `humanml3d/mdm`. Raises
-    `UserError` if there is no such file or experiment.
+    `name` is the path of a .yaml file, or a name in `experiments/`, such as `humanml3d/mdm`. Raises
+    `UserError` if no such file or experiment exists.
     """
     if name.endswith((".yaml", ".yml")):
         path = Path(name).resolve()
@@ -144,7 +144,7 @@ def find_recipe(name: str) -> ConfigSource:
         content = read_yaml(path)
         if not isinstance(content, dict):
             raise UserError(
-                f"{name}: not a recipe, because it has no keys. Start it with a "
+                f"{name} is not a recipe, because it has no keys. Start it with a "
                 "`defaults:` list that names another recipe"
             )
         saved = "defaults" not in content
@@ -159,7 +159,7 @@ def find_recipe(name: str) -> ConfigSource:
 
 
 def quoted(word: str) -> str:
-    """Returns a word `key=value` whose value Hydra takes literally."""
+    """Quotes a word `key=value` so that Hydra takes its value literally."""
     key, _, value = word.partition("=")
     # Hydra takes a backslash literally, except right before a quote, where it must be doubled.
     escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace(
@@ -220,7 +220,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 
 
 def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
-    """Composes a configuration with prepared overrides. Converts Hydra's errors to `UserError`."""
+    """Composes a configuration with prepared overrides; Hydra's errors become a `UserError`."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):
@@ -232,9 +232,9 @@ def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
 
 
 def _legal(config: Config, override: Override) -> str:
-    """Returns an override as text for Hydra.
+    """Checks the key of an override and returns the override as text for Hydra.
 
-    Raises `UserError` if its key exists neither in the recipe nor in the signature of a `_target_`.
+    Raises `UserError` if the key exists neither in the recipe nor in the signature of a `_target_`.
     """
     line = str(override.input_line)
     if (

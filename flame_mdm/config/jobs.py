@@ -23,18 +23,19 @@ from flame_mdm.safe_io.paths import check_tree
 Settings = TypeVar("Settings")
 
 FOLDER = Path("runs") / "sweeps"
-"""Folder for the logs of jobs that a launcher starts.
+"""Folder for the logs of the jobs that a launcher starts.
 
-The results of each job are written to the same place as without a launcher.
+The results of a job are written to the same location as without a launcher.
 """
 
 
 def run_jobs(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
     """Runs a command line `[OBJECT [OUT]] key=value ... [--multirun]` and returns the exit code.
 
-    With `--multirun`, values separated by commas define a sweep with one job per combination. The
-    jobs run one after the other. `launch=...` passes the jobs of a sweep, or a single job, to a launcher, and waits
-    for them. Values of keys that accept any text, such as paths, are never split.
+    With `--multirun`, values separated by commas define a sweep with one job per combination, and
+    the jobs run one after the other. `launch=...` passes the jobs of a sweep, or a single job, to a
+    launcher and waits for them. Values of keys that accept any text, such as paths, are never
+    split.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     asks_for_help = any(word in ("-h", "--help") for word in words)
@@ -66,7 +67,7 @@ def _serve(
         changed = " ".join(word for word in combinations[number - 1] if word not in keyed)
         say(f"job {number} of {len(starts)}: {changed}")
         codes.append(start())
-        if codes[-1] > 128:  # a signal ends all jobs of the sweep
+        if codes[-1] > 128:  # a signal ends the entire sweep
             return
 
 
@@ -83,7 +84,10 @@ def _alternatives(kind: type[Any], word: str) -> list[str]:
 
 
 def _launch(jobs: Sequence[Callable[[], int]], words: Sequence[str]) -> None:
-    """Passes jobs to the Hydra launcher that is selected by `launch=NAME` and its keys, and waits for the jobs."""
+    """Passes jobs to a Hydra launcher and waits for them.
+
+    `words` select the launcher (`launch=NAME`) and set its keys.
+    """
     compose("quickstart", words)  # checks the words
     launchers = [word.partition("=")[2] for word in words if word.startswith(f"{LAUNCH}=")]
     check_launcher(launchers)

@@ -1,20 +1,20 @@
-"""Fields of settings dataclasses, each with a help text for the command line and a check."""
+"""Fields of settings dataclasses, with help texts for the command line and checks."""
 
 from collections.abc import Callable
 from dataclasses import MISSING, field, fields
 from typing import Any
 
 Check = Callable[[str, Any], None]
-"""Checks a value. The arguments are the key and the value.
+"""Function that checks a value. Its arguments are the key and the value.
 
-Raises `UserError` or `FileNotFoundError`.
+It raises `UserError` or `FileNotFoundError` if the value is invalid.
 """
 
 
 def option(default: Any, help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field with a help text and a check for the command line.
+    """Returns a dataclass field with a help text and, optionally, a check for the command line.
 
-    If `default` is a function, it computes the default.
+    If `default` is a function, it is called to compute the default.
     """
     default = {"default_factory" if callable(default) else "default": default}
     return field(**default, metadata={"help": help, "check": check})

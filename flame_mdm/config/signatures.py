@@ -1,7 +1,7 @@
 """Checks of recipes against the signatures of the classes and functions that they name.
 
-Signatures are read from source files. Therefore, misspelled keys are reported immediately, and a
-class in a recipe is checked without running its code.
+Signatures are read from source files, so that misspelled keys are reported immediately and a class
+in a recipe is checked without running its code.
 """
 
 import ast
@@ -21,9 +21,9 @@ Config = dict[str, Any]
 
 
 def check(config: Config) -> None:
-    """Raises `UserError` if a `_target_` does not exist, or does not accept an argument.
+    """Raises `UserError` if a `_target_` does not exist or does not accept one of its arguments.
 
-    The message contains the most similar permitted keys.
+    The message suggests the permitted keys that are most similar.
     """
     for path, node in walk(config):
         if "_target_" not in node:
@@ -45,7 +45,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "str": (str, "a string"),
     "None": (type(None), "null"),
 }
-"""Types of the values that an annotation allows, and a description of the values."""
+"""By annotation: the permitted types of a value, and their description for error messages."""
 SEQUENCES, TUPLES = ("list", "List", "Sequence"), ("tuple", "Tuple")
 
 
@@ -65,13 +65,13 @@ TOP_LEVEL = {
     "ema": "dict[str, Any] | None",
     "logger": "dict[str, Any] | None",
 }
-"""Kinds of values for the keys of a recipe that are not arguments of a `_target_`."""
+"""Annotations of the recipe's keys that are not arguments of a `_target_`."""
 
 ARGUMENTS = {
     "losses": "flame_mdm.losses.MotionLosses",
     "ema": "flame_mdm.training.averaging.MovingAverage",
 }
-"""Class whose arguments a mapping in a recipe contains, by the key of the mapping."""
+"""By key of a mapping in a recipe: the class whose arguments the mapping contains."""
 
 DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes cannot set
 
@@ -92,20 +92,20 @@ def check_top_level(config: Config) -> None:
             if name not in legal:
                 raise UserError(f"unknown config key '{key}.{name}'. Available: {', '.join(legal)}")
             check_kind(f"{key}.{name}", value, legal[name])
-    # A recipe may define additional keys to which other keys refer.
+    # A recipe may define additional keys that other keys refer to.
     for key in config.keys() - TOP_LEVEL.keys():
         if near := difflib.get_close_matches(str(key), TOP_LEVEL, 1, 0.75):
             raise UserError(f"unknown config key '{key}'. Did you mean {near[0]}?")
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Raises `UserError` if the annotation of a parameter excludes a value.
+    """Raises `UserError` if the annotation of a parameter does not permit a value.
 
-    Unknown annotations permit any value.
+    Annotations that are not understood permit any value.
     """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
-    # A configuration cannot contain a tensor, so in a union, only the other types are checked.
+    # A configuration cannot contain tensors, so only the other types in a union are checked.
     for kind in [kind for kind in kinds if _name(kind) != "Tensor"]:
         description = _mismatch(value, kind)
         if not description:
@@ -118,7 +118,7 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
 def _alternatives(annotation: ast.expr) -> list[ast.expr]:
     if isinstance(annotation, ast.BinOp):
         return [*_alternatives(annotation.left), *_alternatives(annotation.right)]
-    # A string is a forward reference, from which the annotation is parsed.
+    # A string is a forward reference that contains the annotation.
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
         return _alternatives(ast.parse(annotation.value, mode="eval").body)
     if isinstance(annotation, ast.Subscript):
@@ -131,7 +131,7 @@ def _alternatives(annotation: ast.expr) -> list[ast.expr]:
 
 
 def _mismatch(value: Any, kind: ast.expr) -> str:
-    """Returns the requirement of an annotation without unions, or "" if the value meets the requirement."""
+    """Returns what an annotation without unions requires, or "" if the value meets it."""
     name = _name(kind)
     if name in KINDS:
         types, description = KINDS[name]
@@ -172,9 +172,9 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
 
 
 def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
-    """Returns the requirement of a tuple's annotation, such as `tuple[float, float]`.
+    """Returns what the annotation of a tuple, such as `tuple[float, float]`, requires.
 
-    Returns "" if the items meet the requirement.
+    Returns "" if the items meet it.
     """
     if isinstance(kinds[-1], ast.Constant) and kinds[-1].value is ...:
         kinds = [kinds[0]] * len(items)
@@ -199,9 +199,9 @@ def _name(node: ast.expr) -> str:
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
-    """Checks keys without a signature.
+    """Checks the types of keys that have no signature.
 
-    Raises `UserError` if an override changes the type of the recipe's value.
+    Raises `UserError` if an override changes the type of a value in the recipe.
     """
     for name, value in base.items():
         key = f"{path}{name}"
@@ -225,7 +225,7 @@ def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
 def walk(
     node: Any, path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
-    """Yields the path and the content of each mapping in a configuration, beginning with the entire configuration."""
+    """Yields the path and content of each mapping in a configuration, beginning with the root."""
     if isinstance(node, Mapping):
         yield path, node
         for name, child in node.items():
@@ -236,12 +236,12 @@ def walk(
 
 
 def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
-    """Returns the error message for a key with the unknown part `parts[depth]` in the parent `node`."""
+    """Returns the error message for a key whose part `parts[depth]` does not exist in `node`."""
     key = ".".join(parts)
     if parts[0] == "data" and not depth:
         return (
-            f"{key} is an option of a data set, but no data set was given. Add data=NAME, such as "
-            "data=folder"
+            f"{key} is an option of a data set, but no data set was specified. Add data=NAME, "
+            "such as data=folder"
         )
     siblings = {str(name) for name in node} if isinstance(node, Mapping) else set()
     siblings |= parameters(node["_target_"]) if "_target_" in siblings else set()
@@ -257,13 +257,13 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
 
 
 def parameters(target: str) -> frozenset[str]:
-    """Returns the argument names of a class or function from its source; "**" stands for any argument."""
+    """Returns the argument names in the source of a class or function; "**" = any argument."""
     return frozenset(_signature(target))
 
 
 @functools.cache
 def _signature(target: str) -> dict[str, str]:
-    """Returns the argument names of a class or function, with their annotations ("" = no annotation)."""
+    """Returns the annotations of a class's or function's arguments by name; "" = no annotation."""
     module, _, name = target.rpartition(".")
     node = definition(module, name)
     if node is None:
@@ -281,7 +281,7 @@ def _signature(target: str) -> dict[str, str]:
 def definition(
     module: str, name: str, seen: frozenset[str] = frozenset()
 ) -> tuple[str, ast.AST] | None:
-    """Returns the module and syntax tree of the definition of `module.name`, following re-exports."""
+    """Follows re-exports to the definition of `module.name`; returns its module and syntax tree."""
     tree = _tree(module)
     if tree is None or module in seen:
         return None
@@ -306,9 +306,9 @@ def definition(
 
 
 def _top_level(node: ast.AST) -> Iterator[ast.AST]:
-    """Yields the statements of a module, including `if` and `try` blocks.
+    """Yields the statements of a module, including those in `if` and `try` blocks.
 
-    Statements in classes and functions are left out.
+    Statements in classes and functions are omitted.
     """
     for child in ast.iter_child_nodes(node):
         yield child
@@ -317,8 +317,8 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_file(module: str) -> Path | None:
-    """Returns the source file of a module, or None if there is no file or the name is not a module name."""
-    # A name with a slash could refer to any file
+    """Returns the source file of a module, or None if it has none or the name is invalid."""
+    # A name that contains a slash could refer to any file
     if not all(part.isidentifier() for part in module.split(".")):
         return None
     relative = Path(*module.split("."))
@@ -363,7 +363,7 @@ def _arguments(module: str, node: ast.AST) -> dict[str, str]:
 
 
 def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
-    # The generic class `Base[Kind]`, for one kind of values, has the arguments of `Base`.
+    # A parametrized generic class `Base[Kind]` has the arguments of `Base`.
     bases = [base.value if isinstance(base, ast.Subscript) else base for base in node.bases]
     parents = [definition(module, _name(base)) for base in bases]
     names: dict[str, str] = {}

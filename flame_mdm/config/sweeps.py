@@ -1,4 +1,4 @@
-"""The command line of `train`: recipes composed by Hydra, sweeps, and jobs of Hydra's launchers."""
+"""Command line of `train`: recipes composed by Hydra, sweeps, and jobs of Hydra's launchers."""
 
 import shutil
 import sys
@@ -19,18 +19,17 @@ from flame_mdm.config.signatures import Config
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io.paths import check_tree
 
-SWEEP = ("-m", "--multirun")  # with these options, values separated by commas are a sweep
+SWEEP = ("-m", "--multirun")  # with these options, values separated by commas define a sweep
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
-# Signals that end training before the first step. From the first step on, training handles signals
-# itself.
+# Signals that end training before its first step, after which training handles signals itself.
 INTERRUPT = STOP[:1]
 
 
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
     """Runs a command line `RECIPE key=value ... [--multirun]` and returns the exit code.
 
-    `launch=...` passes each job of a sweep, or a single job, to a launcher, and waits for them.
+    `launch=...` passes the jobs of a sweep, or a single job, to a launcher and waits for them.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):
@@ -49,9 +48,7 @@ def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str
 def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[int]) -> None:
     name, *words = words
     if name.startswith("-") or "=" in name:
-        raise UserError(
-            f"the first word is '{name}', but it must name an experiment, such as quickstart"
-        )
+        raise UserError(f"the first word must be an experiment, such as quickstart, not '{name}'")
     recipe = composition.find_recipe(name)
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in SWEEP]:
@@ -67,7 +64,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     lists = [str(o.input_line) for o in parsed if o.is_sweep_override()]
     if lists and not sweep:
         raise UserError(
-            f"{lists[0]}: several values make a sweep with one run per value. Add --multirun, "
+            f"{lists[0]}: several values define a sweep with one run per value. Add --multirun, "
             f"or use a single value"
         )
     config = composition.resolve(
@@ -80,7 +77,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         )
 
     def start(config: Config, task: Sequence[str]) -> int:
-        # Lightning starts additional processes with these command-line arguments.
+        # Lightning starts its additional processes with these command-line arguments.
         sys.argv = [sys.argv[0], "train", name, *task, quoted(f"run.dir={config['run']['dir']}")]
         codes.append(guarded(lambda: command(config), INTERRUPT))
         return codes[-1]
@@ -91,7 +88,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
 
     def job(_: object) -> None:
         hydra = HydraConfig.get()
-        # Otherwise, Lightning would add words for Hydra's command line
+        # Otherwise, Lightning would add arguments for Hydra's command line
         HydraConfig.instance().cfg = None
         task = [
             str(word)
@@ -101,7 +98,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         code = start(
             composition.compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task
         )
-        # A signal ends the entire sweep. A failed job ends the sweep only if a launcher ran the
+        # A signal ends the entire sweep, whereas a failed job ends it only if a launcher ran the
         # job.
         if code > 128 or (launcher and code):
             raise SystemExit(code)
@@ -134,10 +131,10 @@ def hydra_sweep(
     """Runs the jobs of a sweep with Hydra.
 
     Args:
-        job: function that receives the composed configuration of each job.
+        job: function that is called with the composed configuration of each job.
         folder: folder of the configuration.
-        stem: name of the configuration file without suffix; None = an empty configuration.
-        words: Hydra overrides, which may list several values to sweep over.
+        stem: name of the configuration file, without suffix; None = an empty configuration.
+        words: Hydra overrides, which may contain several values to sweep over.
     """
     sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]
     GlobalHydra.instance().clear()
@@ -149,8 +146,8 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe lacks a part, or has an invalid value that would only be noticed later."""
-    plain(config, name)  # otherwise, the checkpoints of the run would be rejected
+    """Raises `UserError` if a recipe is incomplete or has a value that would only fail later."""
+    plain(config, name)  # otherwise, the run's checkpoints would be rejected
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]
     lacking = [key for key in ("experiment", "seed", "ema", "logger") if key not in config]

@@ -1,4 +1,4 @@
-"""The demo's server: page, motion files, and limits.
+"""The demo's server: page, motion files and limits.
 
 It requires the `demo` extra (gradio).
 """
@@ -37,13 +37,13 @@ from flame_mdm.demo.studio_page import build_page
 from flame_mdm.errors import UserError, first_line, one_line, say
 from flame_mdm.visualize import player_page
 
-# Number of open pages that gradio remembers. For each page, gradio stores half a megabyte of data,
-# which the demo does not need.
+# Number of open pages for which gradio keeps state. It stores half a megabyte per page, which the
+# demo does not need.
 SESSIONS = 64
 # Maximum number of motion files written at the same time, and of requests waiting for a file
 WRITERS = 2
 WAITING_FILES = 32
-WAITING_BLOCKS = 32  # maximum number of requests waiting for the frames of a stream
+WAITING_BLOCKS = 32  # maximum number of requests that wait for frames of a stream
 BUSY = "too many files are being written. Try again in a minute"
 FOLDER = Path(__file__).parent
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
@@ -56,9 +56,9 @@ def serve(
     device: str | None = None,
     hosts: Collection[str] = (),
 ) -> None:
-    """Serves the page of `Studio(sources)` until interrupted.
+    """Serves the page of `Studio(sources)` until the process is interrupted.
 
-    Raises `UserError` if the port or a model is unusable.
+    Raises `UserError` if the port or a model cannot be used.
     """
     import torch
 
@@ -82,17 +82,17 @@ def serve(
 
 
 def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
-    """Returns the connection limits.
+    """Returns the connection limits for a server.
 
-    With `hosts`, the demo is behind a web server with these names, so all visitors have the same
-    address.
+    If there are `hosts`, the demo is behind a web server with these names, so that all visitors
+    have the same address.
     """
     limits = ConnectionLimits()
     return replace(limits, per_address=limits.total) if hosts else limits
 
 
 class Server(uvicorn.Server):
-    """A server that ends the streams of open pages when it stops, before it waits for requests."""
+    """A server that, when it stops, ends the streams of open pages before it waits for requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]
@@ -100,7 +100,7 @@ class Server(uvicorn.Server):
 
 
 def source(name: str) -> str:
-    """Returns the content of a file in the folder of this module."""
+    """Returns the content of a file in this module's folder."""
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
@@ -109,7 +109,8 @@ class Writers:
 
     Attributes:
         turns: semaphore that is held while a file is written.
-        waiting: number of requests for a file, including requests whose file is being written.
+        waiting: number of requests that wait for a file, including those whose file is being
+            written.
     """
 
     def __init__(self) -> None:
@@ -123,7 +124,7 @@ class Writers:
 
 
 def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
-    """Adds routes for stream blocks (`/live`), stream files, and the page that plays the streams."""
+    """Adds the routes for blocks of streams (`/live`), files of streams, and the stream player."""
     waiting = 0
 
     @app.get("/live.html")
@@ -168,7 +169,10 @@ def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
 
 
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
-    """Returns the application: the page at `/`, and files at `/motion.bvh?...` with the query string of a link."""
+    """Returns the application, which serves the page at `/` and files at `/motion.bvh?...`.
+
+    The addresses of the files contain the query string of a link.
+    """
     app = FastAPI(openapi_url=None)
     writers = Writers()
 

@@ -1,6 +1,6 @@
 """The demo's interpretation of the text, as HTML.
 
-Each action and attribute is shown as a chip, and can be changed with one click.
+Each action and each attribute is shown as a chip, which can be changed with one click.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,19 +15,19 @@ from flame_mdm.conditions.language.wording import attribute_words, caption, pred
 from flame_mdm.errors import one_line
 from flame_mdm.sampling.motion_request import Part
 
-SHOWN = ("direction", "speed", "count", "side")  # attributes with a chip
+SHOWN = ("direction", "speed", "count", "side")  # attributes that are shown as chips
 
 
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
-    """Returns the chips for the text: its actions in order, their attributes, and ignored words.
+    """Returns the chips for a text: its actions in order, their attributes, and ignored words.
 
-    Each option of a chip is the text with a different word for the action or attribute. The chosen
-    option replaces the text in the form.
+    Each option of a chip is the entire text, with a different word for the action or attribute. The
+    option that the user chooses replaces the text in the form.
 
     Args:
-        abilities: the actions and attributes that the model knows. They are the options of the
+        abilities: the actions and attributes that the model knows, which become the options of the
             chips.
-        parts: words and seconds for each part of the text.
+        parts: the words and the duration in seconds of each part of the text.
         readings: the meaning of each part.
     """
     rows = []
@@ -51,7 +51,7 @@ def _step(
             continue
 
         def text(changed: Mention, position: int = position) -> str:
-            """Returns the text to put in the form if `changed` replaces this action."""
+            """Returns the text for the form in which `changed` replaces this action."""
             words = caption((*step[:position], changed, *step[position + 1 :]))
             rows = [
                 (words if row == number else phrase, seconds)

@@ -1,4 +1,4 @@
-"""Connections to the demo's server, with deadlines, a total limit and a limit per address."""
+"""Connections to the demo's server, with deadlines and limits in total and per address."""
 
 import asyncio
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class ConnectionLimits:
     """Limits on the connections to a server.
 
     A connection is *waiting* until the headers of a request are complete, and again after the
-    response. When the maximum number of connections is reached, a new connection replaces the
-    connection that has waited longest. If no connection is waiting, the request of the new
-    connection receives status 503.
+    response. When the maximum number of connections is reached, a new connection replaces the one
+    that has been waiting longest. If no connection is waiting, the request of the new connection is
+    answered with status 503.
 
     Attributes:
         total: maximum number of open connections.
@@ -26,8 +26,8 @@ class ConnectionLimits:
             network.
         header_seconds: maximum waiting time of a connection, regardless of how many bytes of the
             headers arrive.
-        idle_seconds: maximum waiting time after a response, if nothing arrives.
-        stall_seconds: maximum number of seconds during which a client does not read a response.
+        idle_seconds: maximum waiting time after a response if no data arrives.
+        stall_seconds: maximum time during which a client does not read its response.
     """
 
     total: int = 256
@@ -60,7 +60,7 @@ class Connection(H11Protocol):
         self.stall: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Watches a new connection, and closes the longest-waiting connections if there are too many."""
+        """Watches a new connection and closes the longest-waiting ones if there are too many."""
         super().connection_made(transport)
         self.network = _network(self.client[0]) if self.client else None
         self._watch()
@@ -79,24 +79,24 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def handle_events(self) -> None:
-        """Handles received data, and starts or stops the timers."""
+        """Handles received data and starts or stops the timers."""
         super().handle_events()
         self._watch()
 
     def on_response_complete(self) -> None:
-        """Waits for the next request once a response is complete."""
+        """Starts to wait for the next request when a response is complete."""
         super().on_response_complete()
         self._watch()
 
     def pause_writing(self) -> None:
         """Starts the timer that closes the connection if the client does not read."""
         super().pause_writing()
-        # The timer aborts the connection instead of closing it, because closing would wait for the
-        # client, which does not read.
+        # The timer aborts the connection rather than closing it, because closing would wait for the
+        # client to read.
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stops this timer, because the client is reading again."""
+        """Stops the timer of `pause_writing`, because the client is reading again."""
         super().resume_writing()
         if self.stall is not None:
             self.stall.cancel()
@@ -109,7 +109,7 @@ class Connection(H11Protocol):
         self.transport.close()
 
     def _watch(self) -> None:
-        """Starts the deadline when the connection begins to wait, and stops it when a request has arrived."""
+        """Starts the deadline when the connection begins to wait, and stops it upon a request."""
         if self.transport.is_closing():
             return
 
@@ -121,7 +121,7 @@ class Connection(H11Protocol):
             self.deadline = None
 
     def _make_room(self, group: "list[Connection]", limit: int) -> None:
-        """Closes the longest-waiting connections in a group until the group is within the limit."""
+        """Closes the longest-waiting connections in a group until it is within the limit."""
         excess = len(group) - limit
         if excess <= 0:
             return
@@ -145,7 +145,10 @@ class Connection(H11Protocol):
 
 
 def _network(address: str) -> IPv4Address | IPv6Network:
-    """Returns an address, or the 64-bit network of an IPv6 address, because a subscriber has an entire network."""
+    """Returns an IPv4 address, or the 64-bit network of an IPv6 address.
+
+    An IPv6 subscriber usually has an entire network.
+    """
     parsed = ip_address(address.partition("%")[0])
     if isinstance(parsed, IPv6Address):
         return parsed.ipv4_mapped or IPv6Network((parsed, 64), strict=False)

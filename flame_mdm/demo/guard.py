@@ -1,4 +1,4 @@
-"""The guard of the demo's server, which refuses all requests except those from the page."""
+"""The guard of the demo's server, which refuses all requests that do not come from the page."""
 
 import asyncio
 import ipaddress
@@ -19,7 +19,7 @@ from flame_mdm.demo.request import MAX_TEXT, MAX_WAYPOINTS, PLAIN
 
 # Maximum number of bytes in the body of a request, counted as they arrive
 MAX_BODY = 64 * 1024
-# Maximum number of seconds until the body has arrived
+# Maximum time in seconds until the entire body has arrived
 BODY_TIME = 10.0
 # Maximum number of characters in the path of a URL. File names have at most 255 characters.
 MAX_PATH = 200
@@ -39,14 +39,15 @@ HEADERS = {
 }
 """Headers in every response.
 
-Nothing is loaded from other servers, and only Hugging Face may show the page in a frame.
+With these headers, nothing is loaded from other servers, and only Hugging Face may show the page in
+a frame.
 """
 
 Id = Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")]
 
 
 class Post(BaseModel):
-    """The body of a request. Values are not converted, and unknown keys are refused."""
+    """The body of a request. Its values are not converted, and unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -54,7 +55,7 @@ class Post(BaseModel):
 class Call(Post):
     """A call to one of the page's functions.
 
-    Its arguments are strings, and never objects that could refer to a file.
+    Its arguments are strings, never objects that could refer to a file.
     """
 
     data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
@@ -65,7 +66,7 @@ class Call(Post):
 
 
 class Reset(Post):
-    """A message from the page that it is no longer waiting for a call."""
+    """A message that the page no longer waits for the result of a call."""
 
     event_id: Id
 
@@ -81,7 +82,7 @@ Meters = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)]
 
 
 class LiveCall(Post):
-    """A request for the frames of a stream, starting at frame `begin`; `stream` is "" for a new stream."""
+    """A request for frames of a stream from `begin` on; `stream` is "" for a new stream."""
 
     stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
     text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]
@@ -102,11 +103,11 @@ POSTS: dict[str, type[Post]] = {
 class Guard:
     """ASGI middleware that checks a request before the application receives it.
 
-    It checks host, origin, path, size and content. `hosts` are the names of this server, in
-    addition to localhost and numeric addresses. A request with a different host name may come from
-    a page whose name somebody pointed at this computer (DNS rebinding). `calls` maps the indices of
-    the page's callable functions to their path, and to a check of the arguments. `is_open` returns
-    whether a session has called a function, so that its results can be read.
+    It checks the host, origin, path, size and content of the request. `hosts` contains the names of
+    this server, in addition to localhost and numeric addresses. A request with any other host name
+    may come from a page whose name somebody pointed at this computer (DNS rebinding). `calls` maps
+    the index of each function that the page can call to its path and a check of its arguments.
+    `is_open` returns whether a session has called a function, so that its results can be read.
     """
 
     def __init__(
@@ -180,7 +181,7 @@ class Guard:
             line = "this demo is not served under that name. Start it with hosts=NAME"
             raise HTTPException(HTTPStatus.MISDIRECTED_REQUEST, line)
         origin = headers.get("origin", f"http://{host}")
-        # A proxy may replace the host, but does not replace the origin
+        # A proxy may replace the host, but not the origin
         same = _network_location(origin) == host.lower() or _host_name(origin) in self.hosts
         if not same or (
             path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")

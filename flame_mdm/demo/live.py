@@ -1,4 +1,7 @@
-"""Motion streams for visitors. Their number is limited, and blocks are computed one at a time."""
+"""Motion streams for visitors.
+
+Their number is limited, and their blocks are computed one at a time.
+"""
 
 import secrets
 import tempfile
@@ -19,29 +22,29 @@ from flame_mdm.sampling.streams import Stream, read_text, stream
 from flame_mdm.visualize.player import packed_motion
 
 MAX_STREAMS = 16
-# Seconds without a request after which a stream ends
+# Time in seconds without a request after which a stream ends
 IDLE = 120.0
 # Maximum duration of a stream in seconds
 LONGEST = 3600.0
-# Maximum number of blocks that a stream may compute at once, and per second on average
+# Maximum number of blocks that a stream may compute in a burst, and per second on average
 BURST, RATE = 8.0, 2.0
-# Duration in seconds of the part of a stream that can be downloaded
+# Length in seconds of the last part of a stream, which can be downloaded
 KEPT = 60.0
-# The rotations of the first frames of a block depend on this number of preceding frames
+# Number of preceding frames on which the rotations in the first frames of a block depend
 BEFORE = 10
 ENDINGS = (".bvh", ".glb")
 STAND, WALK = "a person stands", "a person walks forward"
-"""The text with which a stream begins, and the text while the person walks to a waypoint."""
+"""Text with which a stream begins, and text while the person walks to a waypoint."""
 
 
 @dataclass
 class LiveStream:
-    """A visitor's stream, and the data that is stored for it.
+    """A visitor's stream and the data that is stored for it.
 
     Attributes:
         stream: the stream.
         used: time in seconds of the last request.
-        joints: (F, J, 3) joint positions of the last minute.
+        joints: (F, J, 3) joint positions in the last minute of the stream.
         text: the current text.
         allowance: number of blocks that the stream may compute now.
     """
@@ -70,7 +73,7 @@ class LiveStreams:
     def can_lead(self) -> bool:
         """Whether visitors can lead the person along waypoints.
 
-        This requires the representation `HumanML`, and a model that understands the text `WALK`.
+        This requires the representation `HumanML` and a model that understands the text `WALK`.
         """
         if not isinstance(self.model.representation, HumanML):
             return False
@@ -86,11 +89,11 @@ class LiveStreams:
         """Returns the frames of a stream, starting at frame `begin`, in the format of the player.
 
         Args:
-            name: name of the stream. "" = begin a new stream, whose name is in the result.
+            name: name of the stream, or "" to begin a new stream, whose name is in the result.
             text: description of the motion.
             begin: index of the first frame. Later frames of the stream are dropped.
-            path: waypoints (x, z), in meters, that are still ahead in frame `begin`. `reached` in
-                the result lists the indices of the frames in which the first waypoints are reached.
+            path: waypoints (x, z) in meters that are still ahead in frame `begin`. `reached` in the
+                result lists the indices of the frames in which waypoints are reached, in order.
 
         Raises:
             UserError: If the text is not understood, if the stream has ended, or if a limit is
@@ -123,7 +126,7 @@ class LiveStreams:
         }
 
     def file(self, name: str, ending: str) -> bytes:
-        """Returns a motion file of the last minute of a stream.
+        """Returns the content of a motion file with the last minute of a stream.
 
         Raises:
             UserError: If the stream has ended, or if no file format has this extension.
@@ -144,7 +147,7 @@ class LiveStreams:
             return path.read_bytes()
 
     def _opened(self, name: str, text: str) -> tuple[str, LiveStream]:
-        """Returns a stream and its name, after ending streams that are no longer read."""
+        """Returns a stream and its name, after ending the streams that are no longer requested."""
         now = self.clock()
         self._streams = {
             other: live for other, live in self._streams.items() if now - live.used <= IDLE
@@ -165,7 +168,7 @@ class LiveStreams:
         return self._streams[name]
 
     def _count(self, live: LiveStream) -> None:
-        """Counts a block.
+        """Counts a block toward the limits of a stream.
 
         Raises `UserError` if a stream computes more blocks than a visitor can watch, or if it has
         reached its maximum duration.

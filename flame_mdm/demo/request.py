@@ -1,4 +1,4 @@
-"""Requests to the demo: their limits, their links, and equivalent Python programs."""
+"""Requests to the demo: limits, links, and equivalent Python programs."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -23,7 +23,7 @@ from flame_mdm.sampling.motion_request import (
     read_path,
 )
 
-# Limits of a request, so that a visitor cannot occupy the machine for minutes
+# Limits of a request, which keep a visitor from occupying the machine for minutes
 MAX_TEXT = 300
 MAX_SECONDS = 30
 MAX_SAMPLES = 4
@@ -32,12 +32,12 @@ MAX_EDITS = 8
 MAX_SEED = 2**31 - 1
 # Maximum number of fields in a query string
 MAX_FIELDS = 50
-# Limits of a path: number of waypoints, and meters along x and z
+# Limits of a path: number of waypoints, and distance along x and z in meters
 MAX_WAYPOINTS, FAR = 16, 20.0
 # Separator between the names of a model and its adapter
 PLUS = " + "
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
-"""Text without control characters, and without characters that change the writing direction."""
+"""Pattern of text without control characters and characters that change its direction."""
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=PLAIN)]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
@@ -59,11 +59,11 @@ Path = Annotated[
 
 
 class DemoEdit(BaseModel):
-    """An edit of a previous motion; `motion` is its index.
+    """An edit of an earlier motion, whose index is `motion`.
 
-    See `flame_mdm.sampling.motion_request.EditRequest`. `text` describes the new part. If it is "",
-    the new part is unconditioned. A variation of the entire motion keeps the text, parts and path
-    of the request.
+    The fields are explained in `flame_mdm.sampling.motion_request.EditRequest`. `text` describes
+    the new part, or is "" if the new part is unconditioned. A variation of the entire motion keeps
+    the text, parts and path of the request.
     """
 
     model_config = RULES
@@ -102,27 +102,27 @@ class DemoRequest(BaseModel):
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
 
     def targets(self, kind: str) -> dict[str, Any]:
-        """Returns the targets of `flame_mdm.generate` along the path, for a model trained on `kind`."""
+        """Returns the path as targets for `flame_mdm.generate`; `kind` is the model's condition."""
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
         return path_targets(self.path, self.total_seconds(parts))
 
     def total_seconds(self, parts: Sequence[tuple[str, float | None]]) -> float:
         """Returns the duration of all parts.
 
-        A part without a duration is as long as `seconds` or, if it is None, `USUAL_SECONDS`.
+        A part without a duration is as long as `seconds` or, if that is None, `USUAL_SECONDS`.
         """
         return sum(seconds or self.seconds or USUAL_SECONDS for _, seconds in parts)
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps: for each step, the index of the motion to edit, and keywords for `generate` or `edit`.
+        """Returns the steps: (index of the motion to edit, keywords for `generate` or `edit`).
 
-        The index is None in the first step, which generates motions.
+        In the first step, which generates motions, the index is None.
         """
         shared = self.model_dump(
             include={"guidance_scale", "num_inference_steps", "sampler"}, exclude_none=True
         )
         path = {"targets": self.targets(kind)} if self.path else {}
-        # The waypoints of a path are spread over this duration.
+        # The waypoints of a path are spread over this time.
         seconds = self.seconds or (USUAL_SECONDS if self.path else None)
         duration = {} if seconds is None else {"seconds": seconds}
         split = {} if self.split else {"split": False}
@@ -142,14 +142,14 @@ class DemoRequest(BaseModel):
                 )
             else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-        # With a path, motions are not cleaned up, because cleanup moves the root away from the
+        # Motions along a path are not cleaned up, because cleanup moves the root away from the
         # waypoints (by 0.3 m in one example).
         if self.cleanup and not self.path:
             steps[-1][1]["cleanup"] = True
         return steps
 
     def python(self, kind: str, device: str) -> str:
-        """Returns Python code that generates the same motions; `kind` is the model's kind of condition."""
+        """Returns Python code that generates the same motions; `kind` is the model's condition."""
         model, _, adapter = self.model.partition(PLUS)
         options = ("" if device == "cpu" else f", {device!r}") + (
             f", adapter={adapter!r}" if adapter else ""
@@ -164,7 +164,10 @@ class DemoRequest(BaseModel):
 
 
 def query_pairs(query: str) -> list[tuple[str, str]]:
-    """Returns the keys and values of a query string. Raises `UserError` if it has more than `MAX_FIELDS`."""
+    """Returns the keys and values of a query string.
+
+    Raises `UserError` if there are more than `MAX_FIELDS`.
+    """
     try:
         return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_FIELDS)
     except ValueError:
@@ -195,9 +198,9 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
 
 
 def checked(values: dict[str, Any]) -> DemoRequest:
-    """Returns a request. Empty values are replaced by the defaults.
+    """Builds a request, in which empty values are replaced by the defaults.
 
-    The `UserError` quotes an invalid value.
+    Raises a `UserError` that quotes the value if one is invalid.
     """
     try:
         return DemoRequest(

@@ -10,16 +10,17 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.visualize.render import thumbnail
 
 STILLS = Path(__file__).parent / "stills"
-"""Samples from the model "package" for actions that the synthetic set does not contain."""
+"""Pictures of samples from the model "package", for actions that the synthetic set lacks."""
 
 
 @cache
 def still(action: str, side: Value | None = None) -> bytes | None:
-    """Returns a WebP image of an action. Returns None if there is no picture of the action.
+    """Returns a WebP image of an action, or None if there is no picture of it.
 
     Args:
         action: name of the action in `actions.yaml`.
-        side: side of the body, for actions of the synthetic set that have one. Default: any.
+        side: side of the body, for actions in the synthetic set that have a side. Default: any
+            side.
     """
     names = [name for name in actions()[action].names if name in ACTIONS]
     if names:

@@ -22,12 +22,12 @@ from flame_mdm.sampling.generation import generate
 from flame_mdm.sampling.motion_request import SamplingRequest, read_parts
 from flame_mdm.sampling.resolution import resolve
 
-# Number of requests whose motions stay in memory, so that a download or an edit does not need the
-# model again
+# Number of requests whose motions stay in memory, so that downloads and edits do not require them
+# to be sampled again
 KEPT = 64
-# Maximum number of seconds for which a request may occupy the model
+# Maximum time in seconds for which a request may occupy the model
 TIME_LIMIT = 300.0
-# Download formats, and their names on the page
+# Names of the download formats on the page, by extension
 FORMATS = {
     ".bvh": "BVH",
     ".fbx": "FBX",
@@ -38,7 +38,7 @@ FORMATS = {
 
 
 class Studio:
-    """Generates the motions for requests, using only the models in `sources`.
+    """Generates motions for requests, using only the models in `sources`.
 
     A source is an argument of `load`, or "MODEL + ADAPTER".
     """
@@ -55,9 +55,9 @@ class Studio:
         self.live = LiveStreams(streaming[0]) if streaming else None
 
     def model(self, name: str) -> MotionGenerator:
-        """Returns a model by its name on the page. Raises `UserError` for other names.
+        """Returns a model by its name on the page. Raises `UserError` if the name is unknown.
 
-        A model with an adapter is loaded when it is first used.
+        A model with an adapter is only loaded when it is first used.
         """
         if name not in self.files:
             near = did_you_mean(name, self.files)
@@ -69,15 +69,15 @@ class Studio:
             model = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
             if model.conditioned_on == "text" and Reader.fits(model.facts):
                 reader = self._readers[name] = Reader(model.facts)
-                # The language tables are read in advance, so that the first response does not wait
-                # for them.
+                # Read the language tables in advance, so that the first response does not wait for
+                # them.
                 for action in reader.abilities.actions:
                     reader.abilities.choices(action)
             self._models[name] = model
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns the text reader of a model whose captions describe single actions, or None."""
+        """Returns a model's text reader, or None if its captions do not describe single actions."""
         self.model(name)
         return self._readers.get(name)
 
@@ -87,9 +87,9 @@ class Studio:
         report: Callable[[int], None] = lambda calls: None,
         stop: Event | None = None,
     ) -> Sequence[Motion]:
-        """Returns the motions for a request, from memory if possible.
+        """Returns the motions for a request, which are taken from memory if possible.
 
-        `report` is called with the number of network calls.
+        `report` is called with the number of network calls so far.
         """
         with self._working:
             model = self.model(request.model)
@@ -98,7 +98,8 @@ class Studio:
 
             def before(*_: object) -> None:
                 nonlocal calls
-                # Another visitor's stream may use the model at the same time
+                # The call may belong to another visitor's stream, which uses the model at the same
+                # time
                 if get_ident() != thread:
                     return
                 if stop is not None and stop.is_set():
@@ -131,7 +132,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request after turning a sentence with several actions into a sequence.
+        """Returns the request, with a sentence of several actions turned into a sequence.
 
         Raises the same errors as `generate`.
         """
@@ -150,7 +151,7 @@ class Studio:
         return [reader.read(words) for words, _ in read_parts(request.text)]
 
     def advice(self, request: DemoRequest) -> list[str]:
-        """Returns messages about words that the model has never seen or does not read."""
+        """Returns messages about words that the model has not seen in training or does not read."""
         model = self.model(request.model)
         if model.conditioned_on != "text" or self.readings(request):
             return []
@@ -165,13 +166,13 @@ class Studio:
     def file(
         self, request: DemoRequest, number: int, extension: str, rig: str | None = None
     ) -> bytes:
-        """Returns the content of a file with motion `number`.
+        """Returns the content of a file that contains the motion with index `number`.
 
-        The motion must be in memory, so that a download does not wait for requests.
+        The motion must be in memory, so that downloads do not wait for requests.
         """
         if extension not in FORMATS:
             raise UserError(
-                f"{one_line(extension[:20])}: this page does not offer this format. Use "
+                f"{one_line(extension[:20])}: the page does not offer this format. Use "
                 f"one of {', '.join(FORMATS)}"
             )
         motions = None

@@ -1,6 +1,6 @@
 """The demo page: form, player, edits, downloads and links.
 
-`page.js` writes the links, and the server reads and answers them.
+Links are written by `page.js` and answered by the server.
 """
 
 import re
@@ -54,7 +54,7 @@ PROGRAMS = {
     "Mixamo FBX": ("fbx", "&amp;rig=mixamo"),
     "Mixamo GLB": ("glb", "&amp;rig=mixamo"),
 }
-"""Buttons for programs: the file extension, and the skeleton in the address of the file.
+"""Download buttons for programs: the file extension and the skeleton in the file's address.
 
 Other formats are under "More".
 """
@@ -72,7 +72,7 @@ EXAMPLES = (
     "a person talks on the phone",
     "a person does a push-up",
 )
-"""Example texts. The page shows those whose actions its model can generate."""
+"""Example texts, of which the page shows those that its model can generate."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
 <div class="list"></div><button type="button" class="add">+ Add an action</button></div>
@@ -83,7 +83,7 @@ SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return lo
 
 
 def build_page(studio: Studio) -> gr.Blocks:
-    """Returns the page. The server calls its functions `show`, `halt` and `switch`."""
+    """Returns the page. Its functions `show`, `halt` and `switch` run on the server."""
     stops: dict[str, Event] = {}
 
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
@@ -181,7 +181,7 @@ def _with_live(studio: Studio, live: LiveStreams) -> SimpleNamespace:
 
 
 def _layout(studio: Studio) -> SimpleNamespace:
-    """Places the components of the page in the current `gr.Blocks`, and returns them by name."""
+    """Places the components of the page in the current `gr.Blocks` and returns them by name."""
     names = list(studio.files)
     model = studio.model(names[0])
     samplers, examples = list(model.process.samplers), _examples(model)
@@ -268,7 +268,7 @@ def _result(
     kind = studio.model(request.model).conditioned_on
     names = [f"Motion {number + 1}" if len(motions) > 1 else "" for number in range(len(motions))]
     scene = [replace(motion, id=name) for motion, name in zip(motions, names, strict=True)]
-    if request.edits:  # shown next to the motion before the last edit
+    if request.edits:  # the result is shown next to the motion before the last edit
         *before, last = request.edits
         original = studio.motions(request.model_copy(update={"edits": tuple(before)}))[last.motion]
         scene.insert(0, replace(original, id="before", text=f"before: {original.text}"))
@@ -305,7 +305,7 @@ def _result(
 
 
 def _verdicts(name: str, motion: Motion) -> str:
-    """Returns the referee's verdicts on the claims of a motion's text, or "" if it has none."""
+    """Returns the referee's verdicts on the claims in a motion's text, or "" if there are none."""
     judgment = try_judge(motion)
     if judgment is None:
         return ""
@@ -326,7 +326,7 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 
 def _refusal(error: NotUnderstood) -> str:
-    """Returns the message for text without an action that the model knows.
+    """Returns the message for a text that contains no action that the model knows.
 
     The nearest actions are shown as buttons with pictures.
     """
@@ -352,7 +352,7 @@ def _still(text: str) -> str:
 def _note(kind: str, line: str) -> str:
     """Returns a message.
 
-    If the message suggests a text, this text is a button that replaces the text in the form.
+    If the message suggests a text, the suggestion is a button that puts it into the form.
     """
     shown = re.sub(
         r"Did you mean &#x27;(.+?)&#x27;\?$",
@@ -368,7 +368,7 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Maps texts or actions from the training data to the addresses of their pictures, or to ""."""
+    """Returns the picture address, or "", of texts or actions from the training data."""
     if model.conditioned_on == "text" and Reader.fits(model.facts):
         doable = Abilities(model.facts).actions
         return {

@@ -38,7 +38,7 @@ BUG = 70  # exit code for a bug, as in sysexits.h
 NO_MEMORY = re.compile(
     "allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map"
 )
-"""Error messages when torch, a thread or the loading of a library runs out of memory."""
+"""Messages of errors that a lack of memory causes in torch, in threads and in loading libraries."""
 
 
 def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:

@@ -45,7 +45,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "str": (str, "a string"),
     "None": (type(None), "null"),
 }
-"""By annotation: the permitted types of a value, and their description for error messages."""
+"""Permitted types of a value and their description in error messages, by annotation."""
 SEQUENCES, TUPLES = ("list", "List", "Sequence"), ("tuple", "Tuple")
 
 
@@ -71,7 +71,7 @@ ARGUMENTS = {
     "losses": "flame_mdm.losses.MotionLosses",
     "ema": "flame_mdm.training.averaging.MovingAverage",
 }
-"""By key of a mapping in a recipe: the class whose arguments the mapping contains."""
+"""Classes whose arguments the mappings in a recipe contain, by key of the mapping."""
 
 DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that recipes cannot set
 

@@ -84,8 +84,8 @@ def serve(
 def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
     """Returns the connection limits for a server.
 
-    If there are `hosts`, the demo is behind a web server with these names, so that all visitors
-    have the same address.
+    If `hosts` is not empty, the demo runs behind a web server with these names, so that all
+    visitors have the same address.
     """
     limits = ConnectionLimits()
     return replace(limits, per_address=limits.total) if hosts else limits

@@ -28,7 +28,7 @@ IDLE = 120.0
 LONGEST = 3600.0
 # Maximum number of blocks that a stream may compute in a burst, and per second on average
 BURST, RATE = 8.0, 2.0
-# Length in seconds of the last part of a stream, which can be downloaded
+# Length in seconds of the part at the end of a stream that can be downloaded
 KEPT = 60.0
 # Number of preceding frames on which the rotations in the first frames of a block depend
 BEFORE = 10

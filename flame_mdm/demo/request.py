@@ -114,7 +114,7 @@ class DemoRequest(BaseModel):
         return sum(seconds or self.seconds or USUAL_SECONDS for _, seconds in parts)
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps: (index of the motion to edit, keywords for `generate` or `edit`).
+        """Returns the steps as (index of the motion to edit, keywords for `generate` or `edit`).
 
         In the first step, which generates motions, the index is None.
         """

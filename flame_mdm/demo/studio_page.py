@@ -368,7 +368,7 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Returns the picture address, or "", of texts or actions from the training data."""
+    """Returns texts or actions from the training data, with picture addresses ("" = no picture)."""
     if model.conditioned_on == "text" and Reader.fits(model.facts):
         doable = Abilities(model.facts).actions
         return {

@@ -20,7 +20,7 @@ class MotionBatch:
     """Motions of different lengths, padded to the longest one.
 
     Attributes:
-        x: (B, F, D) float32, normalized features, 0 past the end of each motion.
+        x: (B, F, D) float32, normalized features, which are 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
         ids: B names, each unique in the data set. The name of a sample seeds its noise and
             identifies it in results.
@@ -41,7 +41,7 @@ class MotionBatch:
 
     @property
     def lengths(self) -> Tensor:
-        """The number of real frames of each motion, (B,) int64."""
+        """Number of real frames of each motion, (B,) int64."""
         return self.mask.sum(1)
 
     def __len__(self) -> int:
@@ -99,7 +99,7 @@ class Condition:
     def drop(self, drop: Tensor) -> Condition:
         """Replaces the conditions of some samples with the null condition.
 
-        Only the text or action is replaced. The prefix and the target are kept.
+        Only the text or action is replaced, not the prefix and the target.
 
         Args:
             drop: (B,) bool, True = replace the condition of this sample.
@@ -155,7 +155,7 @@ class Condition:
 
 
 class Guide(Protocol):
-    """Guides motions (B, F, D) toward a goal, such as world positions."""
+    """Interface of objects that guide motions (B, F, D) toward a goal, such as world positions."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         """Returns a version of `x_t` whose clean estimate is closer to the goal.
@@ -190,8 +190,8 @@ class Edit:
             (FLAME's code), so that the result contains the model's version of the known motion.
         resample: for "x_t", how many times each step is repeated. Noise is added again before each
             repetition (RePaint, algorithm 1).
-        guide: for "x0", a goal that is imposed on the clean estimate at each step, before the kept
-            part overwrites it. None = no goal.
+        guide: for "x0", a guide toward a goal, which changes the clean estimate at each step before
+            the kept part overwrites it. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
             with the noise level of the first of these steps (SDEdit). MDM's code sets the number of
             skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. If `strength`
@@ -227,9 +227,9 @@ class Edit:
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
-"""Signature of a denoiser, with or without guidance.
+"""Function of a denoiser, with or without guidance.
 
-(x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features)
+Its signature is (x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features).
 """
 
 Noise = Callable[[int], Tensor]
@@ -294,7 +294,10 @@ class Constant:
         self.tensors: dict[torch.device, Tensor] = {}
 
     def on(self, device: torch.device) -> Tensor:
-        """Returns the tensor on a device. Only the first call for a device waits for a copy."""
+        """Returns the numbers as a tensor on a device.
+
+        Only the first call per device waits for a copy.
+        """
         if device not in self.tensors:
             # The first call may happen during validation, but training cannot use inference
             # tensors.

@@ -1,4 +1,4 @@
-"""Errors that the user can fix, suggestions for misspelled names, old names, and safe output."""
+"""Errors that users can fix, suggestions for misspelled names, renamed names, and safe output."""
 
 import difflib
 import html
@@ -29,7 +29,7 @@ class UserError(ValueError):
 def first_line(error: BaseException) -> str:
     """Returns the first line of an error's message.
 
-    If this line ends with a colon, the second line is appended.
+    If that line ends with a colon, the second line is appended.
     """
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     if len(lines) > 1 and lines[0].endswith(":"):
@@ -47,7 +47,7 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(text: str, most: int = MAX_LINE) -> str:
-    """Shortens text to at most `most` characters, and escapes direction characters.
+    """Shortens text to at most `most` characters and escapes direction characters.
 
     Shortened text ends with an ellipsis.
     """
@@ -58,7 +58,7 @@ def shortened(text: str, most: int = MAX_LINE) -> str:
 def printable(text: str) -> str:
     r"""Returns the text with control and direction characters escaped (`\x1b`).
 
-    The result cannot control a terminal.
+    The returned text cannot control a terminal.
     """
     return "".join(
         char

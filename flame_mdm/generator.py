@@ -1,7 +1,7 @@
 # pyright: standard
-"""Models that generate motions, independent of Lightning.
+"""Models that generate motions.
 
-They do not import Lightning, because the import takes longer than sampling a motion.
+They are independent of Lightning, whose import takes longer than sampling a motion.
 `flame_mdm.task` trains them.
 """
 
@@ -46,7 +46,7 @@ class Parts:
         if not isinstance(self.denoiser, Denoiser):
             kind = type(self.denoiser).__name__
             raise UserError(
-                f"{kind} is not a denoiser: derive it from flame_mdm.denoisers.Denoiser"
+                f"{kind} is not a denoiser. Derive it from flame_mdm.denoisers.Denoiser"
             )
 
     @classmethod
@@ -85,8 +85,8 @@ def sampling_defaults(
     Raises:
         UserError: If a value is invalid.
     """
-    if num_inference_steps is None:  # a recipe may come from a file
-        raise UserError("task.num_inference_steps=null: set it to the number of sampling steps")
+    if num_inference_steps is None:  # possible in a recipe from a file
+        raise UserError("task.num_inference_steps=null: expected the number of sampling steps")
     try:
         return SamplerOptions(
             guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
@@ -133,7 +133,7 @@ class MotionGenerator(Model, nn.Module):
     """
 
     noun = "a motion generator"
-    #: The condition with which the model was trained.
+    #: Kind of condition with which the model was trained.
     conditioned_on: Literal["none", "text", "action"]
 
     def __init__(self, parts: Parts, sampler_options: SamplerOptions):
@@ -158,7 +158,7 @@ class MotionGenerator(Model, nn.Module):
 
         Args:
             config: the recipe.
-            representation: features of a motion.
+            representation: conversion between motions and features.
             actions: names of the actions in the training data.
             facts: additional facts about the training data; see `add_facts`. Default: none.
         """
@@ -230,8 +230,8 @@ class MotionGenerator(Model, nn.Module):
             unconditioned: whether to sample a conditional model with its null condition.
             shared_noise: whether the noise depends only on (seed, replication), so that it is the
                 same for all ids.
-            trajectory: list that receives the normalized clean estimate (B, F, D) of each call of
-                the denoiser.
+            trajectory: list to which the normalized clean estimate (B, F, D) of each call of the
+                denoiser is appended.
 
         Returns:
             Normalized features (B, F, D), which are 0 past the end of each motion.
@@ -251,7 +251,7 @@ class MotionGenerator(Model, nn.Module):
         if self.denoiser.context_frames:
             if edit is not None or windows is not None or trajectory is not None:
                 raise UserError(
-                    "this model continues motions block by block: omit edits, windows and trajectory"
+                    "this model continues motions block by block. Omit edit, windows and trajectory"
                 )
             blocks = Blocks(
                 self,
@@ -270,7 +270,7 @@ class MotionGenerator(Model, nn.Module):
 
         mask, frames = batch.mask, batch.mask.shape[1]
         if windows is None and not self.denoiser.mask_padding:
-            # This denoiser attends to padding, so motions are padded to the same length as in
+            # This denoiser attends to padding, so motions are padded to the length used in
             # training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
@@ -328,7 +328,7 @@ class MotionGenerator(Model, nn.Module):
 
 
 FADE = 0.5
-"""Seconds over which a jump between two blocks of a stream is faded out."""
+"""Time in seconds over which a jump between two blocks of a stream is faded out."""
 
 
 class Blocks:

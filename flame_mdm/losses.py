@@ -14,7 +14,7 @@ CONTACT_SPEED = 0.01
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample.
+    """Returns the mean (B,) of `x` (B, F, ...) over the real frames of each sample.
 
     The mean of a sample without real frames is 0. MDM's code adds 1e-8 to the number of entries,
     which this function omits because it is below the resolution of float32.
@@ -30,7 +30,7 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
-    """Returns the squared error (B,) of a and b (B, F, ...), averaged over real frames.
+    """Returns the squared error (B,) between `a` and `b` (B, F, ...), averaged over real frames.
 
     `mask` is (B, F). Samples have equal weight, whatever their lengths (Tevet et al. 2022, eq. 2,
     averaged as in their code).
@@ -75,7 +75,7 @@ def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> T
 
 
 class MotionLosses(nn.Module):
-    """Weighted geometric losses of MDM, and a bone-length loss.
+    """MDM's geometric losses and a bone-length loss, each with a weight.
 
     Sources: Tevet et al. 2022, eq. 3-5, and Liang et al. 2024, InterGen. All losses are means over
     real frames and entries: the norms in MDM's paper are divided by the number of entries per

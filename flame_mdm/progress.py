@@ -36,7 +36,7 @@ class ProgressBar(tqdm):
 
     @staticmethod
     def status_printer(file: IO[str]) -> Callable[[str], None]:
-        """Returns a function that writes the bar to a file. tqdm itself ends the last line."""
+        """Returns a function that writes the bar to a file. tqdm itself adds the final newline."""
         if file.isatty():
             return tqdm.status_printer(file)
         end = ""

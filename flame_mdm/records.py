@@ -20,7 +20,7 @@ class Value(Schema):
     # Half width of the 95 % interval over replications, or None for a single replication
     ci: Number | None
     replications: Int | None
-    n: Int | None  # motions per replication, or None if the numbers differ
+    n: Int | None  # motions per replication, or None if replications differ
     per_replication: list[Number | None] = Field(default_factory=list)
     n_per_replication: list[Int] = Field(default_factory=list)
     # Number of real motions if the metric compares two sets, or None otherwise
@@ -46,7 +46,7 @@ class Value(Schema):
 
     @property
     def counts(self) -> str:
-        """Numbers of motions as text: "3 x 64", or "64 + 5" if the numbers differ."""
+        """Numbers of motions as text: "3 x 64", or "64 + 5" if replications differ."""
         if len(set(self.n_per_replication)) > 1:
             return " + ".join(map(str, self.n_per_replication))
         return f"{self.replications} x {self.n}"
@@ -55,8 +55,8 @@ class Value(Schema):
 def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
     """Returns the 95 % interval of a value from its bootstrap values, centered at the value.
 
-    See Efron and Tibshirani 1993, section 13.3. Some values, such as Fréchet distances, are larger
-    for sets with repeated motions (section 10.6). The interval is therefore shifted to the value.
+    Source: Efron and Tibshirani 1993, section 13.3. Some metrics, such as Fréchet distances, are
+    larger for sets with repeated motions (section 10.6), so the interval is shifted to the value.
     The interval holds only for sets of the same size.
 
     Example:
@@ -70,7 +70,7 @@ def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
 
 
 class ProtocolVersion(Schema):
-    """The protocol of an evaluation or audit, and the hash of its content."""
+    """The protocol of an evaluation or audit, with the hash of its content."""
 
     name: str
     version: Int
@@ -100,7 +100,7 @@ class ExtractorRecord(Schema):
 
 
 class Checkpoint(Schema):
-    """The checkpoint that generated the motions, its training, and the sampling options."""
+    """The checkpoint that generated the motions, with its training and the sampling options."""
 
     path: str
     sha256: str
@@ -155,19 +155,19 @@ class Measured(Schema):
     values: dict[str, Value | None] | None
     # Reason why a metric was not computed, by metric
     not_computed: dict[str, str]
-    # [] if the values are valid
+    # Reasons why the values are not valid; [] if they are valid
     invalid_because: list[str]
     # Whether the evaluation continued although the values of real motions were not as expected
     forced: bool = False
     warnings: list[str] = Field(default_factory=list)
     cost: Cost | None = None
-    seeds: list[Int] = Field(default_factory=list)  # seeds of the metrics, by replication
+    seeds: list[Int] = Field(default_factory=list)  # seed of the metrics in each replication
 
 
 class Result(Measured):
-    """A result of `flame-mdm evaluate`: values, the evaluated model or motions, and settings."""
+    """A result of `flame-mdm evaluate`: values, settings, and the evaluated model or motions."""
 
-    quick: bool  # not for publication
+    quick: bool  # whether it is a quick run, which is not for publication
     protocol: ProtocolVersion
     changed: dict[str, Plain] = Field({})  # options that differ from the protocol
     split: str

@@ -15,7 +15,7 @@ from flame_mdm.records import Result, read_result
 from flame_mdm.schemas import Int, Number, Schema, check_shape, read_json
 
 CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
-HISTORY = "metrics.jsonl"  # training curves; one line per logged step
+HISTORY = "metrics.jsonl"  # training curves, with one line per logged step
 RESULTS = "evaluation/**/result*.json"
 HISTORY_LIMIT = 256 * safe_io.MEBIBYTE
 """Maximum size of a history file in bytes.
@@ -108,7 +108,7 @@ class Run:
 
     @property
     def samples(self) -> Path | None:
-        """Folder of the samples of the last step, or None if there are no samples."""
+        """Folder with the samples of the last step, or None if there are no samples."""
         folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
         return max(
             (path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None
@@ -135,7 +135,7 @@ def read_run(folder: Path) -> Run:
     """Returns the content of a run directory.
 
     Raises:
-        UserError: If the folder is not a run directory, or a file is damaged.
+        UserError: If the folder is not a run directory or if a file is damaged.
     """
     check_run(folder)
     config = read_saved(folder / CONFIG)
@@ -145,7 +145,9 @@ def read_run(folder: Path) -> Run:
         raise UserError(f"{folder / CONFIG}: not the configuration of a run: {error}") from error
     provenance: Provenance | None = None
     if (folder / PROVENANCE).exists():
-        provenance = read_json(folder / PROVENANCE, Provenance, "delete it; the page then omits it")
+        provenance = read_json(
+            folder / PROVENANCE, Provenance, "delete it, and the page will omit it"
+        )
     results = {
         path.relative_to(folder).as_posix(): read_result(path)
         for path in sorted(folder.glob(RESULTS))
@@ -181,7 +183,7 @@ def records(path: Path) -> list[dict[str, Any]]:
             record: dict[str, Any] = check_shape(json.loads(line), dict[str, float | int])
             if type(record.get("step")) is not int or record["step"] < 0:
                 raise ValueError("it has no integer step")
-            "".join(record).encode()  # fails for a lone surrogate, which cannot be written again
+            "".join(record).encode()  # fails for lone surrogates, which cannot be written again
         except (ValueError, RecursionError) as error:
             raise UserError(
                 f"{path}: line {number} is damaged ({error}). Delete this line"

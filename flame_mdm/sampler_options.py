@@ -45,7 +45,8 @@ class SamplerOptions:
     )
     num_inference_steps: int | Sequence[int] | None = option(
         None,
-        "number of sampling steps; for diffusion also a list of steps, [0,2,5,9]. Default: the recipe's",
+        "number of sampling steps or, for diffusion, a list of steps, such as [0,2,5,9]. "
+        "Default: the recipe's",
     )
     eta: float | None = option(None, "randomness of the sampler ddim, from 0 (default) to 1")
     spacing: str | None = option(
@@ -62,7 +63,7 @@ class SamplerOptions:
         if self.sampler is not None and not isinstance(self.sampler, str):
             raise UserError(f"sampler={self.sampler!r}: expected the name of a sampler")
         if self.spacing is not None and self.spacing not in SPACINGS:
-            raise UserError(f"spacing={self.spacing} is unknown: choose from {', '.join(SPACINGS)}")
+            raise UserError(f"spacing={self.spacing} is unknown. Choose from {', '.join(SPACINGS)}")
         steps = self.num_inference_steps
         listed, least = (steps, 0) if isinstance(steps, list | tuple) else ([steps], 1)
         if steps is not None and not all(

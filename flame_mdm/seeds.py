@@ -2,9 +2,9 @@
 
 A random number depends on its purpose, not on the order in which numbers are drawn.
 
-In a sampling run, each element of a motion's noise is a function of (seed, replication, id) and its
-index. The noise therefore does not depend on the batch, the padding, the number of ranks or the
-device. It is computed by hashing a counter (splitmix64: Steele, Lea and Flood 2014, "Fast
+In a sampling run, each element of a motion's noise is a function of its index and of (seed,
+replication, id). The noise therefore does not depend on the batch, the padding, the number of ranks
+or the device. It is computed by hashing a counter (splitmix64: Steele, Lea and Flood 2014, "Fast
 splittable pseudorandom number generators") and mapping the hash to the normal distribution (Box and
 Muller 1958).
 """
@@ -92,7 +92,7 @@ def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
 def normal(keys: Tensor, frames: int, features: int) -> Tensor:
     """Returns standard normal noise (B, F, D), float32, for keys (B,) int64.
 
-    Element (f, d) of a key does not depend on B or F (Box and Muller 1958).
+    Element (f, d) of the noise for a key does not depend on B or F (Box and Muller 1958).
 
     Example:
         >>> keys = torch.tensor([key("a"), key("b")])
@@ -116,8 +116,8 @@ def seeded_noise(
         ids: B names of the motions.
         frames: number of frames F.
         features: number of features D.
-        seed: seed of the run.
-        replication: index of the replication.
+        seed: seed of the sampling run.
+        replication: index of the replication, used to sample several motions per id.
         like: a tensor whose device and precision the noise should have.
 
     Returns:

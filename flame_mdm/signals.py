@@ -81,7 +81,7 @@ class StopRequest:
         self.handlers = {}
 
     def note(self, signum: int, frame: FrameType | None) -> None:
-        """Records a signal, so that training stops after the step.
+        """Records a signal, so that training stops after the current step.
 
         A second Ctrl-C ends the process at once.
         """
@@ -99,7 +99,7 @@ class StopRequest:
 
 
 def kill_children() -> None:
-    """Kills all child processes, because Python would wait forever for suspended workers."""
+    """Kills all child processes. Otherwise, Python would wait forever for suspended workers."""
     # torch's handler would raise an error for each worker that ends.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     for process in active_children():
@@ -107,5 +107,5 @@ def kill_children() -> None:
 
 
 def ignore_interrupts() -> None:
-    """Ignores Ctrl-C in a worker process, because the parent process handles it."""
+    """Ignores Ctrl-C in a worker process, whose parent process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

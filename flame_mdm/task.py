@@ -1,7 +1,7 @@
 # pyright: standard
 """Lightning modules for training.
 
-The model itself is `flame_mdm.generator.MotionGenerator`.
+They train the models in `flame_mdm.generator`, such as `MotionGenerator`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ class Task(Model, LightningModule):
         super().__init__()
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
-        self.reported: dict[str, Tensor | float] = {}  # values that are logged after this step
+        self.reported: dict[str, Tensor | float] = {}  # values to log after this step
         self.prepare_data_per_node = False  # all machines of a cluster share the data folder
 
     @classmethod
@@ -56,7 +56,7 @@ class Task(Model, LightningModule):
 
         Args:
             config: the recipe.
-            representation: features of a motion.
+            representation: conversion between motions and features.
             actions: names of the actions in the training data.
             facts: additional facts about the training data; see `add_facts`. Default: none.
         """
@@ -177,7 +177,7 @@ class GeneratorTask(Task):
 
     Args:
         parts: the four parts of the generator.
-        losses: weights of `MotionLosses` on the clean estimate.
+        losses: weights of the `MotionLosses` of the clean estimate.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
         cond_drop_prob: probability that a training sample receives the null condition.
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see
@@ -302,7 +302,7 @@ class GeneratorTask(Task):
             self.generator.denoiser.compile()
 
     def on_fit_start(self) -> None:
-        """Samples with a denoiser that returns 0, so that invalid sampling options fail early."""
+        """Samples once, with a denoiser that returns 0, so that invalid options fail early."""
         process = self.generator.process
         like = torch.zeros(1, 2, self.generator.representation.features, device=self.device)
         mask = torch.ones(1, 2, dtype=torch.bool, device=self.device)
@@ -336,7 +336,8 @@ class GeneratorTask(Task):
         )
         if self.targets is not None and targeted is not None:
             cond = replace(cond, target_mask=targeted[1] >= self.targets.drop_prob)
-        # This also happens with probability 0, because DDP requires a gradient for every parameter
+        # Drop conditions even with probability 0, because DDP requires a gradient for every
+        # parameter
         if cond.null is not None:
             cond = cond.drop(self.dropped(batch))
         terms = self.loss_terms(batch, cond)
@@ -345,7 +346,7 @@ class GeneratorTask(Task):
         return terms["loss"].mean()
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws which motions (B,) of a batch receive the null condition."""
+        """Draws, at random, which motions (B,) of a batch receive the null condition."""
         return torch.rand(len(batch), device=self.device) < self.cond_drop_prob
 
     def loss_terms(

@@ -88,8 +88,8 @@ def edit(
 ) -> list[Edited]:
     """Resamples part of a motion and keeps the rest, without additional training.
 
-    Only the `joints` in the frames of `region` are resampled. By default, all joints and all frames
-    are resampled. With `strength`, the result is a variation of the motion rather than a new one.
+    Only `joints` in the frames of `region` are resampled. By default, these are all joints in all
+    frames. With `strength`, the result is a variation of the motion rather than a new one.
 
     Args:
         model: the model, from `flame_mdm.load`.
@@ -105,16 +105,16 @@ def edit(
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
             `method`, `until` and `resample` select how it is resampled. All of them are described
             in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
-            also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
-            changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
+            also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` changes
+            the kept part, too, usually by millimeters; `Edited.joint_error` says by how much.
 
     Returns:
-        The edited motions, `samples` for each text: first all samples of the first text, then all
-            samples of the second text, and so on. The list does not contain the original, which is
-            the attribute `original` of each edited motion.
+        The edited motions, with `samples` motions for each text: all samples of the first text come
+        first, then all samples of the second text, and so on. The list does not contain the
+        original, which is the attribute `original` of each edited motion.
 
     Raises:
-        UserError: If the request is invalid, the process does not support the method, or the
+        UserError: If the request is invalid, if the process does not support the method, or if the
             motion cannot be read or is longer than the training motions.
 
     Example:
@@ -139,7 +139,7 @@ def resolve_edit(
     fps: float | None = None,
     cut: Sequence[float] | None = None,
 ) -> ResolvedEdit:
-    """Reads the motion and determines which of its features `request.editing` keeps.
+    """Reads a motion and determines which of its features `request.editing` keeps.
 
     The docstring of `edit` describes the arguments `motion`, `fps` and `cut`, and the errors.
     """
@@ -182,7 +182,7 @@ def sample_edit(
     assert edit.resolved.edit is not None
     exact = representation.denormalize(edit.resolved.edit.known[0]).cpu().numpy()
     std = representation.std.cpu().numpy()
-    # The features are compared before cleanup, because a cleaned motion has no features.
+    # Features are compared before the cleanup, because cleaned motions have no features.
     uncleaned = replace(edit.resolved, request=replace(request, cleanup=False))
     edits = []
     for motion in sample(model, uncleaned, stages=stages):

@@ -54,22 +54,21 @@ def generate(
             samples; `known` and `keep` have the shape (1, F, D).
         stages: list to which clean estimates of the first motion are appended, at equal intervals
             of the sampling run, followed by the motion itself (MFM, figure 5).
-        keywords: number and length of the motions, and sampling options: `actions` (instead
-            of texts), `seconds` or `frames` (default: 3 seconds, or less for one or two
-            repetitions, as in "kicks twice"), `samples` (1) per text,
-            `candidates` (1) per sample, `seed` (0), `after`, `split` (True), `loop` (False),
-            `targets` or `path`, `shared_noise` (False), `cleanup` (False), and `guidance_scale`,
-            `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the model's).
-            `flame_mdm.sampling.motion_request.SamplingRequest` and
-            `flame_mdm.sampler_options.SamplerOptions` describe them.
+        keywords: fields of `flame_mdm.sampling.motion_request.SamplingRequest`, which describes
+            them: `actions` (instead of texts), `seconds` or `frames` (default: 3 seconds, or less
+            for one or two repetitions, as in "kicks twice"), `samples` per text (1), `candidates`
+            per sample (1), `seed` (0), `after`, `split` (True), `loop` (False), `targets` or
+            `path`, `shared_noise` (False) and `cleanup` (False). The sampler options
+            `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the
+            model's) are described in `flame_mdm.sampler_options.SamplerOptions`.
 
     Returns:
-        The motions, `samples` for each text: first all samples of the first text, then all samples
-            of the second text, and so on.
+        The motions, with `samples` motions for each text: all samples of the first text come first,
+        then all samples of the second text, and so on.
 
     Raises:
-        UserError: If the request is invalid, the model cannot do what is requested, or the model
-            knows no content word of a text.
+        UserError: If the request is invalid, if the model cannot fulfill it, or if the model knows
+            no content word of a text.
 
     Example:
         >>> import flame_mdm

@@ -53,7 +53,7 @@ REGIONS = (
 
 # Text of one part of a sequence and its duration in seconds, which is None if it is not stated
 Part = tuple[str, float | None]
-Waypoints = Sequence[tuple[float, float]]  # x and z in meters
+Waypoints = Sequence[tuple[float, float]]  # (x, z) of each waypoint in meters
 Ranges = Sequence[float] | Sequence[Sequence[float]]
 ARRIVAL = 0.2  # seconds between the last waypoint of a path and the end of the motion
 
@@ -76,7 +76,7 @@ class EditRequest:
         "quarter), suffix (keeps the last quarter), interpolate (keeps every fifth frame), or one or more [begin, end]",
     )
     region_seconds: Ranges | None = option(
-        None, "one or more [begin, end] in seconds, to be used instead of region"
+        None, "one or more [begin, end] in seconds, used instead of region"
     )
     joints: str | Sequence[str] | None = option(
         None,
@@ -182,7 +182,7 @@ class SamplingRequest:
 
     texts: str | Sequence[str] | None = option(
         None,
-        'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)',
+        'what the person does. Actions with seconds: "walks forward @3 | turns around | bows @2"',
     )
     actions: str | Sequence[str] | None = option(
         None, "an action label, for models that were trained on labels"
@@ -195,9 +195,9 @@ class SamplingRequest:
         "training motion if that is shorter",
     )
     frames: int | Sequence[int] | None = option(
-        None, "length in frames, or a list of lengths, to be used instead of seconds"
+        None, "length in frames, or a list of lengths, used instead of seconds"
     )
-    samples: int = option(1, "motions per text or action")
+    samples: int = option(1, "number of motions per text or action")
     candidates: int = option(
         1,
         "number of motions to generate for each motion that is kept. The best motion without "
@@ -206,18 +206,18 @@ class SamplingRequest:
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(None, "motion to continue: FILE or dataset:id")
     split: bool = option(
-        True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"'
+        True, 'true = split sentences such as "walks, then sits" into sequences, "walks | sits"'
     )
     loop: bool = option(False, "true = generate a loop, whose last frame leads to the first one")
     targets: str | Path | Mapping[str, Any] | None = option(
         None, "JSON file with waypoints, joint positions and poses to reach; see docs/targets.md"
     )
     path: str | Waypoints | None = option(
-        None, 'waypoints on the floor, x,z in meters, instead of targets: "0,1 0.5,2"'
+        None, 'waypoints on the floor, such as "0,1 0.5,2" (x,z in meters), used instead of targets'
     )
     shared_noise: bool = option(
         False,
-        "true = use the same noise for all motions, so that they differ only by text and length",
+        "true = use the same noise for all motions, which then differ only by text and length",
     )
     cleanup: bool = option(
         False, "true = smooth the motions, keep bone lengths constant, and keep feet from sliding"
@@ -447,7 +447,7 @@ def read_parts(text: str) -> list[Part]:
 
 
 def is_range(value: Any) -> bool:
-    """Returns whether the value is a pair of finite numbers."""
+    """Returns whether a value is a pair of finite numbers."""
     pair = isinstance(value, list | tuple) and len(value) == 2
     return pair and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
 
@@ -456,7 +456,7 @@ def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
     """Returns the waypoints (x, z), in meters, in a string "x,z x,z ..." or a sequence of pairs.
 
     Raises:
-        UserError: If there are no waypoints, or they cannot be read.
+        UserError: If there are no waypoints or if they cannot be read.
     """
     pairs = [point.split(",") for point in path.split()] if isinstance(path, str) else path
     try:
@@ -472,7 +472,7 @@ def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
 def path_targets(path: Waypoints, seconds: float) -> dict[str, Any]:
     """Returns targets that lead a motion along a path at a constant speed.
 
-    The path starts at x = z = 0.
+    The path starts at x = z = 0. The motion takes `seconds`.
     """
     steps = pairwise([(0.0, 0.0), *path])
     distances = list(accumulate(math.dist(*step) for step in steps))

@@ -90,7 +90,7 @@ class MotionSet(ClosedSchema):
 
 
 def read_set(source: str) -> MotionSet:
-    """Reads a set, given its name, such as "locomotion", or a YAML file.
+    """Reads a set from its name, such as "locomotion", or from a YAML file.
 
     Raises:
         UserError: If the set is invalid.

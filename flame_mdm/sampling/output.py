@@ -18,7 +18,7 @@ from flame_mdm.visualize.body import Mesh
 
 SAMPLES = "samples"  # default folder for motions
 REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
-"""Files that only some requests write."""
+"""Files that are written only for some requests."""
 
 
 def refuse_no_condition(model: MotionGenerator) -> None:
@@ -36,9 +36,9 @@ def refuse_no_condition(model: MotionGenerator) -> None:
 def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:
     """Returns `samples/<experiment>/<title>-<hash>`, where the hash covers the title and `request`.
 
-    Requests for different motions thus have different folders, even if the file system ignores
-    case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint contains a path
-    instead of an experiment name.
+    Requests for different motions therefore use different folders, even on a file system that
+    ignores case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint contains a
+    path instead of an experiment name.
     """
     digest = hashlib.sha256(repr((title, request)).encode()).hexdigest()[:6]
     name = re.sub(r"[^\w]+", "-", title.lower()).strip("-")[:40].strip("-")

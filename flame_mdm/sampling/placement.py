@@ -13,7 +13,7 @@ from flame_mdm.representations.rotation import rotate_y
 
 @dataclass(frozen=True)
 class Placement:
-    """Placement of B bodies in the world: a rotation about the vertical axis and a shift on the floor.
+    """Placement of B bodies: a rotation about the vertical axis and a shift on the floor.
 
     The rotations (B,) are in radians, and the shifts (B, 3) are in meters, with y = 0. Both are
     float64.
@@ -30,10 +30,10 @@ class Placement:
 
     @classmethod
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
-        """Returns the placement that moves poses `local` (B, J, 3) to `world` (B, J, 3).
+        """Returns the placement that best moves the poses `local` (B, J, 3) to `world` (B, J, 3).
 
-        The placement minimizes the squared error (Kabsch 1976, for a rotation about one axis).
-        Heights do not change. If the poses are equal, the error is 0.
+        It minimizes the squared error (Kabsch 1976, for a rotation about one axis). Heights do not
+        change. If the poses are equal, the error is 0.
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])

@@ -14,12 +14,12 @@ from flame_mdm.sampling.motion_request import check_length, read_parts
 
 @dataclass(frozen=True)
 class PromptFile:
-    """A text file with one prompt per line. If some prompts are refused, the others are still sampled.
+    """A text file with one prompt per line. Refused prompts do not keep others from being sampled.
 
     Attributes:
-        path: the name of the file, as typed by the user.
+        path: name of the file, as the user typed it.
         lines: the prompts by line number, which starts at 1. Blank lines are omitted.
-        refused: reasons why prompts cannot be sampled, by line number.
+        refused: for each refused prompt, the reason why it cannot be sampled, by line number.
     """
 
     path: str
@@ -79,7 +79,7 @@ class PromptFile:
         ]
 
     def report(self) -> list[str]:
-        """Returns one line per refused prompt."""
+        """Returns one line per refused prompt, which states the reason."""
         return [
             f"{self.path}, line {number}: {first_line(self.refused[number])}"
             for number in sorted(self.refused)

@@ -40,7 +40,7 @@ class ResolvedPrompt:
         texts: the words of the prompt that belong to each part.
         frames: number of frames of each part. In a continued motion, the first part includes the
             frames that overlap with the previous motion.
-        unknown: words of the text that never occur in the training captions, or that the model does
+        unknown: words of the text that do not occur in the training captions or that the model does
             not read.
         summary: one line that states how the text was understood, or "" if the model's captions may
             describe several actions.
@@ -173,7 +173,7 @@ def _usual_frames(
 
 @contextmanager
 def _collected(refused: dict[int, UserError] | None, number: int) -> Iterator[None]:
-    """Stores a `UserError` about a prompt in `refused`, unless `refused` is None."""
+    """Catches a `UserError` about a prompt and stores it in `refused`, unless `refused` is None."""
     try:
         yield
     except UserError as error:
@@ -205,7 +205,7 @@ def _check_windows(model: MotionGenerator) -> None:
         raise UserError(
             f"representation {name} contains world positions, so the windows of a "
             "sequence do not fit together. "
-            "Use a model of humanml3d features"
+            "Use a model with humanml3d features"
         )
 
 
@@ -262,9 +262,9 @@ def _continued(
 ) -> tuple[Tensor | None, Edit | None, tuple[str, ...]]:
     """Returns the features (F, D) of the motion to continue, the edit, and the motion's notes.
 
-    The edit keeps the end of the motion. The last frames are generated again so that they connect
-    to the new frames. A model that continues frames reads these frames and needs no edit. The notes
-    of a motion in memory are left out because they were already shown when the motion was read.
+    The edit keeps the end of the motion, whose last frames are generated again so that they connect
+    to the new frames. A model that continues frames reads these frames instead and needs no edit.
+    The notes of a motion in memory are omitted, because they were shown when the motion was read.
     """
     if request.after is None:
         return None, None, ()
@@ -290,7 +290,10 @@ def _continued(
 def _targets(
     request: SamplingRequest, model: MotionGenerator, prompts: Sequence[ResolvedPrompt]
 ) -> Targets | None:
-    """Reads the targets of a request. The waypoints of a path are reached at a constant speed."""
+    """Reads the targets of a request.
+
+    A path becomes targets that are reached at a constant speed.
+    """
     if request.path is not None and prompts:
         lengths = {sum(prompt.frames) for prompt in prompts}
         if len(lengths) > 1:

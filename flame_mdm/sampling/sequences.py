@@ -45,7 +45,7 @@ def part_frames(
             state. None stands for `USUAL_SECONDS` or, if that is too long for one window, as many
             frames as fit into it.
         is_sequence: whether the motion is sampled in windows. If not, it has a single part.
-        loop: whether the last frame leads to the first one.
+        loop: whether the last frame should lead to the first one.
 
     Raises:
         UserError: If a part is too short or too long for the model.

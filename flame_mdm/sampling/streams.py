@@ -118,7 +118,7 @@ class Stream(Iterator[Motion]):
 
     @property
     def text(self) -> str:
-        """The text of the next block."""
+        """Text of the next block."""
         condition = self._streams.schedules[0].at(self.frames)
         return self._streams.texts[condition]
 
@@ -165,7 +165,7 @@ class Stream(Iterator[Motion]):
 
     @property
     def reached(self) -> list[int]:
-        """Indices of the frames in which the first waypoints were reached, in order."""
+        """Indices of the frames in which waypoints were reached, in the order of the waypoints."""
         return list(self._streams.waypoints.reached)
 
     def go_back(self, at: float) -> None:
@@ -242,7 +242,7 @@ class OnlineCleanup:
 
 
 class PastBlock(NamedTuple):
-    """A past block of a single stream, which `go_back` can cut.
+    """A past block of a single stream, which `go_back` can shorten.
 
     `begin` is the index of its first frame, and `number` is the index of the block, which
     determines its noise.
@@ -351,7 +351,7 @@ class Streams(Iterator[list[Motion]]):
         self.texts = {condition: condition for condition in conditions}
         self.targets: Targets | None = None
         self.waypoints = Route()
-        self._root = [0.0, 0.0]  # position (x, z) in the world of the first stream's last frame
+        self._root = [0.0, 0.0]  # world (x, z) of the root in the first stream's last frame
         self._encoded: tuple[list[str], Condition] | None = None
         self._past: deque[PastBlock] = deque(maxlen=HELD)
 
@@ -424,12 +424,12 @@ class Streams(Iterator[list[Motion]]):
         ]
 
     def _until_change(self, row: int) -> int:
-        """Returns the number of frames in the next block of a stream."""
+        """Returns the number of frames in the next block of a stream, which may end at a change."""
         change = self.schedules[row].until_change(self.frames[row])
         return self.block if change is None else min(self.block, change)
 
     def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Samples the next block. Each stream keeps the first `kept` frames of the block.
+        """Samples the next block, of which each stream keeps the first `kept` frames.
 
         Returns the normalized features (B, P, D) and the float64 world joint positions (B, P, J,
         3).
@@ -495,7 +495,7 @@ class Streams(Iterator[list[Motion]]):
 
     @torch.no_grad()
     def _encode(self, conditions: list[str]) -> Condition:
-        """Returns the encoded conditions.
+        """Returns the conditions in encoded form.
 
         The texts are encoded again only if they have changed.
         """
@@ -529,7 +529,7 @@ class Streams(Iterator[list[Motion]]):
 
 
 def in_world(representation: Representation, placement: Placement, x: Tensor) -> Tensor:
-    """Decodes normalized features (..., F, D) of a stream to world joint positions (..., F, J, 3)."""
+    """Decodes normalized features (..., F, D) to world joint positions (..., F, J, 3)."""
     joints = representation.to_joints(x)
     turn = placement.turn[0].to(joints).expand(joints.shape[:-1])
     return rotate_y(joints, turn) + placement.shift[0].to(joints)
@@ -538,7 +538,7 @@ def in_world(representation: Representation, placement: Placement, x: Tensor) ->
 def root_target(window: Targets, frames: int, placement: Placement) -> Tensor | None:
     """Returns the target condition (1, 8, 4) for the root position in a block's last frame.
 
-    Returns None if the window has no such target.
+    Returns None if the window contains no such target.
     """
     goal = window.positions
     of_root = (goal.joints == 0) & (goal.frames == frames - 1)

@@ -24,8 +24,7 @@ from flame_mdm.schemas import ClosedSchema, check_shape, read_json
 SMOOTHNESS = 0.2
 # Maximum speed, in meters per second, that waypoints may require
 MAX_SPEED = 8.0
-# Maximum height of a joint above the floor, and maximum horizontal distance of a joint from the
-# body, in meters
+# Maximum height of a joint above the floor and maximum horizontal distance from the body, in meters
 REACH = 2.5
 # Maximum number of coordinates of all targets. Every sampling step solves for all of them together.
 MAX_COORDINATES = 600
@@ -42,20 +41,23 @@ class Timed(ClosedSchema):
 
 
 class Waypoint(Timed):
-    """A position of the root on the floor."""
+    """A position on the floor that the root should reach."""
 
     position: OnFloor
 
 
 class JointTarget(Timed):
-    """A position of a joint in the world."""
+    """A world position that a joint should reach."""
 
     position: Annotated[Sequence[Coordinate], Field(min_length=3, max_length=3)]
     joint: str
 
 
 class PoseTarget(Timed):
-    """A pose from a frame of a motion file, at a given position or anywhere. `heading` is in degrees."""
+    """A pose to reach, taken from a frame of a motion file, at a given position or anywhere.
+
+    `heading` is in degrees.
+    """
 
     position: OnFloor | None = None
     file: str
@@ -93,9 +95,9 @@ class PositionGuide:
     positions: Positions
     # (3, N) frame, parent joint and child joint of each bone whose length is kept
     bones: Tensor
-    # (1, F, D) features that are always imposed
+    # (1, F, D) features of the poses, which are always imposed
     poses: Tensor
-    # (1, F, D) bool, True = the feature is imposed
+    # (1, F, D) bool, True = impose this feature
     keep: Tensor
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
@@ -114,7 +116,7 @@ class PositionGuide:
 class Targets:
     """Positions and poses that motions should reach."""
 
-    # Coordinates in the world
+    # World coordinates that joints should reach
     positions: Positions
     # (frame, features (D,)) of each pose that may be reached anywhere. The features are not
     # normalized.
@@ -133,9 +135,9 @@ class Targets:
         """Returns the targets in a window of `frames` frames from `begin` on.
 
         Frames are counted from the beginning of the window. If the root has a target after the
-        window, an additional target at the end of the window makes the root cover part of the
-        distance, at a constant speed, from its last target in the window or, if there is none, from
-        `here`.
+        window, a target is added at the end of the window: the point that the root reaches by then
+        at a constant speed. The root starts from its last target in the window or, if there is
+        none, from `here`.
 
         Args:
             begin: first frame of the window.
@@ -207,7 +209,7 @@ class Targets:
 
 
 def errors(motion: Motion, targets: Targets) -> np.ndarray:
-    """Returns how far a motion is from each target position, in meters.
+    """Returns the distance in meters between each target position and the motion.
 
     Free coordinates are ignored.
     """

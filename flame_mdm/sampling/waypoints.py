@@ -33,7 +33,7 @@ TIGHTEST = 0.7
 # the person can walk. With a value of 1, a runner would circle around a waypoint, because bends
 # begin slowly.
 ROOM = 1.2
-PATIENCE = 0.4  # time constant, in seconds, of the decay of deviations
+PATIENCE = 0.4  # time constant, in seconds, with which deviations in direction decay
 SMOOTHING = (
     0.3  # weight of a frame in the moving average of steps, which removes the sway of a walk
 )
@@ -60,7 +60,7 @@ def bends(
             forward.
         heading: direction of the body in the first frame in radians, as in `Placement.turn`.
         position: position of the root in the first frame, in meters.
-        points: waypoints in order.
+        points: positions of the waypoints, in order.
         fps: frames per second.
 
     Example:

@@ -73,7 +73,7 @@ class Body:
 
     @cached_property
     def floor(self) -> np.ndarray:
-        """Height (F,) of the floor: the height of the lowest joint within `FLOOR_WINDOW`.
+        """Height (F,) of the floor in meters: the height of the lowest joint within `FLOOR_WINDOW`.
 
         The height may change during a motion, because floors may have steps.
         """
@@ -82,12 +82,12 @@ class Body:
 
     @cached_property
     def height(self) -> np.ndarray:
-        """Heights (F, 22) of all joints above the floor."""
+        """Heights (F, 22) of all joints above the floor, in meters."""
         return self.joints[..., 1] - self.floor[:, None]
 
     @cached_property
     def forward(self) -> np.ndarray:
-        """Direction (F, 2) in x and z that the body faces, given by the hips and shoulders."""
+        """Direction (F, 2) in x and z that the body faces, computed from the hips and shoulders."""
         across = self.joints[:, HIPS[0]] - self.joints[:, HIPS[1]]
         across = across + self.joints[:, SHOULDERS[0]] - self.joints[:, SHOULDERS[1]]
         left = gaussian_filter1d(across[:, [0, 2]], 0.1 * RATE, axis=0, mode="nearest")

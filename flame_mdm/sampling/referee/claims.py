@@ -32,7 +32,7 @@ class Claim:
         when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
             time.
         seconds: claimed duration; None = not stated.
-        parts: the two claims of an order, of which the first one happens earlier.
+        parts: for an order, its two claims, of which the first one happens earlier.
     """
 
     kind: str
@@ -70,8 +70,8 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
     """Returns variants of a claim that are false if the claim is true, with the kinds of change.
 
     The kinds of change are "side", "direction", "speed", "count" (one more, and one fewer),
-    "duration" (twice and half as long), "start or end" (the other end), "posture" (one that
-    excludes the claimed posture at that time) and "order".
+    "duration" (twice as long, and half as long), "start or end" (the other end), "posture" (one
+    that excludes the claimed posture at that time) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]
@@ -90,7 +90,7 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
         wrong += [("duration", replace(claim, seconds=value)) for value in durations if value > 0]
     if claim.when and claim.kind in EXCLUDED:
         wrong.append(("posture", replace(claim, kind=EXCLUDED[claim.kind])))
-    # A person is standing at both ends of most motions.
+    # Most motions begin and end with a standing person.
     if claim.when and claim.kind not in ("upright", "return pose", "return place"):
         wrong.append(("start or end", replace(claim, when=FLIPPED_END[claim.when])))
     return wrong

@@ -46,7 +46,7 @@ class Verdict:
 
     @property
     def group(self) -> str:
-        """The subject of the claim, such as "side" or "count"."""
+        """Subject of the claim, such as "side" or "count"."""
         return group_of(self.claim)
 
     @property
@@ -122,8 +122,8 @@ def judge(
         fps: frames per second; required for joint positions.
 
     Raises:
-        UserError: If the motion has a different skeleton, is shorter than 0.4 seconds, or contains
-            NaN or infinity; if there is no text; or if joints are passed without `fps`.
+        UserError: If the motion has a different skeleton, is shorter than 0.4 seconds or contains
+            NaN or infinity, if there is no text, or if joint positions are passed without `fps`.
     """
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
@@ -140,7 +140,7 @@ def judge(
         )
     if not text or not text.strip():
         raise UserError(
-            "text is missing, and so is the motion's text. Pass the sentence to judge the motion by"
+            "text is missing, and the motion has none. Pass the sentence to judge the motion by"
         )
     return Judgment(text, tuple(verdicts(joints, fps, read_claims(text))))
 
@@ -167,9 +167,9 @@ def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
 
 
 def claim_score(motions: Sequence[Motion]) -> list[float]:
-    """Returns, for each motion, the number of true claims minus the number of false claims.
+    """Returns the number of true claims minus the number of false claims for each motion.
 
-    The claims are read from the motion's own text. The score of a text without claims is 0.
+    The claims are read from the motion's own text. If the text contains no claims, the score is 0.
     """
     judged = [try_judge(motion) for motion in motions]
     return [0.0 if one is None else float(2 * one.true - one.decided) for one in judged]

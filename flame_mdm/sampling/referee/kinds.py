@@ -43,8 +43,9 @@ class Kind:
     """A kind of claim.
 
     Attributes:
-        group: subject of the claims, one of `GROUPS`. A claim about a start, an end, a duration, a
-            side, a direction or a speed belongs to that group instead.
+        group: subject of the claims, one of `GROUPS`. A claim that states a start, an end, a
+            duration, a side, a direction or a speed belongs to the group for that attribute
+            instead.
         measure: function that measures a claim on a body.
         no, yes: thresholds that were set by hand. A claim is false for scores up to `no`, true for
             scores from `yes` on, and undecided in between.
@@ -164,7 +165,7 @@ def thresholds() -> dict[str, Any]:
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns the two thresholds between which a score leaves the claim undecided.
+    """Returns the two thresholds of a claim, between which a score leaves it undecided.
 
     They do not depend on whether the claim is about the start, the end or any time.
     """

@@ -60,8 +60,8 @@ def veer(body: Body, claim: Claim) -> Reading:
 
     The larger of two displacements counts: the displacement from the start, relative to the initial
     heading, and the sum of all sideways steps, relative to the current heading. The reading is
-    unclear if this displacement exceeds 0.2 m and the displacement to the other side is more than
-    half as large.
+    unclear if this displacement exceeds 0.2 m and the displacement to the other side exceeds half
+    of it.
     """
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0
@@ -258,7 +258,7 @@ def count_kicks(body: Body, claim: Claim) -> Reading:
 
 
 def count_punches(body: Body, claim: Claim) -> Reading:
-    """Counts how often a wrist moves away from its shoulder in body coordinates."""
+    """Counts how often a wrist moves away from its shoulder, measured in body coordinates."""
     away = np.linalg.norm(body.seen[:, WRISTS] - body.seen[:, SHOULDERS], axis=-1) / body.reach
     if claim.side in SIDES:
         signal = away[:, SIDES.index(claim.side)]
@@ -276,7 +276,7 @@ def count_punches(body: Body, claim: Claim) -> Reading:
 
 
 def count_raises(body: Body, claim: Claim) -> Reading:
-    """Counts how often a wrist rises by half the length of an arm or more."""
+    """Counts how often a wrist rises by at least half an arm length."""
     above = (body.joints[:, WRISTS, 1] - body.joints[:, SHOULDERS, 1]) / body.reach
     signal = above.max(1)
     if claim.side in SIDES:
@@ -295,7 +295,7 @@ def count_spins(body: Body, claim: Claim) -> Reading:
 
 
 def kick(body: Body, claim: Claim) -> Reading:
-    """Measures the speed of an ankle relative to the pelvis while its foot is higher than the other foot."""
+    """Measures the speed of an ankle relative to the pelvis while its foot is the higher one."""
     higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
     speed = np.where(higher > 0.12, body.foot_speed, 0.0)
     readings = [existence(speed[:, side], "m/s", f"{SIDES[side]} foot", 0.06) for side in (0, 1)]
@@ -311,7 +311,7 @@ def strike(body: Body, claim: Claim) -> Reading:
 
 
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
-    """Compares how much a limb and the other limb of the same kind move.
+    """Compares how much a limb moves with how much its counterpart on the other side moves.
 
     The score is the binary logarithm of the ratio of their movements.
     """

@@ -129,8 +129,8 @@ def counted(
     """Returns a reading of the number of repetitions, counted as peaks of a signal.
 
     Peaks are counted twice, with a lower and a higher minimum depth. The score is 0 if both counts
-    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, it is the
-    negative distance from the claimed count to the nearer count, which is at most -1.
+    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, it is minus
+    the distance from the claimed count to the nearer count, and thus at most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))

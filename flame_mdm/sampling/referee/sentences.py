@@ -1,4 +1,4 @@
-"""Reads the claims in a sentence by rules. Parts that are not understood are ignored.
+"""Rules that read the claims in a sentence. Parts that are not understood are ignored.
 
 The rules aim at precision rather than completeness. The patterns are in `sentences.yaml`, and the
 verb forms are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or
@@ -60,12 +60,15 @@ DIRECTIONS = {
     "forward": "forwards?|forewards?|ahead|straight ahead",
     "backward": "backwards?|backwords?",
 }
-"""Words for a direction of travel. "Walks back" is not listed, because it may mean to return."""
+"""Words for a direction of travel.
+
+"Back" is not listed, because "walks back" may mean to return.
+"""
 
 
 @dataclass(frozen=True)
 class Clause:
-    """A clause, and whether it happens after the previous clause."""
+    """A clause, and whether its events happen after those of the previous clause."""
 
     text: str
     is_later: bool
@@ -178,7 +181,7 @@ def _has(text: str, key: str) -> bool:
 
 
 def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
-    """Adds the duration that a clause states to its claims, as in "stands still for three seconds"."""
+    """Adds the duration that a clause states ("stands still for three seconds") to its claims."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)

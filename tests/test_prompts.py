@@ -92,7 +92,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, mon
     monkeypatch.setitem(sys.modules, "av", None)
     for content, words, message in (
         (None, [], "p.txt: no such file"),
-        (b" \n\t\r\n\n", [], "p.txt: no prompts. Write one per line"),
+        (b" \n\t\r\n\n", [], "p.txt contains no prompts. Write one per line"),
         (b"PK\x03\x04\xff\xfe\x00", [], "p.txt: not a UTF-8 text file"),
         (b"a\n" * 2**20, [], "p.txt: the file is 2 MiB, but at most 1 MiB is allowed"),
         (

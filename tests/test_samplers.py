@@ -597,7 +597,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: expected the name"),
-        ({"spacing": "even"}, "spacing=even is unknown: choose from linspace, stride"),
+        ({"spacing": "even"}, "spacing=even is unknown. Choose from linspace, stride"),
         ({"guidance_scale": math.nan}, "guidance_scale=nan is not a finite number"),
         ({"edit": {"mode": "trajectory"}}, "x0, x_t"),
         (

@@ -1,4 +1,4 @@
-"""Text- and action-conditioned human motion generation: FLAME, MDM and Motion Flow Matching in one framework.
+"""Text- and action-conditioned human motion generation with FLAME, MDM and Motion Flow Matching.
 
 import flame_mdm
 model = flame_mdm.load("runs/quickstart/default")
@@ -44,7 +44,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Imports public names on first use, so that commands answer `--help` without importing torch."""
+    """Imports public names on first use, so that `--help` does not import torch."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -1,4 +1,4 @@
-"""Commands, one file per command; `flame_mdm.__main__` lists them.
+"""Commands, each in its own file; `flame_mdm.__main__` lists them.
 
 This module contains the keys that several commands share.
 """
@@ -60,7 +60,7 @@ def motion_file(key: str, source: str) -> None:
 def finish(failures: Sequence[str], total: int, done: str) -> None:
     """Prints the errors of failed motions, if any, and then exits with code 1.
 
-    `done` is the participle for the error message, such as "converted".
+    `done` is the participle in the error message, such as "converted".
     """
     if failures:
         say(*(f"error: {failure}" for failure in failures), error=True)
@@ -78,7 +78,7 @@ def model_source(key: str, source: str) -> None:
 
 
 def body_name(key: str, body: str) -> None:
-    """Raises `UserError` if `body` is neither mannequin, nor Anny, nor a file."""
+    """Raises `UserError` unless `body` is "mannequin", an Anny body or a file."""
     if body.split()[:1] not in (["mannequin"], ["anny"]) and not Path(body).is_file():
         raise UserError(
             f'{key}={body}: no such file. Use mannequin, a file, or Anny: {key}="anny age=0.9"'
@@ -93,7 +93,7 @@ def device_name(key: str, device: str) -> None:
 
 
 def video(key: str, requested: bool) -> None:
-    """Checks that MP4 files can be written."""
+    """Checks that MP4 files can be written, if they are requested."""
     if requested and find_spec("av") is None:
         raise UserError(
             f'{key}=true: MP4 requires the av package. Run pip install "flame-mdm[video]", or write a GIF'
@@ -129,7 +129,7 @@ class AdaptedSettings(ModelSettings):
     )
     adapter_strength: float | Sequence[float] = option(
         1.0,
-        "strength of all adapters, or a list with one number per adapter; 0 = no effect",
+        "strength of all adapters, or a list with one strength per adapter; 0 = no effect",
     )
 
     def adapters(self) -> dict[str, Any]:
@@ -228,7 +228,7 @@ class WritingSettings:
     def read_character(self) -> Character | BvhCharacter | None:
         """Reads `character`.
 
-        If the names of some joints are unknown, prints the content of a file that the user can
+        If the names of some joints are unknown, prints the draft of a file for the user to
         complete.
         """
         from flame_mdm.formats import characters
@@ -304,7 +304,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         )
 
     def _fields(self, kind: type[Any]) -> dict[str, Any]:
-        """Returns the values of the keys that are fields of a dataclass."""
+        """Returns the values of the keys that are also fields of the dataclass `kind`."""
         return {
             entry.name: getattr(self, entry.name)
             for entry in fields(kind)

@@ -22,7 +22,9 @@ class AdaptSettings(ModelSettings):
     source: str = required("folder of motions with captions; see docs/own-data.md")
     name: str = required("one word for prompts such as 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default: runs/adapt/NAME")
-    action: bool = option(False, "true = the clips show a new action rather than a style")
+    action: bool = option(
+        False, "true = the clips show an action that is new to the model, rather than a style"
+    )
     full: bool = option(
         False, "true = train all weights, which results in a model instead of an adapter"
     )

@@ -42,9 +42,8 @@ class CompareSettings(BodySettings):
     extractor, prints the difference in each metric with its 95 % interval, and whether the
     interval contains 0. Instead of a run, you can name a FOLDER of motion files, such as real
     motions (`browse motions=FOLDER`) or motions from another program. The runs are then sampled
-    for the captions and lengths of these motions. rate=true writes a blind user
-    study instead: a page that asks which of two motions fits a text better. ratings= counts the
-    answers.
+    for the captions and lengths of these motions. rate=true writes a blind user study
+    instead: a page that asks which of two motions fits a text better. ratings= counts the answers.
     """
 
     OBJECTS: ClassVar = ("runs",)
@@ -182,7 +181,7 @@ def _sampled(
         prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
             numbers, or all of them are None, which stands for the default length. Lengths above the
             model's maximum are reduced to it.
-        seed: seed for the noise. If a prompt is listed twice, its motions have different noise.
+        seed: seed of the noise, which differs between the motions of a prompt that is listed twice.
     """
     import torch
 

@@ -34,8 +34,9 @@ MOST_LINES = 20  # maximum number of faults printed per motion; the player shows
 class InspectSettings(BodySettings, FileSettings, DataSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
-    Finds physical faults, such as sliding feet and jumps, in a motion file, in all motion files
-    in a folder, or in a prepared data set. docs/motion-faults.md lists the limits.
+    Finds physical faults, such as sliding feet and jumps, in a motion file, in all motion files in
+    a folder, or in a prepared data set. docs/motion-faults.md lists the limits beyond which
+    something is a fault.
 
     Prints the faults by frame and joint, and writes a player that marks them on its timeline. For a
     data set or a large folder, the player shows only the worst motions (`clips`). Exits with code 3
@@ -44,7 +45,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
 
     OBJECTS: ClassVar = ("motion", "out")
     motion: str = required(
-        "a motion file, a folder of motion files, or the name of a data set, possibly your "
+        "a motion file, a folder of motion files, or the name of a data set, including your "
         "own (data.name)"
     )
     out: str | None = option(None, "HTML file; default: runs/inspect/<name>.html")
@@ -71,7 +72,7 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
 
 
 def main(settings: InspectSettings) -> None:
-    """Prints the faults in motion files and writes a player that shows them."""
+    """Prints the faults in motions and writes a player that shows them."""
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
 

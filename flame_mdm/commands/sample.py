@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 # Maximum number of motions on the page for a prompt file. Each motion takes about 20 kB.
 GALLERY = 200
-CLAIMS = "claims"  # scorer that checks the claims of the text; see docs/referee.md
+CLAIMS = "claims"  # scorer that checks the claims in the text; see docs/referee.md
 
 
 def scorer_source(key: str, source: str) -> None:
@@ -77,7 +77,7 @@ class SampleSettings(OutputSettings, WritingSettings):
     format: str | None = option(None, "format of a set's files: fbx, glb, usda, usdc or usdz")
     scorer: str | None = option(
         None,
-        "how to choose the candidate that best fits the text: claims (most true "
+        "how to choose the candidate that fits the text best: claims (most true "
         "and fewest false claims, see docs/referee.md), or a motion-CLIP (run or file)",
         scorer_source,
     )
@@ -273,7 +273,7 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
 
     options = {entry.name: getattr(settings, entry.name) for entry in fields(SamplerOptions)}
     clips = make_set(loaded.model, content, settings.seed, **options)
-    say(*(f"left out: {name}: {reason}" for name, reason in clips.left_out.items()))
+    say(*(f"omitted: {name}: {reason}" for name, reason in clips.left_out.items()))
     if settings.out is None:
         general = (
             content.model_dump(),

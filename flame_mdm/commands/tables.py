@@ -44,7 +44,7 @@ class TablesSettings:
     batch_size: int = option(64, "motions per batch")
     force: bool = option(
         False,
-        "generate motions even if the metrics of the real motions differ from the values that "
+        "generate motions even if the metrics of real motions differ from the values that "
         "the protocol expects; the result is marked as not valid",
     )
     data_root: str = option(
@@ -90,7 +90,7 @@ def evaluate_missing(
 ) -> list[str]:
     """Runs the evaluations whose results are missing or outdated, and counts motion lengths.
 
-    Returns one line per failure.
+    Returns one line per failed evaluation.
     """
     from evaluators.evaluation import evaluate
     from evaluators.evaluation_request import EvaluationRequest
@@ -126,7 +126,9 @@ def evaluate_missing(
                 name: value for name in names if (value := getattr(settings, name)) is not None
             }
             if "batch_size" in protocol_config(keys["protocol"]):
-                general.pop("batch_size", None)  # protocols that measure time set the batch size
+                general.pop(
+                    "batch_size", None
+                )  # protocols that measure time determine the batch size
             evaluate(EvaluationRequest.of(nodes | general | keys | {"out": str(path)}))
         except (UserError, OSError) as error:
             failed.append(f"{evaluation.label}: {first_line(error)}")
@@ -154,7 +156,7 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
     Args:
         path: path of the result file.
         evaluation: the evaluation that a table requires.
-        values: the values in the result that the tables show.
+        values: names of the values in the result that tables show.
     """
     from evaluators.sources import sample_files, sha256_of_samples
     from flame_mdm.checkpoints.model_files import weights_sha256

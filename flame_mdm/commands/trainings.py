@@ -1,4 +1,4 @@
-"""Training runs of a benchmark, each in its own process, one after the other or in parallel."""
+"""Training runs of a benchmark: each has its own process, and several can run in parallel."""
 
 import os
 import subprocess
@@ -36,14 +36,14 @@ class Training:
 
     @property
     def title(self) -> str:
-        """The arguments on one line."""
+        """The arguments, joined to one line."""
         return " ".join(self.words)
 
 
 def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
     """Returns the training runs of a benchmark.
 
-    A run depends on an earlier run if its configuration contains a path in the earlier run's directory.
+    A run depends on an earlier one if its configuration contains a path in the latter's directory.
     """
     root = [f"data_root={data_root}"] if data_root else []
     trainings: list[Training] = []
@@ -69,8 +69,8 @@ def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
     batches and random draws of a run do not depend on other runs.
 
     Raises:
-        UserError: If a run failed. The other runs are stopped and can be resumed.
-        SystemExit: If a run was interrupted.
+        UserError: If a run fails. The other runs are stopped and can be resumed.
+        SystemExit: If a run is interrupted.
     """
     environment = dict(os.environ)
     if jobs > 1:

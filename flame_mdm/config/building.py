@@ -38,7 +38,7 @@ RENAMED = {
 }
 """Current names of classes, by their names in configurations of version 0.2."""
 ADAPTED = {"flame_mdm.task.GeneratorTask": "flame_mdm.training.adaptation.AdaptationTask"}
-"""Current name of the task that adapts models, by its name in version 0.2.
+"""Current name of the task for adapting models, by its name in version 0.2.
 
 The configuration of this task has a key `base`.
 """
@@ -119,7 +119,7 @@ def movable(config: Config) -> Config:
 
 
 def moved(node: Any, folders: Mapping[str, str]) -> Any:
-    """Returns a configuration in which paths are moved from old to new folders (`folders`)."""
+    """Moves the paths in a configuration to other folders; `folders` maps old to new folders."""
     if isinstance(node, dict):
         return {name: moved(value, folders) for name, value in node.items()}
     folder = next(

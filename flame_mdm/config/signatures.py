@@ -77,7 +77,7 @@ DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that reci
 
 
 def check_top_level(config: Config) -> None:
-    """Raises `UserError` for unknown keys and invalid values outside mappings with a `_target_`."""
+    """Raises `UserError` if a key outside mappings with a `_target_` is unknown or invalid."""
     for key, annotation in TOP_LEVEL.items():
         group, _, name = key.rpartition(".")
         node = config.get(group) if group else config

@@ -40,7 +40,8 @@ from flame_mdm.visualize import player_page
 # Number of open pages for which gradio keeps state. It stores half a megabyte per page, which the
 # demo does not need.
 SESSIONS = 64
-# Maximum number of motion files written at the same time, and of requests waiting for a file
+# Maximum number of motion files that are written at the same time, and maximum number of requests
+# that wait for a file
 WRITERS = 2
 WAITING_FILES = 32
 WAITING_BLOCKS = 32  # maximum number of requests that wait for frames of a stream

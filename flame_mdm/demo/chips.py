@@ -77,7 +77,10 @@ def _step(
 
 
 def _action_label(action: str) -> str:
-    """Returns the words for an action without its usual direction, which another chip may contradict."""
+    """Returns the words for an action without its usual direction.
+
+    Another chip may contradict this direction.
+    """
     return predicate(Mention(action)).removesuffix(f" {actions()[action].usual}")
 
 

@@ -1,4 +1,4 @@
-"""Connections to the demo's server, with deadlines and limits in total and per address."""
+"""Connections to the demo's server, with deadlines and maximum numbers in total and per address."""
 
 import asyncio
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class ConnectionLimits:
 
 
 def server_settings(app: ASGIApp, limits: ConnectionLimits) -> uvicorn.Config:
-    """Returns the settings of a server for `app` with these limits."""
+    """Returns the settings of a server that serves `app` within these limits."""
     options: dict[str, Any] = {
         "http": partial(Connection, limits=limits),
         "ws": "none",

@@ -1,7 +1,7 @@
-// A stream of motion on a page: clock, buffer, texts, waypoints. A source makes the blocks: a server, or a worker on the visitor's device.
-const AHEAD = 1; // seconds that are left when the next block is requested
-const SLOW = 0.15; // seconds that are left when the clock begins to slow down
-const EASE = 0.15; // seconds over which the clock returns to its speed
+// A stream of motion on a page: clock, buffer, texts and waypoints. The blocks come from a source: a server, or a worker on the visitor's device.
+const AHEAD = 1; // seconds of motion that are left when the next block is requested
+const SLOW = 0.15; // seconds of motion that are left when the clock begins to slow down
+const EASE = 0.15; // seconds over which the clock returns to its normal speed
 const LEAD = 0.25; // minimum number of seconds from a new text to the first frame that follows it
 const STEP = 0.1; // maximum clock step in seconds; a hidden page pauses the stream
 const CHIPS = 6; // texts that can be clicked again
@@ -89,10 +89,10 @@ export class Live {
   get fps() { return this.page.fps; }
   get frame() { return Math.floor(this.clock.time * this.fps); }
 
-  /** Seconds that a block takes: the lower median over the last blocks, because the very first block is slow. */
+  /** Seconds that a block takes: the lower median over the last blocks, because the first block is slow. */
   get seconds() { return [...this.times].sort((a, b) => a - b)[(this.times.length - 1) >> 1]; }
 
-  /** The text of the last frames once the pending change has been made. */
+  /** The text of the last frames after the pending change. */
   get next() { return this.pending?.text ?? this.text; }
 
   async timed(request) {

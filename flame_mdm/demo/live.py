@@ -86,12 +86,13 @@ class LiveStreams:
     def block(
         self, name: str, text: str, begin: int, path: Sequence[tuple[float, float]] = ()
     ) -> dict[str, Any]:
-        """Returns the frames of a stream, starting at frame `begin`, in the format of the player.
+        """Returns the frames of a stream from frame `begin` on, in the format of the player.
 
         Args:
             name: name of the stream, or "" to begin a new stream, whose name is in the result.
             text: description of the motion.
-            begin: index of the first frame. Later frames of the stream are dropped.
+            begin: index of the first frame to return. The stream's existing frames from there on
+                are dropped and replaced.
             path: waypoints (x, z) in meters that are still ahead in frame `begin`. `reached` in the
                 result lists the indices of the frames in which waypoints are reached, in order.
 

@@ -1,4 +1,7 @@
-"""Motions for the page. The model handles one request at a time, and the latest results stay in memory."""
+"""Motions for the page.
+
+The model handles one request at a time, and the latest results stay in memory.
+"""
 
 import tempfile
 import time

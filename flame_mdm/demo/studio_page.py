@@ -166,7 +166,7 @@ def build_page(studio: Studio) -> gr.Blocks:
 
 
 def _with_live(studio: Studio, live: LiveStreams) -> SimpleNamespace:
-    """Places the components of the page in a tab, next to the tab of the stream, and returns them."""
+    """Places the page's components in a tab, next to the tab with the stream. Returns them."""
     fps = live.model.representation.fps
     walk = f'data-walk="{WALK}"' if live.can_lead else ""
     with gr.Tabs():

@@ -1,8 +1,8 @@
-"""The training step of the authors' code, GuyTevet/motion-diffusion-model, run from a clone.
+"""Training step of the MDM authors' code, run from a clone of GuyTevet/motion-diffusion-model.
 
 The authors' network, diffusion, optimizer and loss logging are unchanged. CLIP is replaced with a
-stub that returns zeros, as in the framework's step. The body model is left out, because a step on
-HumanML3D does not use it.
+stub that returns zeros, as in the framework's step. The body model is omitted, because a training
+step on HumanML3D does not use it.
 """
 
 import sys
@@ -53,10 +53,10 @@ def authors_step(
     """Returns the authors' training step for HumanML3D, with the defaults of their parser.
 
     Args:
-        repository: path to the clone.
-        width: width of the network.
-        layers: number of its layers.
-        device: cpu or cuda.
+    repository: path of the clone.
+    width: width of the network.
+    layers: number of layers of the network.
+    device: cpu or cuda.
     """
     sys.path.insert(0, repository)
     sys.modules.update(_stubs())
@@ -78,7 +78,7 @@ def authors_step(
 
     create = import_module("utils.model_util").create_model_and_diffusion
     model, diffusion = create(arguments, SimpleNamespace(dataset=SimpleNamespace(num_actions=1)))
-    model.to(device)  # neither `to` nor `train` of the authors' class returns the model
+    model.to(device)  # in the authors' class, neither `to` nor `train` returns the model
     model.train()
     trainer = import_module("diffusion.fp16_util").MixedPrecisionTrainer(model=model)
     optimizer = torch.optim.AdamW(

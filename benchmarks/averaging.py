@@ -21,7 +21,7 @@ DECAY = 0.999
 
 
 def updates(network: nn.Module) -> dict[str, Callable[[], object]]:
-    """Returns functions that each update an average of the network's weights once."""
+    """Returns, by name, functions that update the averaged weights of a network once."""
     average: Any = MovingAverage(DECAY)
     average._average_model = AveragedModel(network)
     average.on_train_start(None, network)
@@ -49,7 +49,7 @@ def updates(network: nn.Module) -> dict[str, Callable[[], object]]:
 
 
 def measure(settings: Settings) -> Section:
-    """Times the moving average of weights and returns the page section."""
+    """Times updates of the averaged weights and returns the page section."""
     rounds = 1 if settings.quick else 100
     rows: list[Row] = []
     faster: dict[str, float] = {}
@@ -69,10 +69,10 @@ def measure(settings: Settings) -> Section:
             rows.append(row | {"ratio": taken / times["framework"]})
     return section(
         "Averaged weights",
-        f"""The table shows the time of one update of the exponential moving average of all weights. Values are
+        f"""The table shows the time that one update of the exponential moving average of all weights takes. Values are
         medians of {rounds} alternating updates. The framework updates all weights in one call.""",
-        f"The update of the averaged weights is {faster['quickstart']:.1f} times as fast as Lightning's in the "
-        f"quickstart, and {faster['full size']:.1f} times at full size.",
+        f"Updating the averaged weights is {faster['quickstart']:.1f} times as fast as with Lightning's callback for "
+        f"the quickstart, and {faster['full size']:.1f} times as fast at full size.",
         {"updates": rows},
     )
 

@@ -1,9 +1,10 @@
-"""Times an evaluation at HumanML3D's size without networks: `python benchmarks/evaluation.py`.
+"""Times an evaluation of HumanML3D's size without networks: `python benchmarks/evaluation.py`.
 
-A protocol measures random motions with HumanML3D's lengths (40 to 196 frames at 20 frames per
-second, 22 joints). The extractor returns 512 numbers from the motion and 512 random text features.
-The source returns other windows of the same clips. The remaining time is the cost of the evaluation
-itself: reading and decoding motions, and computing metrics. FID is also compared with torchmetrics'
+A protocol evaluates random motions with HumanML3D's lengths (40 to 196 frames at 20 frames per
+second, 22 joints). No network is called: the extractor returns 512 numbers from the motion and 512
+random numbers for the text, and the source of generated motions returns other windows of the same
+clips. The measured time is therefore the cost of the evaluation itself: reading and decoding
+motions, and computing metrics. The framework's FID is also compared with torchmetrics'
 implementation on the same features.
 """
 
@@ -33,7 +34,7 @@ TORCHMETRICS, FRAMEWORK = "torchmetrics' FrechetInceptionDistance", "framework"
 
 
 class Stub(Extractor):
-    """An extractor without a network: the first numbers of a motion, and random features for captions."""
+    """An extractor without a network. It returns the first numbers of a motion, and random features for captions."""
 
     sha256 = "stub"
 
@@ -49,7 +50,7 @@ class Stub(Extractor):
         return {"features": features[:, :2].flatten(1)[:, :WIDTH]}
 
     def texts(self, captions: Sequence[str], tokens: Any) -> Tensor:
-        """Returns a row of random numbers per caption."""
+        """Returns one row of random numbers for each caption."""
         return self.table[[self.rows[caption] for caption in captions]]
 
 
@@ -96,7 +97,7 @@ def random_clips(count: int) -> Clips:
 
 
 class Identity(nn.Module):
-    """An extractor for torchmetrics whose "images" are already features."""
+    """A feature extractor for torchmetrics that returns its inputs, because they are already features."""
 
     num_features = WIDTH
 
@@ -106,7 +107,12 @@ class Identity(nn.Module):
 
 
 def fid(motions: int, rounds: int) -> list[Row]:
-    """Times FID on batches of features, in the framework and in torchmetrics."""
+    """Times the FID of two sets of random features, computed by the framework and by torchmetrics.
+
+    Args:
+        motions: number of features per set.
+        rounds: number of timed rounds.
+    """
     generated, real = torch.randn(motions, WIDTH), torch.randn(motions, WIDTH) + 0.1
 
     def torchmetrics() -> Tensor:
@@ -132,7 +138,7 @@ def fid(motions: int, rounds: int) -> list[Row]:
 
 
 def measure(settings: Settings) -> Section:
-    """Times an evaluation without its extractor and returns the page section."""
+    """Times an evaluation without networks and returns the page section."""
     motions, rounds = (40, 1) if settings.quick else (4600, 3)
     torch.manual_seed(0)
     clips = random_clips(motions)
@@ -160,10 +166,10 @@ def measure(settings: Settings) -> Section:
         f"""`{PROTOCOL}` runs without networks on {motions:,} motions with HumanML3D's lengths, in
         {protocol.replications} replications, {repeated} of which measure multimodality. The time is spent on
         reading and decoding motions, and on metrics. The process has {torch.get_num_threads()} threads, and values
-        are medians of {rounds} alternating rounds. FID alone is computed from {motions:,} features of width {WIDTH}
-        in batches of {BATCH}, with medians of 10 alternating rounds.""",
-        f"An evaluation at HumanML3D's size takes {total / 60:.1f} minutes plus the networks; torchmetrics' FID "
-        f"takes {distances[0]['ratio']:.1f} times as long as the framework's.",
+        are medians of {rounds} alternating rounds. For FID alone, {motions:,} features of width {WIDTH} are passed in
+        batches of {BATCH}, and values are medians of 10 alternating rounds.""",
+        f"An evaluation of HumanML3D's size takes {total / 60:.1f} minutes, not counting the networks. torchmetrics "
+        f"takes {distances[0]['ratio']:.1f} times as long as the framework to compute FID.",
         {"protocol": table, "FID alone": distances},
     )
 

@@ -1,15 +1,15 @@
 """Times the framework's share of a training step: `python benchmarks/host.py`.
 
-The network is a transformer with one layer of width 16 and no text encoder, so that most of the
-time is spent outside the network. The framework is compared with bare Lightning. Bare Lightning
-trains the same network with the same masked loss, fused optimizer and clipping on batches that are
-in memory. It logs nothing and has no averaged weights, loggers or checkpoints. All measurements run
-on one thread and alternate.
+The network is a transformer with one layer of width 16 and no text encoder, so most of the time is
+spent outside the network. The framework is compared with bare Lightning, which trains the same
+network with the same masked loss, fused optimizer and gradient clipping on batches in memory. Bare
+Lightning logs nothing and has no averaged weights, loggers or checkpoints. All measurements run on
+one thread and alternate.
 
-The time of a step is the mean over all steps after the first ones, so that it also includes work
-that serves several steps: planned batches, logged values, and checks of the losses. Times are
-thread times, which exclude other programs on the machine. The parts of the framework's step are
-timed one by one, without Lightning.
+The time of a step is the mean over all steps after the first `WARM` steps. It therefore includes
+work that is done once for several steps, such as planning batches, logging values and checking
+losses. Times are thread times, which exclude other programs on the machine. The parts of the
+framework's step are timed one by one, without Lightning.
 """
 
 import io
@@ -64,18 +64,18 @@ BATCHES = 16  # distinct batches for bare Lightning and for the plain loop
 
 
 class Measured(Exception):
-    """Ends training without the work that follows the last step."""
+    """Raised to end training as soon as the last step has been timed."""
 
 
 class Clock(Callback):
-    """Measures the mean thread time between the ends of steps."""
+    """Measures the mean thread time from the end of one step to the end of the next."""
 
     def __init__(self, steps: int) -> None:
         self.first, self.last = min(WARM, steps // 2), steps
         self.step, self.begin, self.seconds = 0, 0.0, 0.0
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Reads the clock after the first steps, and ends training after the last one."""
+        """Starts the clock after the warm-up steps, and ends training after the last step."""
         self.step += 1
         if self.step == self.first:
             self.begin = time.thread_time()
@@ -85,7 +85,7 @@ class Clock(Callback):
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """Runs training until its last step is measured."""
+        """Ends the training in its block without an error as soon as the last step is measured."""
         try:
             yield
         except Measured:
@@ -94,12 +94,12 @@ class Clock(Callback):
 
 
 def log_interval() -> int:
-    """Returns the number of steps between logged values in the framework."""
+    """Returns the number of steps after which the framework logs values."""
     return compose("quickstart", TINY)["trainer"]["log_every_n_steps"]
 
 
 def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
-    """Returns the batches and the task with which the framework trains."""
+    """Returns batches drawn by the framework, and the task that it trains."""
     config = compose("quickstart", [*TINY, f"data_root={folder / 'data'}"])
     representation = instantiate(config["representation"])
     data: Any = instantiate(config["data"], representation=representation, seed=0)
@@ -110,7 +110,7 @@ def built(folder: Path) -> tuple[list[MotionBatch], GeneratorTask]:
 
 
 def loss_of(task: GeneratorTask, batch: MotionBatch) -> Tensor:
-    """Returns the loss of a batch, computed without Lightning."""
+    """Returns the mean loss of a batch, computed without Lightning."""
     model = task.generator
     cond = model.condition(batch)
     return model.process.loss(model.denoiser, batch.x, batch.mask, cond, auxiliary=task.losses)[
@@ -137,7 +137,7 @@ class Bare(LightningModule):
 
 
 def bare(steps: int, folder: Path) -> float:
-    """Returns seconds per step for bare Lightning."""
+    """Trains with bare Lightning and returns the time per step in seconds."""
     batches, task = built(folder)
     stream = itertools.islice(itertools.cycle(batches), steps)
     clock = Clock(steps)
@@ -158,7 +158,13 @@ def bare(steps: int, folder: Path) -> float:
 
 
 def framework(steps: int, folder: Path, *words: str) -> float:
-    """Returns seconds per step for the complete framework."""
+    """Trains with the complete framework and returns the time per step in seconds.
+
+    Args:
+        steps: number of training steps.
+        folder: folder for the data and the run.
+        words: additional overrides of the recipe.
+    """
     run = Path(tempfile.mkdtemp(dir=folder))
     words = (
         *TINY,
@@ -177,7 +183,7 @@ def framework(steps: int, folder: Path, *words: str) -> float:
 
 
 def loop(steps: int, folder: Path) -> float:
-    """Returns seconds per step for a plain PyTorch loop that trains the same network."""
+    """Trains the same network in a plain PyTorch loop and returns the time per step in seconds."""
     batches, task = built(folder)
     optimizer, parameters = task.make_optimizer(), list(task.parameters())
     clock = Clock(steps)
@@ -192,7 +198,7 @@ def loop(steps: int, folder: Path) -> float:
 
 
 def parts(steps: int, folder: Path) -> dict[str, float]:
-    """Returns the median seconds for each part of a step."""
+    """Returns the median time of each part of a step, in seconds."""
     batches, task = built(folder)
     model = task.generator
     optimizer, parameters = task.make_optimizer(), list(task.parameters())
@@ -254,14 +260,14 @@ def measure(settings: Settings) -> Section:
     whole, without = (times[name] / times[BARE] for name in (FRAMEWORK, PLAIN))
     return section(
         "Host cost of a training step",
-        f"""The network is tiny: one transformer layer of width 16, no text encoder, and batches of 4 clips. A step
-        does almost no arithmetic, so its time is the call overhead of torch, the framework and Lightning. Bare
-        Lightning trains the same network with the same masked loss, fused optimizer and clipping on batches that are
-        in memory. It logs nothing and has no averaged weights, loggers or checkpoints. The complete framework cuts
-        and gathers its batches, checks losses, averages weights, shows its progress and logs every
-        {log_interval()} steps. Values are medians of {rounds} alternating runs of {steps} steps on one thread, in
-        mean thread time per step. The second table times the parts of the framework's step one by one, outside of
-        Lightning.""",
+        f"""The network is tiny: it has one transformer layer of width 16 and no text encoder, and is trained on batches
+        of 4 clips. A step does almost no arithmetic, so its time is the call overhead of torch, the framework and
+        Lightning. Bare Lightning trains the same network with the same masked loss, fused optimizer and gradient
+        clipping on batches in memory. It logs nothing and has no averaged weights, loggers or checkpoints. The
+        complete framework cuts and gathers its batches, checks losses, averages weights, shows its progress and logs
+        every {log_interval()} steps. Each run takes {steps} steps on one thread, and the mean thread time per step is
+        measured. Values are medians of {rounds} alternating runs. For the second table, the parts of the framework's
+        step are timed one by one, without Lightning.""",
         f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms, {whole:.2f} times as long as in bare "
         f"Lightning with the same network, and {without:.2f} times as long without averaged weights.",
         {"steps": ratios(times, BARE, "training"), "parts of the framework": shares},

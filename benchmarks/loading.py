@@ -1,11 +1,11 @@
-"""Times two ways of loading batches, compared with a training step: `python benchmarks/loading.py`.
+"""Compares two ways of loading batches with a training step: `python benchmarks/loading.py`.
 
-A synthetic data set is packed into a temporary folder. Three measurements alternate: batches
-gathered from memory (data.resident=true), batches of the data loader in the training process, and
-training steps of the small MDM encoder (forward pass, backward pass and update). They are measured
-in CPU time on one core, which excludes other programs on the machine. Loading with workers is
-measured in wall time, which includes passing batches between processes and depends on the load of
-the machine.
+A synthetic data set is prepared in a temporary folder. Three measurements alternate: batches
+gathered from memory (data.resident=true), batches from a data loader in the training process, and
+training steps of the small MDM encoder (forward pass, backward pass and update). Their CPU time on
+one core is measured, which excludes other programs on the machine. For data loaders with workers,
+wall time is measured instead. Wall time includes passing batches between processes and depends on
+the load of the machine.
 """
 
 import itertools
@@ -31,7 +31,7 @@ STEP, LOADER, RESIDENT = "step", "loader, one core", "resident, one core"
 
 
 def training(features: int) -> Callable[[MotionBatch], None]:
-    """Returns a training step (forward, backward, update) of MDM's encoder in its CPU size."""
+    """Returns a training step (forward pass, backward pass, update) of the small MDM encoder."""
     model = MDMEncoder(
         features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0
     )
@@ -48,14 +48,20 @@ def training(features: int) -> Callable[[MotionBatch], None]:
 
 
 def batches_of(data: MotionDataModule, resident: bool, workers: int = 0) -> Iterator[MotionBatch]:
-    """Returns the training batches of a data set, kept on the device or loaded by workers."""
+    """Returns an iterator over training batches.
+
+    Args:
+        data: the data set.
+        resident: True gathers batches from memory, and False loads them with a data loader.
+        workers: number of worker processes of the data loader.
+    """
     data.resident, data.num_workers = resident, workers
     data.setup("fit")
     return iter(data.train_dataloader())
 
 
 def measure(settings: Settings) -> Section:
-    """Times the batches of a data set and returns the page section."""
+    """Times the loading of batches and returns the page section."""
     clips, count, rounds = (100, 3, 1) if settings.quick else (1000, 20, 10)
     torch.manual_seed(0)
     torch.set_num_threads(1)
@@ -93,12 +99,12 @@ def measure(settings: Settings) -> Section:
     frames = statistics.mean(batch.x.shape[1] for batch in shown)
     gather, load = times[RESIDENT] / count, times[LOADER] / count
     return section(
-        "Loading of batches",
-        f"""A batch has {BATCH} clips with {lengths:.0f} frames of {shown[0].x.shape[2]} features on average, padded
-        to {frames:.0f} frames. Resident batches (`data.resident=true`) are gathered from memory. The loader collates
-        clips in the training process or in workers. A training step of the small MDM encoder takes
-        {1000 * wait:.0f} ms on one core. The target is {GOAL:,} clips per second per worker. Values are medians of
-        {rounds} alternating rounds of {count} batches.""",
+        "Batch loading",
+        f"""A batch contains {BATCH} clips with {shown[0].x.shape[2]} features per frame. The clips have
+        {lengths:.0f} frames on average and are padded to {frames:.0f} frames. Resident batches (`data.resident=true`)
+        are gathered from memory. The loader collates clips in the training process or in workers. A training step of
+        the small MDM encoder takes {1000 * wait:.0f} ms on one core. The target is {GOAL:,} clips per second per
+        worker. Values are medians of {rounds} alternating rounds of {count} batches.""",
         f"A resident batch is ready {load / gather:.1f} times as fast as a batch from the loader, and takes "
         f"{gather / wait:.1%} of the time of a small training step.",
         {"batches": rows},
@@ -106,7 +112,14 @@ def measure(settings: Settings) -> Section:
 
 
 def _row(name: str, seconds: float, step: float, workers: int) -> Row:
-    """Returns the speed of one loader, and its ratios to a training step and to the target."""
+    """Returns a table row with the speed of one loader, compared with a training step and with the target.
+
+    Args:
+        name: label of the loader.
+        seconds: time per batch.
+        step: time of a training step in seconds.
+        workers: number of workers.
+    """
     rate = BATCH / seconds
     return {
         "batches": name,

@@ -1,10 +1,10 @@
-"""Measures the speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py`.
+"""Measures the speed and memory use of `make prepare` for several data set sizes: `python benchmarks/preparation.py`.
 
 For each size, a new process prepares synthetic clips of about 51 frames in a temporary folder (1.1
-KB of disk per frame), with one worker per core. The results are the total CPU time of all
-processes, the maximum resident memory of the main process and of its largest worker, and the
-private part of each, which is not shared with other processes and is sampled. Another result is the
-number of bytes per frame by which the main process grows.
+KB of disk space per frame), with one worker per core. The script reports the total CPU time of all
+processes, and the maximum resident memory of the main process and of the largest worker. It also
+reports their private memory, which is not shared with other processes and is sampled at intervals,
+and the number of bytes per frame by which the main process grows.
 """
 
 import json
@@ -33,7 +33,7 @@ def private(process: int) -> int:
 
 
 class Peaks(threading.Thread):
-    """Samples the private memory of this process and of its largest worker."""
+    """A thread that tracks the maximum private memory, in bytes, of this process and of any of its workers."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -41,7 +41,7 @@ class Peaks(threading.Thread):
         self.done = threading.Event()
 
     def run(self) -> None:
-        """Records the maximum memory of this process and of its children until `done` is set."""
+        """Samples the memory of this process and of its children every half second until `done` is set."""
         while not self.done.wait(0.5):
             workers = [private(child.pid or 0) for child in multiprocessing.active_children()]
             self.main = max(self.main, private(multiprocessing.current_process().pid or 0))
@@ -49,7 +49,7 @@ class Peaks(threading.Thread):
 
 
 def prepare(clips: int) -> None:
-    """Prepares clips in this process, and prints frames, CPU seconds and bytes of memory as JSON."""
+    """Prepares clips in this process, and prints the number of frames, CPU seconds and bytes of memory as JSON."""
     from flame_mdm.data.store import write_store
     from flame_mdm.data.synthetic import Synthetic
     from flame_mdm.representations.humanml import HumanML
@@ -73,7 +73,7 @@ def prepare(clips: int) -> None:
 
 
 def measure(settings: Settings) -> Section:
-    """Measures the time and memory needed to prepare large data sets, and returns the page section."""
+    """Measures the time and memory that the preparation of large data sets takes, and returns the page section."""
     rows: list[Row] = []
     growth: list[tuple[float, float]] = []
     for size in [2000] if settings.quick else [125_000, 500_000]:
@@ -97,10 +97,10 @@ def measure(settings: Settings) -> Section:
     (few, small), (many, large) = growth[0], growth[-1]
     per_frame = (large - small) / (many - few) if many > few else 0
     return section(
-        "Preparation of a data set",
-        f"""`make prepare` runs on synthetic clips of about {FRAMES_PER_CLIP} frames, with one worker per core. Times
+        "Data set preparation",
+        f"""`make prepare` converts synthetic clips of about {FRAMES_PER_CLIP} frames, with one worker per core. Times
         are CPU seconds, summed over all processes. Memory is the maximum during the run.""",
-        f"One core prepares {rows[-1]['clips per second per core']:,.0f} clips per second; memory grows by "
+        f"One core prepares {rows[-1]['clips per second per core']:,.0f} clips per second, and memory grows by "
         f"{per_frame:.0f} bytes per frame.",
         {"sizes": rows},
     )

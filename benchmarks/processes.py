@@ -1,10 +1,10 @@
 """Times training steps with one process and with two gloo processes: `python benchmarks/processes.py`.
 
-Both runs use the same batches of 16 clips: one process has all 16 clips, and two processes
-have 8 clips each. Each process has one thread. With one core per process, the ideal ratio is 0.5.
-Two processes on one core cannot be below 1. The overhead consists of reducing the gradients and
-waiting for the slower process. Times are measured between steps, so that they do not include
-imports.
+Both runs use the same batches of 16 clips. A single process receives all 16 clips, and each of two
+processes receives 8 clips. Each process has one thread. With one core per process, the ideal ratio
+of the times is 0.5. If two processes share one core, the ratio cannot be below 1. The overhead
+consists of reducing the gradients and waiting for the slower process. Times are measured from the
+end of one step to the end of the next, so they do not include imports.
 """
 
 import json
@@ -51,7 +51,14 @@ class Clock(Callback):
 
 
 def step_seconds(folder: Path, processes: int, steps: int, number: int) -> float:
-    """Returns the median time between steps in seconds."""
+    """Trains with one or two processes and returns the median time per step in seconds.
+
+    Args:
+        folder: folder for the run, which contains clock.py.
+        processes: 1 or 2.
+        steps: number of training steps; the first fifth is not counted.
+        number: number of the round, for the name of the run.
+    """
     words = [
         "quickstart",
         *QUIET,
@@ -92,9 +99,9 @@ def measure(settings: Settings) -> Section:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return section(
         "Two processes",
-        f"""The same batches of {CLIPS} clips are used by one process, and by two processes with {CLIPS // 2} clips
-        each (DDP, gloo), with one thread per process, on {cores} cores. With one core per process, the ideal ratio
-        is 0.5. Values are medians of {rounds} alternating runs of {steps} steps.""",
+        f"""The same batches of {CLIPS} clips are processed by one process, and by two processes with {CLIPS // 2} clips
+        each (DDP, gloo). Each process has one thread, and the machine has {cores} cores. With one core per process,
+        the ideal ratio is 0.5. Values are medians of {rounds} alternating runs of {steps} steps.""",
         f"For the same batch, two processes take {two / one:.2f} times as long as one process.",
         {"steps": ratios({"one": one, "two": two}, "one", "processes")},
     )

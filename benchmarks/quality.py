@@ -1,9 +1,9 @@
 """Compares the quality of models trained at both speeds: `make bench ONLY=quality RUNS=FOLDER`.
 
-This script trains nothing. It reads the runs in a folder, which were trained by `make train ...
-speed=...` and evaluated by `make evaluate`, with two or more seeds per data set and speed. The
-figures are means over the seeds with 95 % intervals by Student's t. Differences are between runs
-with the same seed, which begin with the same weights and use the same batches.
+This script does not train models. It reads the runs in a folder, which must have been trained with
+`make train ... speed=...` and evaluated with `make evaluate`, with at least two seeds per data set
+and speed. Values are means over the seeds, with 95 % intervals by Student's t. Differences are
+computed between runs with the same seed, which begin with the same weights and use the same batches.
 """
 
 import statistics
@@ -29,7 +29,7 @@ BySeed = dict[int, dict[str, float]]  # seed -> metric -> value
 
 
 def values(run: Run) -> dict[str, float]:
-    """Returns the final validation loss of a run and the metrics of its newest result."""
+    """Returns the final validation loss of a run, and the metrics of its latest evaluation, by label."""
     losses = run.curves.get("val/loss", {})
     result = list(run.results.values())[-1].values if run.results else None
     if not losses or not result:
@@ -46,7 +46,7 @@ def values(run: Run) -> dict[str, float]:
 
 
 def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
-    """Returns the values of the runs in a folder, by training setup (with its data set), speed and seed."""
+    """Returns the values of all runs in a folder, by training setup (data set, steps, decay), speed and seed."""
     runs: dict[str, dict[str, BySeed]] = {}
     for path in sorted(folder.glob(f"*/{CONFIG}")):
         run = read_run(path.parent)
@@ -57,26 +57,34 @@ def read_runs(folder: Path) -> dict[str, dict[str, BySeed]]:
         speeds[config["run"].get("speed", "reference")][config["seed"]] = values(run)
     if not runs:
         raise SystemExit(
-            f"{folder}: contains no runs. docs/speed.md lists the commands that train and evaluate them"
+            f"{folder}: contains no runs. Train runs with `make train ... speed=...`, and evaluate them"
         )
     return runs
 
 
 def shown(mean: float, half: float, sign: str = "") -> str:
-    """Returns a mean and a half width as text, rounded to two significant digits of the half width."""
+    """Returns a mean and the half width of its interval as text.
+
+    Both are rounded to two significant digits of the half width.
+
+    Args:
+        mean: the mean.
+        half: half the width of its interval.
+        sign: "+" also shows the sign of positive means.
+    """
     decimals = next((count for count in range(6) if half >= 10 ** (1 - count)), 6 if half else 2)
     return f"{mean:{sign},.{decimals}f} ± {half:,.{decimals}f}"
 
 
 def interval(sample: Sequence[float]) -> tuple[float, float]:
-    """Returns the mean of two or more numbers, and the half width of its 95 % interval by Student's t."""
+    """Returns the mean of at least two numbers, and half the width of its 95 % interval by Student's t."""
     count = len(sample)
     quantile = float(t.ppf(0.975, count - 1))
     return statistics.mean(sample), quantile * statistics.stdev(sample) / count**0.5
 
 
 def measure(settings: Settings) -> Section:
-    """Compares the metrics of runs that differ only in speed, and returns the page section."""
+    """Compares the metrics of runs that differ only in their speed, and returns the page section."""
     folder = Path(settings.runs or ".")
     tables: dict[str, list[Row]] = {}
     differing: list[str] = []
@@ -84,7 +92,7 @@ def measure(settings: Settings) -> Section:
         seeds = sorted(speeds["reference"])
         if len(seeds) < 2 or seeds != sorted(speeds["fast"]):
             raise SystemExit(
-                f"{folder}: {name}: requires two or more seeds, the same at both speeds"
+                f"{folder}: {name}: requires at least two seeds, the same at both speeds"
             )
 
         rows = tables.setdefault(f"{name}, {len(seeds)} seeds", [])
@@ -104,10 +112,10 @@ def measure(settings: Settings) -> Section:
     equal = total - len(differing)
     others = f"; the others: {', '.join(differing)}" if differing else ""
     return section(
-        "Quality in both speeds",
-        """Models are trained at each speed with several seeds, and evaluated once on the test motions. Values are means
-        over the seeds, with 95 % intervals by Student's t. The differences are between runs with the same seed, which
-        begin with the same weights and see the same batches. [Commands](../speed.md#quality).""",
-        f"For {equal} of {total} quality figures, the interval of `fast` − `reference` contains 0{others}.",
+        "Quality at both speeds",
+        """At each speed, models are trained with several seeds and evaluated once on the test motions. Values are means
+        over the seeds, with 95 % intervals by Student's t. Differences are computed between runs with the same seed,
+        which begin with the same weights and use the same batches.""",
+        f"For {equal} of {total} quality figures, the 95 % interval of `fast` − `reference` contains 0{others}.",
         tables,
     )

@@ -1,9 +1,9 @@
 """Measures the speed of the framework and writes docs/benchmarks/speed.md: `make bench [ONLY=a,b] [DEVICE=cuda]`.
 
-The scripts run one after another, each in its own process. With ONLY, all other sections keep their
-figures. DEVICE=cuda measures the sections that use a GPU, which are added to the page.
-MDM_REPO=PATH, a clone of the authors' code, adds the authors' training step. ONLY=quality
-RUNS=FOLDER compares the quality of trained runs.
+The scripts run one after another, each in its own process. ONLY selects sections; all other
+sections keep their figures. DEVICE=cuda measures the sections that use a GPU and adds them to the
+page. MDM_REPO=PATH, the path of a clone of the authors' code, adds the authors' training step.
+ONLY=quality RUNS=FOLDER compares the quality of trained runs.
 """
 
 import datetime
@@ -43,15 +43,15 @@ HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
 a ratio of measurements that alternate in one run, on an idle machine unless the section states otherwise. The absolute
-figures next to it hold only for that machine. `make bench ONLY=host,steps` repeats some sections, and `make bench
-DEVICE=cuda` adds the sections of a GPU. With `MDM_REPO=PATH`, a clone of the authors' code, the authors' training step
-is also measured. A section that names a commit has not been measured again since. Another page explains [which options
-to choose](../speed.md).
+figures next to each ratio hold only for that machine. `make bench ONLY=host,steps` repeats only these sections, and
+`make bench DEVICE=cuda` adds the sections that are measured on a GPU. If `MDM_REPO` is the path of a clone of the
+authors' code, their training step is also measured. A section that names a commit has not been measured since that
+commit. [Speed of training](../speed.md) explains which options to choose.
 """
 
 
 def machine() -> dict[str, str | int]:
-    """Returns the hardware and software versions on which a measurement depends."""
+    """Returns the properties of the hardware and the software versions that affect the measurements."""
     capabilities, software = torch.cpu.get_capabilities(), environment()
     has_affinity = hasattr(os, "sched_getaffinity")
     bfloat16 = [name for name in ("avx512_bf16", "amx_bf16") if capabilities.get(name)]
@@ -70,7 +70,7 @@ def machine() -> dict[str, str | int]:
 
 
 def run(name: str, settings: Settings) -> dict[str, Any]:
-    """Measures a section in another process and returns it."""
+    """Measures a section in a separate process and returns the section."""
     part = PAGE.with_suffix(f".{name}.part")
     line = [sys.executable, __file__, "--child", name, str(part), json.dumps(asdict(settings))]
     try:
@@ -83,13 +83,13 @@ def run(name: str, settings: Settings) -> dict[str, Any]:
 
 
 def child(name: str, out: str, settings: str) -> None:
-    """Measures one section and writes it as JSON."""
+    """Measures one section and writes it to a JSON file."""
     section = importlib.import_module(name).measure(Settings(**json.loads(settings)))
     Path(out).write_text(json.dumps(section))
 
 
 def render(sections: dict[str, Any]) -> str:
-    """Returns the page that contains the measured sections."""
+    """Returns the page with all measured sections, as Markdown."""
     order = sorted(sections, key=_position)
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
 
@@ -116,15 +116,16 @@ def render(sections: dict[str, Any]) -> str:
 
 
 def _position(name: str) -> tuple[int, bool]:
-    """Returns the position of a section on the page, in the order of the scripts, CPU before GPU."""
+    """Returns the sort key of a section: sections are in the order of `SECTIONS`, first CPU, then GPU."""
     scripts = [*SECTIONS, *ON_REQUEST]
     return scripts.index(name.removesuffix("_cuda")), name.endswith("_cuda")
 
 
 def chosen(only: str, settings: Settings) -> list[str]:
-    """Returns the scripts to run.
+    """Returns the names of the scripts to run.
 
-    Exits with a one-line error if a script, or something that a script requires, does not exist.
+    Exits with a one-line error if a script does not exist, or if a GPU, a clone or a folder that it
+    requires is missing.
     """
     if settings.device not in ("cpu", "cuda"):
         raise SystemExit(
@@ -153,7 +154,7 @@ def chosen(only: str, settings: Settings) -> list[str]:
 
 
 def main(*words: str) -> None:
-    """Measures the chosen sections, and writes the page after each section."""
+    """Measures the selected sections, and rewrites the page after each section."""
     options = dict(word.split("=", 1) for word in words)
     settings = Settings(
         device=options.get("device") or "cpu",

@@ -1,9 +1,9 @@
 """Times sampling: `python benchmarks/sampling.py`.
 
-The first table contains the latency at batch 1 and the throughput at batch 64 of MDM's encoder: for
-1, 2 and 4 steps of a distilled model, which has no guidance, and for 10, 50 and 1000 steps. The
-second table compares the samplers with this encoder, in alternating runs. The third table contains
-the milliseconds per network call that the sampling loop itself takes, measured with a denoiser that
+The first table shows the latency (batch size 1) and the throughput (batch size 64) of MDM's encoder,
+for 1, 2 and 4 steps of a distilled model without guidance, and for 10, 50 and 1000 guided steps. The
+second table compares samplers that use this encoder, in alternating runs. The third table shows the
+time that the sampling loop itself takes per network call. It is measured with a denoiser that
 returns a stored tensor.
 """
 
@@ -40,7 +40,7 @@ RUNS = [
     (FlowMatching(), "rk4", 10),
     (FlowMatching(), "dopri5", 1),
 ]
-"""Process, sampler and number of steps. dopri5 chooses its own steps."""
+"""Process, sampler and number of steps of each run. dopri5 ignores the number and chooses its own steps."""
 
 
 class Counted:
@@ -56,19 +56,19 @@ class Counted:
 
 @dataclass(frozen=True)
 class Size:
-    """Number and size of the sampled motions."""
+    """Size of the motions and of the network, and the effort spent on timing them."""
 
     device: str
     frames: int = 60
     latent_dim: int = 128
     num_layers: int = 4
     rounds: int = 5
-    # A run that would take more seconds is estimated from a run of 10 steps
+    # If a run would take more seconds than this, its time is estimated from a run of 10 steps
     longest: float = 20.0
 
 
 def inputs(batch: int, size: Size) -> tuple[Tensor, Tensor, Condition]:
-    """Returns noise (B, F, D), a mask (B, F), and a condition with a null condition."""
+    """Returns the inputs of a sampler: noise (B, F, D), a mask (B, F) and a random condition with a null condition."""
     device = size.device
     null = Condition(
         torch.zeros(1, 512, device=device), torch.zeros(1, 0, 512, device=device), None
@@ -85,9 +85,9 @@ def options(sampler: str, steps: int) -> SamplerOptions:
 
 
 def latency(denoise: Denoise, size: Size) -> list[Row]:
-    """Times the distilled and the ancestral sampler by batch size and number of steps.
+    """Times the samplers `consistency` and `ancestral` for two batch sizes and several numbers of steps.
 
-    Returns seconds per run and motions per second.
+    Returns one row per batch size and number of steps, with seconds per run and motions per second.
     """
     guided = classifier_free_guidance(denoise, GUIDANCE, FEATURES)
     rows: list[Row] = []
@@ -124,7 +124,7 @@ def latency(denoise: Denoise, size: Size) -> list[Row]:
 
 
 def samplers(denoise: Denoise, size: Size) -> list[Row]:
-    """Returns one row per sampler of `RUNS`."""
+    """Times the samplers in `RUNS` and returns one row per sampler."""
     fixed, mask, cond = inputs(BATCH, size)
     counted = {}
     turns = {}
@@ -151,7 +151,7 @@ def samplers(denoise: Denoise, size: Size) -> list[Row]:
 
 
 def loops(size: Size) -> list[Row]:
-    """Times the loop of each sampler per network call, at batch 1, and the drawing of noise."""
+    """Times the loop of each sampler, per network call at batch size 1, and the drawing of noise."""
     fixed, mask, cond = inputs(1, size)
     keep = torch.zeros_like(fixed, dtype=torch.bool)
     keep[:, : size.frames // 4] = True
@@ -199,7 +199,7 @@ def loops(size: Size) -> list[Row]:
 
 @torch.no_grad()
 def measure(settings: Settings) -> Section:
-    """Times samplers and returns the page section."""
+    """Times sampling and returns the page section."""
     torch.manual_seed(0)
     size = Size(settings.device)
     if settings.quick:
@@ -221,10 +221,11 @@ def measure(settings: Settings) -> Section:
     return section(
         "Sampling",
         f"""MDM's encoder has {sum(p.numel() for p in encoder.parameters()):,} parameters. Motions have {size.frames}
-        frames of {FEATURES} features and are sampled on {size.device} with guidance {GUIDANCE} (two rows per motion
-        in one call). Latency and throughput are measured with the ancestral sampler, with noise; "distilled" is the
-        sampler for distilled models, without guidance. The samplers are measured with {BATCH} motions per batch, and
-        the loops alone without a network, at batch 1. Values are medians of {size.rounds} alternating rounds.""",
+        frames of {FEATURES} features and are sampled on the device "{size.device}" with a guidance scale of
+        {GUIDANCE}, so a network call processes two rows per motion. Latency and throughput are measured with the
+        ancestral sampler and include the drawing of noise. "Distilled" refers to the sampler for distilled models,
+        without guidance. The samplers are compared with {BATCH} motions per batch. The loops are timed without a
+        network, for a single motion. Values are medians of {size.rounds} alternating rounds.""",
         f"With 10 steps, one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 give "
         f"{64 / ten['64']:.0f} motions per second.",
         {

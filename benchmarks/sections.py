@@ -1,6 +1,6 @@
-"""Code shared by the benchmarks.
+"""Functions shared by the benchmark scripts.
 
-Each script has a function `measure`, which returns a page section.
+Each script has a function `measure`, which returns a section of docs/benchmarks/speed.md.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 
 Row = dict[str, str | float | None]
 Section = dict[str, Any]
-"""A title, a text, a summary in one sentence, and tables by caption."""
+"""A page section: a title, a text, a one-sentence summary, and tables by caption."""
 
 QUIET = [
     "trainer.accelerator=cpu",
@@ -26,14 +26,14 @@ QUIET = [
     "callbacks.checkpoints.every_n_steps=1000000",
     "logger=csv",
 ]
-"""Settings for runs that only train, to time their steps."""
+"""Settings for runs whose training steps are timed: no validation, samples or checkpoints."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """The settings that `make bench` passes to each script."""
 
-    quick: bool = False  # tiny sizes, which only show that everything runs
+    quick: bool = False  # use tiny sizes, to check only that everything runs
     device: str = "cpu"  # cpu or cuda
     mdm_repo: str | None = (
         None  # path of a clone of the authors' code, GuyTevet/motion-diffusion-model
@@ -54,7 +54,14 @@ def section(title: str, text: str, summary: str, tables: Mapping[str, Sequence[R
 def ratios(
     times: Mapping[str, float], reference: str, name: str, unit: str = "ms per step"
 ) -> list[Row]:
-    """Returns rows of times in milliseconds, with their ratios to the time of one row."""
+    """Returns one row per measurement, with its time in milliseconds and the ratio to a reference time.
+
+    Args:
+        times: seconds, by label.
+        reference: label of the measurement that the ratios refer to.
+        name: heading of the first column, which contains the labels.
+        unit: heading of the column with the times.
+    """
     return [
         {name: key, unit: 1000 * taken, "ratio": taken / times[reference]}
         for key, taken in times.items()
@@ -62,7 +69,7 @@ def ratios(
 
 
 def cell(value: str | float | None) -> str:
-    """Returns the text of a cell. Numbers have three significant digits."""
+    """Returns the text of a table cell. Numbers are rounded to three significant digits or to integers."""
     if value is None or isinstance(value, str):
         return value or ""
     if abs(value) >= 100 or value == round(value):
@@ -98,17 +105,17 @@ def take_turns(
     device: str = "cpu",
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Returns the median seconds per call of each function.
+    """Returns the median time per call of each function, in seconds.
 
-    The functions alternate, so that a busy machine slows down all of them. A first round, which
-    warms up, is not counted.
+    The functions take turns, so that load on the machine slows down all of them. The first round is
+    a warm-up round and is not counted.
 
     Args:
         runs: the functions, by name.
-        rounds: number of counted calls of each function.
-        device: with cuda, each call ends when the GPU has finished.
-        clock: function that returns seconds. `time.process_time` excludes other programs on the
-            machine.
+                rounds: number of timed calls of each function.
+        device: cpu or cuda. With cuda, the time of a call includes waiting for the GPU.
+        clock: function that returns the time in seconds. With `time.process_time`, other programs
+            on the machine are not counted.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds + 1):

@@ -1,9 +1,9 @@
-"""Times the startup of commands: `python benchmarks/startup.py`.
+"""Times how long commands take to start: `python benchmarks/startup.py`.
 
-Commands answer `--help` and misspelled keys without importing torch. The work itself is minimal
-(one training step, one motion, one replication of eight motions), so that mainly imports and
-preparation are measured. To compare machines, times are also given relative to `python -c "import
-torch"`.
+Commands answer `--help` and report misspelled keys without importing torch. Otherwise, the work is
+minimal (one training step, one motion, one replication of eight motions), so that mainly imports and
+setup are measured. So that machines can be compared, times are also given relative to the time of
+`python -c "import torch"`.
 """
 
 import itertools
@@ -50,12 +50,12 @@ WORK: dict[str, tuple[list[str], list[str]]] = {
     "sample": ([CHECKPOINT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
     "evaluate": ([CHECKPOINT, *EVALUATION], ["seed={}", "out=result{}.json"]),
 }
-"""Arguments of each command. The arguments in the second list differ from run to run."""
+"""Arguments of each command. Those in the second list contain the number of the run."""
 TORCH = "python -c 'import torch'"
 
 
 def run(folder: Path, *words: str) -> None:
-    """Runs one process from start to end."""
+    """Runs Python with the given arguments in a folder, and waits until the process ends."""
     command = [sys.executable, *words]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     finished = subprocess.run(
@@ -66,14 +66,14 @@ def run(folder: Path, *words: str) -> None:
 
 
 def minimal_work(folder: Path, command: str, numbers: itertools.count) -> None:
-    """Runs a command with as little work as possible."""
+    """Runs a command that does as little work as possible."""
     words, varying = WORK[command]
     number = next(numbers)
     run(folder, "-m", "flame_mdm", command, *words, *(word.format(number) for word in varying))
 
 
 def measure(settings: Settings) -> Section:
-    """Times the start of commands and returns the page section."""
+    """Times the startup of commands and returns the page section."""
     commands = ["sample"] if settings.quick else list(WORK)
     rounds = 1 if settings.quick else 3
     with tempfile.TemporaryDirectory() as temporary:
@@ -99,10 +99,10 @@ def measure(settings: Settings) -> Section:
     answered = times[f"{commands[0]} --help"]
     started = times[f"{commands[0]}, minimal work"] / times[TORCH]
     return section(
-        "Start of the commands",
+        "Startup of the commands",
         f"""Times are measured from the start of a process to its end, with one thread. The work is minimal (one
         training step, one motion, one replication of eight motions), so that mainly imports are measured. Values are
-        medians of {rounds} alternating runs, with ratios to the time of importing torch.""",
+        medians of {rounds} alternating runs, and ratios refer to the time of importing torch.""",
         f"`--help` answers in {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times as "
         "long as importing torch.",
         {"commands": rows},

@@ -1,10 +1,10 @@
-"""Times training steps in both speeds: `python benchmarks/steps.py`.
+"""Times training steps at both speeds: `python benchmarks/steps.py`.
 
-The full-size step trains humanml3d/mdm with lengths as in HumanML3D. It is compared with the
-authors' step, from a clone of their code, and with a plain PyTorch loop, which trains an
+The full-size step trains humanml3d/mdm on motions with HumanML3D's lengths. It is compared with the
+authors' step, from a clone of their code, and with a plain PyTorch loop that trains an
 `nn.TransformerEncoder` of the same size. Both receive the same clips, padded to 196 frames as in the
-published code. Further tables contain a step of every network in its CPU size and, on the CPU, the
-quickstart in the complete framework. All measurements alternate in one run.
+published code. Other tables show a training step for each of the small networks and, on the CPU, for
+the quickstart in the complete framework. All measurements alternate in one run.
 """
 
 import statistics
@@ -33,7 +33,7 @@ from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens per caption
-# Rounds of the full-size step. All implementations train on each batch in turn, twice.
+# On each batch of the full-size step, all implementations take turns, twice.
 ROUNDS, BATCHES = 2, 6
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
@@ -48,7 +48,7 @@ SPEEDS = ("reference", "fast")
 
 
 def training_step(task: GeneratorTask, batch: MotionBatch) -> Tensor:
-    """Returns the loss of a step. A condition of the right shape replaces the encoded text."""
+    """Returns the loss of one training step. A condition of zeros replaces the encoded text."""
     generator = task.generator
     rows, features = len(batch), generator.condition.features
     real = torch.ones(rows, TOKENS, dtype=torch.bool)
@@ -70,7 +70,7 @@ class Peer(nn.Module):
         self.token, self.dropout = nn.Linear(512, width), nn.Dropout(0.1)
 
     def forward(self, x: Tensor, mask: Tensor, cond: Tensor) -> Tensor:
-        """Returns the network's output for a batch, with the layout used in the authors' code."""
+        """Returns the output of the network (B, F, 263). Inside, frames come first, as in the authors' code."""
         tokens = self.dropout(torch.cat([self.token(cond)[None], self.input(x.transpose(0, 1))]))
         padding = ~torch.cat([mask.new_ones(len(mask), 1), mask], 1)
         return self.output(self.encoder(tokens, src_key_padding_mask=padding))[1:].transpose(0, 1)
@@ -91,14 +91,14 @@ def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], N
 
 
 def build_task(config: dict[str, Any]) -> GeneratorTask:
-    """Returns the task of a recipe."""
+    """Returns the training task that a recipe configures."""
     return GeneratorTask.build(config, instantiate(config["representation"]))
 
 
 def recipe_step(
     config: dict[str, Any], speed: str, device: str
 ) -> tuple[Callable[[MotionBatch], None], int]:
-    """Returns a training step of a recipe, and the multiple of frames to which it pads."""
+    """Returns a training step for a recipe, and the number of frames to whose multiples batches are padded."""
     config = deepcopy(config)
     config["trainer"]["accelerator"] = device
     task = build_task(config).to(device).train()
@@ -119,14 +119,14 @@ def recipe_step(
 
 
 def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
-    """Returns a random batch with these lengths, padded to `frames`."""
+    """Returns a random batch of motions with the given lengths, padded to `frames`."""
     mask = torch.arange(frames) < torch.from_numpy(lengths)[:, None]
     x = torch.randn(len(lengths), frames, WIDTH) * mask[..., None]
     return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])
 
 
 def drawn_lengths(rows: int, batches: int) -> list[np.ndarray]:
-    """Returns the lengths (rows,) of batches as the framework's sampler draws them."""
+    """Returns the motion lengths (rows,) in each batch, as drawn by the framework's sampler."""
     lengths = 4 * np.random.default_rng(0).integers(10, 50, TrainingBatches.BUCKETS * rows)
     world = TrainingBatches.BUCKETS // batches
     sampler = iter(TrainingBatches(lengths, rows, seed=0, first=0, rank=0, world=world))
@@ -134,7 +134,7 @@ def drawn_lengths(rows: int, batches: int) -> list[np.ndarray]:
 
 
 def full_size(settings: Settings) -> tuple[list[Row], str]:
-    """Returns the rows for the full-size step, and a text about the batches."""
+    """Returns the table of the full-size step, and a phrase that describes its batches."""
     words = ["data.batch_size=16"]
     if settings.quick:
         words = [
@@ -180,7 +180,7 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
 
 
 def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
-    """Returns one row per network in `BACKBONES`. The networks have their CPU size."""
+    """Times a training step for the small version of each named network in `BACKBONES`. Returns one row per network."""
     rows: list[Row] = []
     lengths = np.random.default_rng(1).integers(36, 61, 32)
     for name in names:
@@ -205,9 +205,9 @@ def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
 
 
 def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
-    """Returns one row per speed: the quickstart's step in the complete framework.
+    """Times training steps of the quickstart in the complete framework.
 
-    The speeds alternate.
+    Runs at both speeds alternate. Returns one row per speed.
     """
     times: dict[str, list[float]] = {speed: [] for speed in SPEEDS}
     with tempfile.TemporaryDirectory() as name:
@@ -238,7 +238,7 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Returns a sentence about both speeds, compared with the first row, the slowest peer."""
+    """Returns a sentence that compares both speeds with the implementation in the first row."""
     peer = str(rows[0]["training"]).partition(",")[0]
     reference, fast = (row["times as fast"] for row in rows[-2:])
     return (
@@ -260,12 +260,12 @@ def measure(settings: Settings) -> Section:
         memory = torch.cuda.max_memory_allocated() / 2**30
         batches += f"; at most {memory:.1f} GiB of memory for all models together"
     names = ["FLAME", "MFM"] if quick else list(BACKBONES)
-    tables["networks in their CPU size"] = backbones(names, 1 if quick else 15, device)
+    tables["small networks"] = backbones(names, 1 if quick else 15, device)
     if device == "cpu":
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
 
     authors = (
-        "The authors' step runs their code without CLIP, whose features are zeros. "
+        "The authors' step runs their code with zeros instead of CLIP's features. "
         if settings.mdm_repo
         else "The authors' code was not measured in this run. "
     )
@@ -273,11 +273,11 @@ def measure(settings: Settings) -> Section:
         "Training steps",
         f"""The full-size step trains `humanml3d/mdm` (8 layers of width 512, dropout 0.1) on {batches}. Lengths
         are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
-        the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips,
-        padded to 196 frames as in the published code, in float32. All implementations alternate on each of {BATCHES}
-        batches, {ROUNDS} times after one that warms up. The small networks have 32 clips per batch and no text
-        encoder, and alternate 15 times; the quickstart is trained by the complete framework, with its text
-        encoder.""",
+        the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips in
+        float32, padded to 196 frames as in the published code. On each of {BATCHES} batches, all implementations
+        alternate for a warm-up round and {ROUNDS} timed rounds. The small networks are trained on 32 clips per batch
+        without a text encoder, and both speeds alternate for 15 rounds. The quickstart is trained by the complete
+        framework, with its text encoder.""",
         summary(full),
         tables,
     )

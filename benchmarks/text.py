@@ -1,7 +1,7 @@
-"""Times text encoding with the language model and from the cache: `python benchmarks/text.py`.
+"""Compares encoding captions with a language model and reading them from the cache: `python benchmarks/text.py`.
 
-The language model is sentence-BERT from the extra `offline`, so that nothing is downloaded. It
-returns token features.
+The language model is sentence-BERT from the extra `offline`, which needs no download. It returns
+one feature vector per token.
 """
 
 import itertools
@@ -24,7 +24,7 @@ PARTS = [
 
 
 def measure(settings: Settings) -> Section:
-    """Times text encoders with and without cached embeddings and returns the page section."""
+    """Times a text encoder with and without cached embeddings, and returns the page section."""
     size, rounds = (2, 1) if settings.quick else (64, ROUNDS)
     condition = compose("quickstart", ["condition=minilm_offline"])["condition"]
     live, cached = (instantiate(condition | {"tokens": True}) for _ in range(2))

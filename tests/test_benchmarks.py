@@ -271,7 +271,7 @@ def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
 
     del runs["b2"]
     (tmp_path / "b2" / "config.yaml").unlink()
-    with pytest.raises(SystemExit, match="requires two or more seeds, the same at both speeds"):
+    with pytest.raises(SystemExit, match="requires at least two seeds, the same at both speeds"):
         quality.measure(settings)
     monkeypatch.setattr(
         quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {})

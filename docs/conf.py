@@ -1,4 +1,7 @@
-"""Settings for the docs site, which `make docs` builds. The start page is the README; docs/index.md lists the pages."""
+"""Sphinx configuration of the docs site, which `make docs` builds.
+
+The start page is the README. docs/index.md lists the pages in the sidebar.
+"""
 
 import re
 from dataclasses import fields, is_dataclass
@@ -22,7 +25,11 @@ LINK = re.compile(r"\[([^\]]+)\]\(([\w./-]+\.(?:md|cff))\)")
 
 
 def sidebar(index: str) -> dict[str, list[str]]:
-    """Returns the pages in the sidebar by section: the pages to which docs/index.md links, each listed once."""
+    """Returns the pages in each section of the sidebar: the pages to which docs/index.md links, without duplicates.
+
+    Args:
+        index: text of docs/index.md.
+    """
     seen, sections = {"index"}, {}
     for part in index.split("\n## ")[1:]:
         pages = dict.fromkeys(re.findall(r"\]\(([\w/-]+)\.md[)#]", part))
@@ -32,7 +39,7 @@ def sidebar(index: str) -> dict[str, list[str]]:
 
 
 def without_target(link: re.Match[str], folder: Path, name: str) -> str:
-    """Returns a link, or only its text if it leads to a page in the repository that is not on the site."""
+    """Returns a Markdown link, or only its text if its target is a page in the repository that is not on the site."""
     base = DOCS.parent if name == "index" and not (folder / link[2]).exists() else folder
     target = (base / link[2]).resolve()
     is_on_site = target.is_relative_to(DOCS) or target == DOCS.parent / "README.md"
@@ -40,7 +47,10 @@ def without_target(link: re.Match[str], folder: Path, name: str) -> str:
 
 
 def start_page(app: Any, name: str, source: list[str]) -> None:
-    """Replaces the list of pages with the README and the sidebar. Links to the README lead to this page."""
+    """Edits a page before Sphinx reads it.
+
+    The start page is replaced with the README and the sidebar, and links to the README lead to it.
+    """
     sections = sidebar((DOCS / "index.md").read_text(encoding="utf-8"))
     if name == "index":
         readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
@@ -59,7 +69,7 @@ def start_page(app: Any, name: str, source: list[str]) -> None:
 def add_help(
     app: Any, what: str, name: str, documented: Any, options: Any, lines: list[str]
 ) -> None:
-    """Adds a dataclass's help texts, which the command line also shows, to its description."""
+    """Adds the help texts of a dataclass's fields, which `--help` also shows, to its description on the site."""
     if is_dataclass(documented):
         helps = {
             entry.name: entry.metadata["help"]

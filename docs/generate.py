@@ -1,4 +1,7 @@
-"""Writes recipes.md and hyperparameters.md from the recipes, and draws the parts of the code: `make docs`."""
+"""Writes the generated pages of the docs, and draws the parts of the code as a house: `make docs`.
+
+The pages are recipes.md, hyperparameters.md and memory.md, which are generated from the recipes.
+"""
 
 import ast
 import re
@@ -20,7 +23,7 @@ HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
 
 
 def head(name: str) -> tuple[str, str]:
-    """Returns the head comment of a recipe: what it reproduces (paper, table, row), and its deviations."""
+    """Returns the two parts of a recipe's head comment: what it reproduces (paper, table, row), and its deviations."""
     lines = (EXPERIMENTS / f"{name}.yaml").read_text().splitlines()[1:]
     comment = " ".join(
         line.removeprefix("#").strip()
@@ -31,7 +34,7 @@ def head(name: str) -> tuple[str, str]:
 
 
 def _wide(width: int, layers: int) -> list[str]:
-    """Returns the overrides for a wide network, with feed-forward layers four times as wide."""
+    """Returns the overrides for a network of this width and depth, with feed-forward layers four times as wide."""
     sizes = {"latent_dim": width, "ff_size": 4 * width, "num_layers": layers}
     return [f"denoiser.{name}={size}" for name, size in sizes.items()]
 
@@ -82,7 +85,7 @@ def published_tables() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def printed(text: str) -> Any:
-    """Returns the value of a printed text: "1,000" is a number, "0.9, 0.999" is two numbers."""
+    """Parses a value as printed in a paper. For example, "1,000" is a number, and "0.9, 0.999" is two numbers."""
     if ", " in text:
         return tuple(map(printed, text.split(", ")))
     number = text.removesuffix(" words").replace(",", "")
@@ -98,11 +101,11 @@ DEVIATIONS = {
     ): "the code is not public; the widths are chosen so that the number of parameters is "
     "close to the paper's"
 }
-"""Deviations of recipes from their papers, by (recipe, key), with the reason."""
+"""Hyperparameters that deviate from the papers: (recipe, key) -> reason."""
 
 
 def same(ours: Any, papers: Any) -> bool:
-    """Returns whether a value agrees with the paper's, to the paper's digits."""
+    """Returns whether our value equals the paper's value after rounding to the paper's number of digits."""
     if isinstance(papers, float) and isinstance(ours, float):
         ours = round(ours, len(f"{papers}".partition(".")[2]) if papers > 1 else 12)
     return ours == papers
@@ -167,7 +170,7 @@ ROOMS = {
     "conditions": (4, "texts and actions as vectors"),
     "visualize": (0, "players, pictures, videos"),
     "records": (1.9, "result files of evaluations"),
-    "generator": (3, "a model: four parts, and how to sample from them"),
+    "generator": (3, "a model made of four parts, and sampling from it"),
     "formats": (0, "motion files, cleanup, characters"),
     "runs": (1.9, "run directories"),
     "data": (0.5, "data sets, stores, batches"),
@@ -182,11 +185,16 @@ ROOMS = {
     "commands": (3.1, "one module per command"),
     "__main__": (3.1, "the command line"),
 }
-"""Column and content of each room in the picture. The columns are chosen so that no line crosses a room."""
+"""Column and description of each room in the picture. The columns are chosen so that no line crosses a room."""
 
 
 def import_rules() -> tuple[dict[str, set[str]], set[str]]:
-    """Returns what each part of the code may import, and the parts on the ground, from the architecture test."""
+    """Reads the rules in the architecture test.
+
+    Returns:
+        The parts of the code that each part may import, and the parts "on the ground", which all parts
+        may import.
+    """
     tree = ast.parse((ROOT / "tests" / "test_architecture.py").read_text(encoding="utf-8"))
     values: dict[str, Any] = {}
     for node in tree.body:
@@ -205,7 +213,7 @@ def import_rules() -> tuple[dict[str, set[str]], set[str]]:
 
 
 def storeys(rules: Mapping[str, set[str]]) -> list[list[str]]:
-    """Returns the rooms of each storey, from the bottom up: a room is above all rooms that it may import."""
+    """Returns the rooms on each storey, from the bottom up. Each room is above all rooms that it may import."""
 
     @cache
     def height(name: str) -> int:
@@ -218,7 +226,10 @@ def storeys(rules: Mapping[str, set[str]]) -> list[list[str]]:
 
 
 def stairs(rules: Mapping[str, set[str]]) -> list[tuple[str, str]]:
-    """Returns the imports from which all others follow: A may import C if A may import B and B may import C."""
+    """Returns the imports to draw as lines, as pairs (importing room, imported room).
+
+    An import from A to C is omitted if A may import B and B may import C.
+    """
 
     @cache
     def below(name: str) -> frozenset[str]:
@@ -233,7 +244,7 @@ def stairs(rules: Mapping[str, set[str]]) -> list[tuple[str, str]]:
 
 
 def house() -> str:
-    """Draws the parts of the code as a house: a room may import the rooms to which lines lead downward."""
+    """Draws the parts of the code as rooms in a house, in SVG. Lines lead down to the rooms that a room may import."""
     rules, ground = import_rules()
     # The parts on the ground, which all others may import, are drawn as one wide room.
     merged = {
@@ -306,7 +317,7 @@ SIZES: dict[str, tuple[str, list[str]]] = {
     "`humanml3d/mdm`, 1024 wide, 16 layers": ("humanml3d/mdm", _wide(1024, 16)),
     "`humanml3d/mdm`, 2048 wide, 24 layers": ("humanml3d/mdm", _wide(2048, 24)),
 }
-"""Rows of the page about memory: a recipe and overrides, by label."""
+"""Rows of the table in memory.md: label -> recipe and overrides."""
 
 MEMORY = """# Memory for training
 
@@ -328,7 +339,7 @@ The wide models override `denoiser.latent_dim`, `denoiser.ff_size` (four times t
 
 
 def memory_page() -> str:
-    """Returns the page about the memory that training needs."""
+    """Returns the content of memory.md: the memory that training takes for the recipes in `SIZES`."""
     rows = []
     for label, (recipe, words) in SIZES.items():
         config = compose(recipe, words)

@@ -1,7 +1,7 @@
-"""Builds the extension for Blender 4.2 or later: `make blender [PLATFORM=windows-x64]`.
+"""Builds the extension for Blender 4.2 and later: `make blender [PLATFORM=windows-x64]`.
 
-The file is build/flame_mdm-PLATFORM.zip. The extension samples with the model in this package.
-The wheels for onnxruntime come from the package index.
+The script writes build/flame_mdm-PLATFORM.zip. The extension contains a model from this package and
+generates motions with it. The onnxruntime wheels come from the package index.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MODULES = (
     ),
     *sorted(LANGUAGE.glob("[!_]*.py")),
 )
-"""Modules that the extension contains unchanged. They require only numpy."""
+"""Modules that are copied into the extension. They depend only on numpy."""
 
 
 def this_machine() -> str:
@@ -54,10 +54,15 @@ def this_machine() -> str:
 
 
 def build(model: str, out: Path, target: str) -> None:
-    """Writes the extension with a model for one platform.
+    """Builds the extension for one platform.
+
+    Args:
+        model: the model to include, as in `flame_mdm.load`.
+        out: path of the zip file.
+        target: Blender's name for the platform, such as linux-x64.
 
     Raises:
-        UserError: If the platform is unknown, or pip finds no wheels for it.
+        UserError: If the platform is unknown, or if pip finds no wheels for it.
     """
     if target not in PLATFORMS:
         raise UserError(
@@ -107,10 +112,7 @@ def write_language(folder: Path) -> None:
 
 
 def fetch_wheels(folder: Path, target: str) -> None:
-    """Downloads the wheels for onnxruntime and its requirements.
-
-    onnxruntime has the version that exported the model.
-    """
+    """Downloads the wheels for onnxruntime and its dependencies, in the versions installed here."""
     names = [
         re.split(r"[^\w-]", line)[0]
         for line in requires("onnxruntime") or []
@@ -136,7 +138,7 @@ def fetch_wheels(folder: Path, target: str) -> None:
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise UserError(f"pip cannot download the wheels of onnxruntime for {target}: {reason}")
+        raise UserError(f"pip cannot download the onnxruntime wheels for {target}: {reason}")
 
 
 if __name__ == "__main__":

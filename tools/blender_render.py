@@ -1,12 +1,13 @@
-"""Imports motion files in Blender and renders frames with Cycles, as small PNG files.
+"""Imports motion files into Blender and renders frames as small PNG files with Cycles.
 
-Run `PYTHON blender_render.py JOB.json` with a Python that has the package bpy (Blender 4.2 or
-later). The job contains `width`, `height`, `samples`, and a list of `files` with these keys:
+Run `PYTHON blender_render.py JOB.json` with a Python interpreter that has the package bpy (Blender
+4.2 or later). The job contains the picture size (`width`, `height`), the rays per pixel
+(`samples`), and a list of `files` with these keys:
 
 path     path of the motion file
-out      prefix of the picture names, which end in _000.png and so on
-every    number of frames between pictures; 0 = `count` pictures from the first to the last frame
-bones    true = draw the skeleton without the skin
+out      prefix of the picture paths, to which _000.png, _001.png, ... are appended
+every    render every Nth frame; 0 = render `count` frames, evenly spaced over the motion
+bones    true = draw the skeleton instead of the skin
 """
 
 import json
@@ -34,7 +35,7 @@ def material(name, color):
 
 
 def stage(job):
-    """Adds a light, a checkered floor and a camera."""
+    """Adds a light, a checkered floor and a camera to the scene, and configures the renderer."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.use_denoising = job["samples"], False
@@ -69,7 +70,7 @@ def stage(job):
 
 
 def heads(armature):
-    """Returns the world positions of the bone heads in a pose, by bone name."""
+    """Returns the world positions of the bone heads in the current frame, by bone name."""
     return {bone.name: armature.matrix_world @ bone.head for bone in armature.pose.bones}
 
 

@@ -1,7 +1,8 @@
 """Draws the pictures in docs/engines.md with Blender: `python tools/engine_pictures.py [SET]`.
 
-`FLAME_MDM_BLENDER` is the path to a Python that has the package bpy. SET is a folder with a set of
-FBX files. If it is given, every frame of each clip is drawn into SET/frames.
+The environment variable `FLAME_MDM_BLENDER` must be the path of a Python interpreter that has the
+package bpy. SET is a folder with a set of FBX files for game engines. With SET, a picture of every
+frame of its clips is also written to SET/frames.
 """
 
 import json
@@ -32,21 +33,23 @@ CLIPS = ("Walk_Fwd_Start", "Walk_Fwd_Loop", "Walk_Fwd_Stop", "Run_Fwd_Loop", "Tu
 def rendered(
     files: Sequence[Mapping[str, object]], size: tuple[int, int], samples: int, folder: Path
 ) -> list[list[Path]]:
-    """Renders files in Blender. Returns the pictures for each file, in frame order.
+    """Renders motion files in Blender and returns the paths of the pictures for each file, in frame order.
 
     Args:
-        files: the path and the drawing options of each file, as in `blender_render.py`. This
-            function adds `out`.
-        size: width and height in pixels.
+        files: the path and the drawing options of each file, as in `blender_render.py`, but without
+            `out`, which this function adds.
+        size: width and height of a picture in pixels.
         samples: rays per pixel.
-        folder: the folder for the pictures.
+        folder: folder to which the pictures are written.
 
     Raises:
         UserError: If `FLAME_MDM_BLENDER` is not set, or if Blender fails.
     """
     python = os.environ.get("FLAME_MDM_BLENDER")
     if python is None:
-        raise UserError("FLAME_MDM_BLENDER is not set. Use a Python that has the package bpy")
+        raise UserError(
+            "FLAME_MDM_BLENDER is not set. Set it to the path of a Python that has the package bpy"
+        )
     named = [{**file, "out": str(folder / f"{n:03d}")} for n, file in enumerate(files)]
     job = {"width": size[0], "height": size[1], "samples": samples, "files": named}
     (folder / "job.json").write_text(json.dumps(job))
@@ -59,7 +62,7 @@ def rendered(
 
 
 def sheet(path: Path, rows: Sequence[Sequence[Path]], labels: Sequence[str]) -> None:
-    """Writes one picture with labeled rows of pictures of equal size."""
+    """Combines pictures of equal size into one picture with labeled rows, and saves it."""
     width, height = Image.open(rows[0][0]).size
     whole = Image.new("RGB", (width * max(map(len, rows)), height * len(rows)), "white")
     draw = ImageDraw.Draw(whole)
@@ -72,7 +75,7 @@ def sheet(path: Path, rows: Sequence[Sequence[Path]], labels: Sequence[str]) -> 
 
 
 def draw_files() -> None:
-    """Draws a motion as skinned characters (an FBX and a GLB file), and as the bones of two rigs."""
+    """Draws a motion as a skinned character (from an FBX and a GLB file), and as the bones of two rigs."""
     motion = flame_mdm.generate(flame_mdm.load("package"), TEXT)[0]
     versions = {
         "walk.fbx, rig=unreal": (".fbx", "unreal", False),

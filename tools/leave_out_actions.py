@@ -1,9 +1,10 @@
-"""Removes actions from the list of actions that a model file knows, for instance because the model gets them wrong.
+"""Removes actions from the list of known actions in a model file, for instance because the model gets them wrong.
 
     python tools/leave_out_actions.py flame_mdm/models/package.safetensors waltz cry
 
-Sentences about these actions are then rejected, and the nearest actions are suggested. Use the
-action names in `flame_mdm/conditions/language/actions.yaml`. The weights do not change.
+Sentences about these actions are then rejected, and the actions with the nearest meanings are
+suggested. Use the action names in `flame_mdm/conditions/language/actions.yaml`. The weights do not
+change.
 """
 
 import sys
@@ -19,7 +20,7 @@ def main(path: Path, left_out: set[str]) -> None:
     unknown = left_out - actions().keys()
     if unknown:
         raise UserError(
-            f"{', '.join(sorted(unknown))}: not in flame_mdm/conditions/language/actions.yaml. Use names from it"
+            f"{', '.join(sorted(unknown))}: not in flame_mdm/conditions/language/actions.yaml. Use names from this file"
         )
     content = read_model_file(path)
     facts = content["facts"]
@@ -35,14 +36,14 @@ def main(path: Path, left_out: set[str]) -> None:
 
 
 def named(name: str) -> set[str]:
-    """Returns the actions in the table to which an action name in a model refers."""
+    """Returns the names of the table entries to which an action name in a model file refers."""
     plain = name.replace("_", " ").lower()
     listed = {entry.name for entry in actions().values() if plain in entry.names}
     return listed or mentioned(plain)
 
 
 def mentioned(text: str) -> set[str]:
-    """Returns the actions that a text mentions."""
+    """Returns the names of the actions that a text mentions."""
     return {mention.action for mention in understand(text).mentions}
 
 

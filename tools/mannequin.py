@@ -1,9 +1,10 @@
-"""Models the mannequin for pictures and files: `python tools/mannequin.py`.
+"""Models the mannequin that pictures and files show: `python tools/mannequin.py`.
 
-Writes flame_mdm/visualize/mannequin.npz. The figure contains no third-party data. Its parts have
-elliptic cross sections along the bones of `ADULT`, with the widths and depths of an adult of 1.78
-m. Smooth unions join the parts into one surface. The left half is triangulated and simplified, and
-the right half is its mirror image. This script requires the packages in tools/requirements.txt.
+The script writes flame_mdm/visualize/mannequin.npz and requires the packages in
+tools/requirements.txt. The figure contains no third-party data. Its parts have elliptic cross
+sections along the bones of `ADULT`, with the widths and depths of an adult who is 1.78 m tall.
+Smooth unions join the parts into one surface. The left half is triangulated and simplified, and the
+right half is its mirror image.
 """
 
 from __future__ import annotations
@@ -32,35 +33,35 @@ from flame_mdm.visualize.body import (
 )
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
-"""Rotations of the left side, in degrees about x, y and z, from SMPL's rest pose to the stored pose.
+"""Rotations of the joints on the left side from SMPL's rest pose to the stored pose, in degrees about x, y and z.
 
-The arms are lowered in the stored pose. In most motions, the arms hang down, so the skin is
-stretched less than from a pose with outstretched arms.
+In the stored pose, the arms are lowered. Because the arms hang down in most motions, the skin is
+stretched less than it would be from a pose with outstretched arms.
 """
 KNUCKLES, CURL = 0.088, 0.034
 """Distance from the wrist to the knuckles, and radius of the finger arc, in meters."""
 CELL = 0.005
 VERTICES = 1150
-"""Number of vertices in a half, before it is mirrored."""
+"""Number of vertices in the left half, before it is mirrored."""
 SOLE = -0.981
-"""Height of the sole below the pelvis."""
+"""Height of the soles relative to the pelvis, in meters."""
 LIPS, EYES = (192, 138, 120), (92, 74, 64)
-"""Colors of the face."""
+"""RGB colors of the lips and the eyes, from 0 to 255."""
 Field = Callable[[np.ndarray], np.ndarray]
 ORIGIN, UP = np.zeros(3), np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
 
 
 def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0) -> Field:
-    """Returns a function for the approximate signed distance from a tube with elliptic cross sections and round ends.
+    """Returns the approximate signed distance field of a tube with elliptic cross sections and round ends.
 
     Args:
-        origin: the point at length 0.
-        axes: (3, 3), rows with the directions of the length and of the two half widths.
-        stations: several cross sections, separated by semicolons. Each consists of the length, the
-            two coordinates of the center and the two half widths, in millimeters. They are
-            interpolated without overshoot.
-        power: exponent of the cross section; 2 = ellipses. With larger values, the cross section is
-            more similar to a rectangle.
+                origin: the point (3,) on the tube's axis at length 0, in meters.
+        axes: array (3, 3) whose rows are the directions of the tube and of its two half widths.
+        stations: cross sections, separated by semicolons. Each cross section consists of the
+            position along the tube, the two coordinates of the center and the two half widths, in
+            millimeters. Cross sections between them are interpolated without overshoot.
+        power: exponent of the cross section. 2 gives ellipses, and larger values give shapes that
+            are closer to rectangles.
     """
     table = np.array(stations.replace(";", " ").split(), float).reshape(-1, 5) / 1000
     shape = PchipInterpolator(table[:, 0], table[:, 1:])
@@ -78,19 +79,22 @@ def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0
 
 
 def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Field:
-    """Returns the approximate signed distance from an ellipsoid with axes along x, y and z."""
+    """Returns the approximate signed distance field of an ellipsoid with axes along x, y and z."""
     middle, size = np.array(center), np.array(radii)
     return lambda points: (np.linalg.norm((points - middle) / size, axis=-1) - 1) * size.min()
 
 
 def union(first: np.ndarray, second: np.ndarray, blend: float) -> np.ndarray:
-    """Joins two signed distances. Surfaces closer than `blend` meters are blended smoothly."""
+    """Returns the signed distances from the union of two shapes, given the distances from each shape.
+
+    Surfaces that are closer together than `blend` meters are blended smoothly.
+    """
     share = np.maximum(blend - np.abs(first - second), 0) / blend
     return np.minimum(first, second) - share**2 * blend / 4
 
 
 def pose() -> tuple[np.ndarray, np.ndarray]:
-    """Returns the joints (22, 3) of the stored pose, with the pelvis at 0, and their world rotations (22, 3, 3)."""
+    """Returns the joint positions (22, 3) in the stored pose, pelvis at 0, and the world rotations (22, 3, 3)."""
     joints, turned = np.zeros((22, 3)), np.tile(np.eye(3), (22, 1, 1))
     for joint, parent in enumerate(SMPL22.parents):
         side, _, name = SMPL22.joints[joint].rpartition("_")
@@ -103,19 +107,25 @@ def pose() -> tuple[np.ndarray, np.ndarray]:
 
 
 def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the origin and axes of a tube along a bone; `u` is the direction of its first half width."""
+    """Returns the origin and the axes of a tube along the bone between two joints.
+
+    Args:
+        start: name of the joint at which the bone begins.
+        end: name of the joint at which the bone ends.
+        u: direction (3,) of the tube's first half width, relative to the first joint.
+    """
     joints, turned = pose()
     at = JOINT[start]
     return joints[at], orthonormal(joints[JOINT[end]] - joints[at], turned[at] @ np.array(u, float))
 
 
 def model() -> dict[str, Field]:
-    """Returns the parts of the left half of the body: trunk, left leg, left arm and head."""
+    """Returns the distance fields of the parts of the left half: trunk, left leg, left arm and head."""
     return {**trunk(), **leg(), **arm(), "head": head()}
 
 
 def trunk() -> dict[str, Field]:
-    """Returns torso, buttock, breast, shoulder blade, trapezius and neck."""
+    """Returns the distance fields of torso, buttock, breast, shoulder blade, trapezius and neck."""
     return {
         "torso": tube(
             ORIGIN,
@@ -142,7 +152,7 @@ def trunk() -> dict[str, Field]:
 
 
 def leg() -> dict[str, Field]:
-    """Returns thigh, calf and foot. Axes: down, to the left, forward."""
+    """Returns the distance fields of thigh, calf and foot, whose axes point down, left and forward."""
     joints, _ = pose()
     parts = {}
     thigh = bone("left_hip", "left_knee", (1, 0, 0))
@@ -175,7 +185,7 @@ def leg() -> dict[str, Field]:
 
 
 def arm() -> dict[str, Field]:
-    """Returns upper arm, forearm and hand. Axes: to the left along the bone, up, forward."""
+    """Returns the distance fields of upper arm, forearm and hand, whose axes point left, up and forward."""
     joints, turned = pose()
     parts = {}
     parts["arm"] = tube(
@@ -225,7 +235,7 @@ def axes_of_hand(wrist: np.ndarray) -> np.ndarray:
 
 
 def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the points and normals (V, 3) of the left half, with the fingers bent into a loose fist."""
+    """Bends the fingers of the left half into a loose fist. Returns the new points and normals (V, 3)."""
     joints, turned = pose()
     wrist, axes = joints[JOINT["left_wrist"]], axes_of_hand(turned[JOINT["left_wrist"]])
     local = (points - wrist) @ axes.T
@@ -243,7 +253,7 @@ def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def head() -> Field:
-    """Returns the head with face, ear and hair."""
+    """Returns the distance field of the head, with face, ear and hair."""
     skull = ellipsoid((0, 0.712, 0.003), (0.074, 0.089, 0.095))
     face = tube(
         ORIGIN,
@@ -283,7 +293,7 @@ def head() -> Field:
 
 
 def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
-    """Returns the signed distance of the entire body for points with x >= 0."""
+    """Returns the signed distances (N,) of points with x >= 0 from the entire body."""
     mirrored = points * [-1, 1, 1]
     leg = union(
         union(parts["thigh"](points), parts["calf"](points), 0.02), parts["foot"](points), 0.03
@@ -298,7 +308,7 @@ def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
 
 
 def gradient(distance: Field, points: np.ndarray) -> np.ndarray:
-    """Returns the gradient (N, 3) of a distance by central differences."""
+    """Returns the gradients (N, 3) of a distance field at points, computed by central differences."""
     steps = 1e-4 * np.eye(3)
     return (
         np.stack([distance(points + step) - distance(points - step) for step in steps], -1) / 2e-4
@@ -366,11 +376,11 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
 
 
 def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
-    """Returns the joint weights (V, 22) for points on the left half."""
+    """Returns the skinning weights (V, 22) of points on the left half."""
     joints, turned = pose()
 
     def beyond(name: str, normal: Sequence[float] | np.ndarray, width: float) -> np.ndarray:
-        """Returns how far points lie beyond a joint: 0.5 on the plane through it, 0 and 1 `width` meters from it."""
+        """Returns how far points are beyond a joint: 0.5 on the plane through it, 0 or 1 at `width` meters from it."""
         unit = np.array(normal, float) / np.linalg.norm(normal)
         return smooth(-width, width, (points - joints[JOINT[name]]) @ unit)
 
@@ -408,7 +418,7 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
     }
     for name in ("spine1", "spine2", "spine3", "left_collar"):
         share[name] = np.maximum(share[name], on_arm)
-    whole = np.zeros((len(points), 22))  # weight of a joint and all joints below it
+    whole = np.zeros((len(points), 22))  # weight of a joint and of all its descendants
     whole[:, 0] = 1
     for joint, parent in enumerate(SMPL22.parents):
         if parent >= 0 and SMPL22.joints[joint] in share:
@@ -418,7 +428,7 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
         children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
         below = whole[:, children].sum(1)
         too_much = np.maximum(1, below / np.maximum(whole[:, joint], 1e-9))
-        # Joints on both sides of the middle share the weight of their parent
+        # In the middle of the body, the left and the right joint share the weight of their parent
         for child in children:
             for joint_below in descendants(child):
                 weights[:, joint_below] /= too_much
@@ -427,7 +437,7 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
 
 
 def descendants(joint: int) -> list[int]:
-    """Returns a joint and all joints below it."""
+    """Returns the indices of a joint and of all its descendants in the skeleton."""
     return [joint] + [
         j for child, p in enumerate(SMPL22.parents) if p == joint for j in descendants(child)
     ]
@@ -461,7 +471,7 @@ def paint(points: np.ndarray) -> np.ndarray:
 
 
 def make() -> dict[str, np.ndarray]:
-    """Returns the arrays in the asset: the left half of the figure and its mirror image."""
+    """Returns the arrays in mannequin.npz, which describe the left half of the figure and its mirror image."""
     parts = model()
 
     def distance(points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Draws the pictures that illustrate options, with the package's model and Chromium: `python tools/pictures.py`."""
+"""Draws the pictures of options in the docs and in the demo: `python tools/pictures.py`.
+
+The motions come from the model `package`. The screenshots of the demo require Chromium.
+"""
 
 import base64
 import io
@@ -34,7 +37,7 @@ SHOTS = {"page": "#stage", "examples": "#examples", "change": "#edit"}
 
 
 def draw_motions() -> None:
-    """Draws six poses of a motion for each option."""
+    """Draws six poses for each option of `sample`, `edit` and `convert` that the docs illustrate."""
     model = flame_mdm.load("package")
     texts = {
         "text": WALK,
@@ -73,7 +76,7 @@ def draw_motions() -> None:
 
 
 def draw_stills() -> None:
-    """Draws the demo's pictures for actions that the synthetic set lacks."""
+    """Draws the demo's pictures for the actions that the synthetic set does not contain."""
     model = flame_mdm.load("package")
     for action in Abilities(model.facts).actions:
         if not set(actions()[action].names) & set(ACTIONS):
@@ -82,7 +85,7 @@ def draw_stills() -> None:
 
 
 def draw_demo() -> None:
-    """Takes screenshots of parts of the demo page, at 60 % of their size and in 128 colors."""
+    """Takes screenshots of parts of the demo page and saves them at 60 % of their size with 128 colors."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     from support.browser import browser
 
@@ -96,7 +99,7 @@ def draw_demo() -> None:
         )
         tab.open(f"http://127.0.0.1:7999/?text={WALK}&path=0,1+0.5,2")
         tab.wait("!!document.querySelector('#files a')", 60)
-        time.sleep(3)  # the player draws
+        time.sleep(3)  # until the player has drawn the motion
         for name, part in SHOTS.items():
             box = tab.run(f"document.querySelector('{part}').getBoundingClientRect().toJSON()")
             clip = {key: box[key] for key in ("x", "y", "width", "height")} | {"scale": 0.6}

@@ -1,23 +1,25 @@
-"""Calibrates the referee on captioned motions: writes its thresholds and prints how often it is right.
+"""Calibrates the referee on captioned motions, and prints how often its verdicts are right.
 
 python tools/referee.py data/bandai-humanml-clean-smpl22 data/cmu-humanml-clean-smpl22 ... [figures=FILE.json]
 
-The figures for this repository are in docs/benchmarks/referee_calibration.json.
+The script writes the thresholds to the package and, with `figures=`, the figures to a file. The
+figures in this repository are in docs/benchmarks/referee_calibration.json, and
 `tools/referee_page.py` writes the page that shows them.
 
-The arguments are prepared data sets with SMPL's 22 joints. A hash of their names splits the
-recordings into two halves. Thresholds are calibrated on one half, and figures are measured on the
-other half. Sums over both halves are "crossed": each half is judged with the thresholds of the
-other half. Procedural motions set no thresholds, and have separate figures.
+The other arguments are prepared data sets with SMPL's 22 joints. A hash of their names splits the
+recordings into two halves. Thresholds are calibrated on one half, and the verdicts on the other half
+are counted. In rows called "crossed", the counts of both halves are added; each half is judged with
+thresholds from the other half. Procedural motions are not used for calibration and have separate
+rows.
 
-A claim in a caption counts as true for its motion. A falsified claim counts as false. It states
-another side, direction or speed, one repetition more or less, the reverse order, another duration,
-or the other end of the motion. Captions are sometimes wrong, and the figures include their errors.
+Each claim in a caption counts as true for its motion. Falsified claims count as false. They state
+the other side, direction or speed, one repetition more or less, the reverse order, another duration,
+or the other end of the motion. A wrong caption counts as an error by the referee.
 
 Captions hardly ever state durations. If the captions of a recording only state that the body walks,
-runs or stands still, the recording is cut to two, three and four seconds, so that "for three
-seconds" is true for the cut. A walking body is assumed to be upright at the start and at the end. Claims
-about durations and ends set no thresholds.
+runs or stands still, the recording is therefore cut to two, three and four seconds, so that "for
+three seconds" is true for the cut. A walking body is assumed to be upright at the start and at the
+end. Claims about durations, starts and ends are not used for calibration.
 """
 
 import re
@@ -61,7 +63,7 @@ HEAD = """# Thresholds of the referee by kind of claim, written by `tools/refere
 
 @dataclass(frozen=True)
 class Example:
-    """A motion with its name, its captions, its data set and its half of the recordings."""
+    """A motion and its captions, with the data set and the half (0 or 1) to which its recording belongs."""
 
     dataset: str
     half: int
@@ -72,9 +74,10 @@ class Example:
 
 @dataclass(frozen=True)
 class Case:
-    """A claim about a motion, and the change that falsified it ("" if the claim is unchanged and true).
+    """A claim about a motion.
 
-    `is_built`: whether the claim comes from `built_cases`, not from a caption.
+    `change` describes how the claim was falsified, and is "" for a true claim. `is_built` is True if
+    the claim comes from `built_cases` instead of a caption.
     """
 
     example: Example
@@ -102,7 +105,10 @@ def main(folders: Sequence[Path], figures: Path | None) -> None:
 
 
 def read(folder: Path) -> Iterator[Example]:
-    """Yields the motions in a prepared data set, without mirrored or repeated copies."""
+    """Yields the captioned motions in a prepared data set, except for mirrored and repeated copies.
+
+    Of the procedural motions, only a part of the test split is used.
+    """
     store = Store(folder)
     files = sorted((EXPERIMENTS / "representation").glob("*.yaml"))
     nodes = {file.stem: read_yaml(file) for file in files}
@@ -130,7 +136,7 @@ def read(folder: Path) -> Iterator[Example]:
 
 
 def cases_of(example: Example) -> list[Case]:
-    """Returns the claims in all captions for a motion and their falsified versions, without duplicates."""
+    """Returns the claims in all captions for a motion, and their falsified versions, without duplicates."""
     claims = {str(claim): claim for text in example.captions for claim in read_claims(text)}
     cases = []
     for claim in claims.values():
@@ -143,7 +149,10 @@ def cases_of(example: Example) -> list[Case]:
 
 
 def built_cases(example: Example) -> list[Case]:
-    """Returns claims about durations, the start and the end: claims assumed to be true, and falsified claims."""
+    """Returns constructed claims about the duration, the start and the end of a motion.
+
+    Some claims are assumed to be true, and the others are their falsified versions.
+    """
     if example.dataset == SYNTHETIC:
         return []
     sets = [{claim.kind for claim in read_claims(text)} for text in example.captions]
@@ -163,7 +172,7 @@ def built_cases(example: Example) -> list[Case]:
 
 
 def cut(example: Example, seconds: int) -> Example:
-    """Returns the middle of a motion."""
+    """Returns the middle part of a motion, with the given duration."""
     body = example.body
     frames = round(seconds * RATE)
     first = (len(body) - frames) // 2
@@ -172,7 +181,7 @@ def cut(example: Example, seconds: int) -> Example:
 
 
 def calibrate(cases: Sequence[Case]) -> None:
-    """Writes the thresholds for all kinds with enough claims."""
+    """Calibrates and writes the thresholds for all kinds of claims with at least `FEWEST` true claims."""
     kinds.FILE.unlink(missing_ok=True)
     kinds.thresholds.cache_clear()
     scores: defaultdict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
@@ -200,9 +209,15 @@ def calibrate(cases: Sequence[Case]) -> None:
 def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[float, float]:
     """Returns two thresholds: claims are false up to the first score, and true from the second score on.
 
-    The first threshold is set by hand, and lowered until at most `MOST_REFUSED` of the true claims
-    are judged false. The second threshold is raised until `LEAST_REFUSED` of the decided falsified
-    claims are judged false.
+    The first threshold is lowered until at most `MOST_REFUSED` of the true claims are judged false.
+    The second threshold is raised until `LEAST_REFUSED` of the decided falsified claims are judged
+    false.
+
+    Args:
+        true: scores of true claims.
+        wrong: scores of falsified claims.
+        no: first threshold before calibration, set by hand.
+        yes: second threshold before calibration, set by hand.
     """
     refused = int(MOST_REFUSED * len(true))
     lowest = float(np.sort(true)[refused])
@@ -217,7 +232,7 @@ def chosen(true: np.ndarray, wrong: np.ndarray, no: float, yes: float) -> tuple[
 
 
 def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Counts true and falsified claims, decided claims and right verdicts in each set and group."""
+    """Counts true and falsified claims by set and group, and how many of them are decided and judged correctly."""
     counts: defaultdict[tuple[str, str], dict[str, int]] = defaultdict(
         lambda: dict.fromkeys(
             ("true", "true_decided", "true_right", "false", "false_decided", "false_right"), 0
@@ -244,7 +259,7 @@ def tally(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def name_of(claim: Claim) -> str:
-    """Returns the kind of a claim, with a mark for claims about a duration, the start or the end."""
+    """Returns the name of a claim's kind, which also states whether it is about a duration, the start or the end."""
     if claim.seconds is not None:
         return f"{claim.kind}, duration"
     return f"{claim.kind}, {claim.when}" if claim.when else claim.kind
@@ -274,7 +289,7 @@ def by_set(examples: Sequence[Example]) -> dict[str, list[Example]]:
 
 
 def coverage(examples: Sequence[Example]) -> dict[str, Any]:
-    """Returns three numbers: captions, captions with a claim, and captions with a decided claim."""
+    """Returns the number of captions, of captions with a claim, and of captions with a decided claim."""
     captions = with_claim = with_decided = 0
     for example in examples:
         for text in example.captions:

@@ -24,12 +24,12 @@ the caption of a motion counts as true. Falsified claims count as false. They st
 one repetition more or less, the reverse order, another duration, or the other end of the motion. A wrong caption
 counts as an error by the referee. We corrected patterns and measurements after we had seen errors on both halves, so
 expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as kicking with both
-legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the CMU claims would be
-right.
+legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the verdicts on CMU's
+claims would be right.
 
-CMU's captions come from HumanML3D's test split and from KIT-ML; they cover only the recordings that were available.
-Bandai-Namco's captions are built from its labels with templates, so its many clips have few different sentences. Read
-the figures for each set separately.
+CMU's captions come from HumanML3D's test split and from KIT-ML, and cover only the recordings that were available.
+Bandai-Namco's captions are filled-in templates, so its many clips have only a few different sentences. The figures for
+the sets should therefore be read separately.
 """
 
 
@@ -67,7 +67,11 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
             true = share(row["true_right"], row["true_decided"])
             false = share(row["false_right"], row["false_decided"])
             lines.append(f"| {title} | {group} | {decided} | {true} | {false} |")
-    lines += ["", "This table covers the captions of all recordings in a set, in both halves:", ""]
+    lines += [
+        "",
+        "The next table covers the captions of all recordings in a set, in both halves:",
+        "",
+    ]
     lines += ["| set | captions | with a claim | with a decided claim |", "|---|---:|---:|---:|"]
     for row in rows:
         if "captions" in row:
@@ -78,7 +82,7 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
     lines += built_table(rows)
     kinds = [row for row in rows if row["set"] == "real" and row["group"].startswith("kind ")]
     lines += below_the_targets(kinds)
-    lines += ["", "This table shows each kind of claim, over all real sets:", ""]
+    lines += ["", "The next table shows each kind of claim, over all real sets:", ""]
     lines += [
         "| kind | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",
@@ -91,10 +95,10 @@ def calibration_tables(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str]:
-    """Returns a table for both halves of the recordings, judged with each other's thresholds."""
+    """Returns a table for both halves of the recordings, each judged with thresholds from the other half, as lines."""
     lines = [
         "",
-        "This table covers both halves of the recordings, each judged with thresholds from the other half:",
+        "The next table covers both halves of the recordings. Each half is judged with thresholds from the other half:",
         "",
     ]
     lines += [
@@ -107,23 +111,24 @@ def crossed_table(by_name: Mapping[tuple[str, str], dict[str, Any]]) -> list[str
             lines.append(f"| {title} | {both_shares(row)} |")
     lines += [
         "",
-        "CMU's figures are below the targets. Four of its falsified claims are not judged false. Three of the four",
-        "state the opposite direction of motions that go both ways. The fourth is about squats: the caption states",
-        "three squats, but the referee counts two. The true claims that are judged false are about these squats, a jog",
-        "in place, and a walk at 1.8 m/s that one caption calls slow and another caption calls brisk.",
+        "CMU's figures are below the targets. Four of its falsified claims are not judged false. Three of these claims",
+        "state the opposite direction for motions that go both ways. The fourth claim is about squats: the caption",
+        "states three squats, but the referee counts two. The true claims that are judged false concern these squats,",
+        "a jog in place, and a walk at 1.8 m/s that one caption calls slow and another caption calls brisk.",
     ]
     return lines
 
 
 def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns a table for constructed claims about durations, the start and the end."""
+    """Returns a table for the constructed claims about the duration, the start and the end, as lines."""
     lines = [
         "",
-        "Captions hardly ever state a duration, a start or an end, so these claims were constructed instead. If the",
-        "captions of a recording only state that the body walks, runs or stands still, the recording is cut to two,",
-        "three and four seconds. Falsified claims state twice or half the duration. In recordings of walks, the person",
-        "is assumed to be standing upright at the start and at the end. Claims that the person is lying at the start",
-        "or at the end are therefore used as falsified claims. The other tables do not contain these claims.",
+        "Captions hardly ever state a duration or describe the start or the end of a motion, so claims about them were",
+        "constructed. If the captions of a recording only state that the person walks, runs or stands still, the",
+        "recording is cut to two, three and four seconds. Falsified claims state twice or half the duration. In",
+        "recordings of walks, the person is assumed to be standing upright at the start and at the end. The claims",
+        "that the person is lying at the start or at the end are therefore false. The other tables do not contain the",
+        "constructed claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",
@@ -138,9 +143,9 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns the kinds of claims below the targets.
+    """Returns a paragraph that lists the kinds of claims that miss the targets.
 
-    The targets are right verdicts on 97 % of true claims and 90 % of falsified claims.
+    The targets are right verdicts on 97 % of the true claims and on 90 % of the falsified claims.
     """
     missed = [
         f"{row['group'].removeprefix('kind ')} ({side}: {share(right, decided)})"
@@ -152,13 +157,13 @@ def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
     return [
         "",
-        "The targets are right verdicts on 97 % of true claims and 90 % of falsified claims. These kinds of claims "
-        f"miss the targets: {', '.join(missed)}.",
+        "The targets are right verdicts on 97 % of the true claims and on 90 % of the falsified claims. The following "
+        f"kinds of claims miss the targets: {', '.join(missed)}.",
     ]
 
 
 def both_shares(row: Mapping[str, Any]) -> str:
-    """Returns two cells: true claims judged true, and falsified claims judged false."""
+    """Returns two table cells: the share of true claims judged true, and of falsified claims judged false."""
     true = share(row["true_right"], row["true_decided"])
     return f"{true} | {share(row['false_right'], row['false_decided'])}"
 
@@ -168,13 +173,12 @@ def systems_table(content: Mapping[str, Any]) -> list[str]:
     both = sum(row["top3"] is not None for row in content["rows"])
     lines += [
         "The table shows the share of decided claims that are true, and R-precision (`MotionsForText`, top 3, with",
-        "the package's motion-CLIP) on the same motions. Each row has at most",
-        f"{content['motions']} motions. Over the {both} rows with both values, the rank correlation is",
-        f"{content['rank_correlation']:.2f}. Generated motions are at most three seconds",
-        "long, which is too short for some turns. The model for Bandai-Namco is small and was trained for eleven",
-        "minutes on one thread. There is no model for CMU, because only 23 training clips were available.",
-        "[Another table](bandai_small.md) shows both values for FLAME, MDM, MFM and DiP models that were trained on",
-        "Bandai-Namco for the same time.",
+        f"the package's motion-CLIP) on the same motions. Each row covers at most {content['motions']} motions.",
+        f"Over the {both} rows with both values, the rank correlation is {content['rank_correlation']:.2f}. Generated",
+        "motions are at most three seconds long, which is too short for some turns. The model for Bandai-Namco is",
+        "small and was trained for eleven minutes on one thread. There is no model for CMU, because only 23 training",
+        "clips were available. [Another page](bandai_small.md) shows both values for FLAME, MDM, MFM and DiP models",
+        "that were trained on Bandai-Namco for the same time.",
     ]
     groups = ("all", "side", "direction", "count", "movement", "posture", "contact")
     lines += ["", f"| data | motions | {' | '.join(groups)} | decided | R-precision |"]
@@ -190,9 +194,9 @@ def eye_table(verdicts: list[dict[str, Any]]) -> list[str]:
     agreed = sum(verdict["agrees"] for verdict in verdicts)
     lines = ["", "## Verdicts checked by eye", ""]
     lines.append(
-        f"We compared {len(verdicts)} verdicts on motions from the second half with twelve pictures of each motion. "
-        f"The verdicts are spread over the kinds of claims, with at most one per motion. {agreed} of them agree with "
-        "the pictures."
+        f"We checked {len(verdicts)} verdicts on motions from the second half against twelve pictures of each motion. "
+        f"The verdicts are spread over the kinds of claims, with at most one per motion. Of these, {agreed} verdicts "
+        "agree with the pictures."
     )
     lines += ["", "| motion | verdict | agrees | |", "|---|---|---|---|"]
     for verdict in verdicts:

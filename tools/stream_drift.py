@@ -2,9 +2,10 @@
 
     python tools/stream_drift.py [MODEL]
 
-In several streams of five minutes, the text changes every ten seconds. The texts are captions for
-single synthetic actions that rules can recognize. The last minute repeats the texts of the first
-minute, so that both can be compared. Without MODEL, only the page and the figure are regenerated.
+MODEL generates several streams of five minutes, in which the text changes every ten seconds. The
+texts are captions for single synthetic actions that rules can recognize. The last minute repeats the
+texts of the first minute, so that both can be compared. Without MODEL, only the page and the figure
+are regenerated.
 """
 
 import sys
@@ -40,22 +41,23 @@ MINUTES = 5
 SECONDS_PER_TEXT = 10
 TEXTS_PER_MINUTE = 60 // SECONDS_PER_TEXT
 PERIODS = {"0–10 s": (0, 10), "50–60 s": (50, 60), "290–300 s": (290, 300)}
-WINDOW = 2.0  # seconds of the windows whose features are compared
+WINDOW = 2.0  # length in seconds of the windows that FID compares
 SHOWN = (2.0, 3.0, 4.0)  # lengths in seconds of the windows that are searched for an action
 LATEST = 4.0  # seconds from a text change to the latest end of these windows
-IN_TIME = 2.0  # seconds from a text change in which an action is recognized "in time"
-DEEP = 0.03  # depth in meters below the floor of toes that are counted
+IN_TIME = 2.0  # seconds after a text change within which an action is recognized "in time"
+DEEP = 0.03  # toes that are more than this many meters below the floor are counted
 TOES = [10, 11]
 HEAD = 15
 
 
 INTRODUCTION = """# Long streams, measured
 
-[Streams](../streams.md) explains how a stream works. `python tools/stream_drift.py {model}` computes the figures.
+[Streams](../streams.md) explains how a stream works. `python tools/stream_drift.py {model}` computes the figures on
+this page.
 
-{streams} streams of {minutes} minutes each receive a new text every ten seconds, {texts} texts per stream. The texts
-are captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both can be
-compared. Unless stated otherwise, no frame is cleaned up.
+In each of {streams} streams of {minutes} minutes, the text changes every ten seconds, so a stream has {texts} texts.
+The texts are captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both
+can be compared. Unless stated otherwise, the motions are not cleaned up.
 
 ## Drift
 
@@ -63,11 +65,12 @@ compared. Unless stated otherwise, no frame is cleaned up.
 
 {periods}
 
-FID is computed with the package's motion-CLIP between windows of two seconds and synthetic motions that the model has
-not seen. For a second draw of such motions, it is {real_fid}. The jitter is {first} m/s³ in the first minute and
-{last} m/s³ in the last minute, {ratio} times as much. In 99.9 % of the frames, no toe is more than {low} cm below the
-floor. The lowest toe is {lowest} cm below the floor. With `cleanup=true`, the lowest toe of the same streams is
-{cleaned_lowest} cm below the floor, and {cleaned_deep} of {cleaned_frames} frames are more than 3 cm below it.
+FID is computed with the package's motion-CLIP between two-second windows of the streams and of synthetic motions that
+the model has not seen. For a second draw of such motions, FID is {real_fid}. The jitter is {first} m/s³ in the first
+minute and {last} m/s³ in the last minute, which is {ratio} times as much. In 99.9 % of the frames, no toe is more than
+{low} cm below the floor, and the lowest toe in any frame is {lowest} cm below it. With `cleanup=true`, the lowest toe
+in the same streams is {cleaned_lowest} cm below the floor, and in {cleaned_deep} of {cleaned_frames} frames, a toe is
+more than 3 cm below it.
 
 ## Seams
 
@@ -78,9 +81,9 @@ meters:
 
 ## Texts
 
-{in_time} of {changes} actions ({in_time_share} %) are recognized in the first two seconds after the text changed.
-{right} actions ({share} %) are recognized in at least one window of two, three or four seconds that ends at most four
-seconds after the change. These actions are not always recognized: {actions}.
+Of {changes} actions, {in_time} ({in_time_share} %) are recognized in the first two seconds after the text changes, and
+{right} ({share} %) are recognized in at least one window of two, three or four seconds that ends at most four seconds
+after the change. These actions are not always recognized: {actions}.
 """
 
 
@@ -95,7 +98,12 @@ def main(model: str | None) -> None:
 
 
 def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
-    """Returns all measurements of a model."""
+    """Returns the content of streams.json for a model.
+
+    Args:
+        model: a model that continues frames.
+        name: name of the model, which is shown on the page.
+    """
     fps = model.representation.fps
     requests = [texts(number) for number in range(STREAMS)]
     joints, seams, cleaned = streamed(model, requests)
@@ -138,7 +146,7 @@ def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
 
 
 def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
-    """Returns measurements for every ten seconds of streams (B, F, 22, 3)."""
+    """Returns skating, head height and jitter for every ten seconds of the streams (B, F, 22, 3)."""
     length = round(SECONDS_PER_TEXT * fps)
     parts = [joints[:, begin : begin + length] for begin in range(0, joints.shape[1], length)]
     return {
@@ -149,7 +157,7 @@ def over_time(joints: np.ndarray, fps: float) -> dict[str, list[float]]:
 
 
 def figure(results: dict[str, Any]) -> Markup | None:
-    """Returns a figure that shows the streams over time, as SVG."""
+    """Returns an SVG figure of skating, head height and jitter over time."""
     panels = [
         Panel(
             [Series(name, [(SECONDS_PER_TEXT * number, y) for number, y in enumerate(values)])],
@@ -186,9 +194,11 @@ def texts(stream: int) -> list[tuple[str, Attributes]]:
 def streamed(
     model: MotionGenerator, requests: Sequence[Sequence[tuple[str, Attributes]]]
 ) -> tuple[np.ndarray, dict[str, float], np.ndarray]:
-    """Returns joints (B, F, 22, 3) from streams, how much they move at seams, and the cleaned joints.
+    """Runs one stream per list of requests.
 
-    The cleaned joints do not include the last block.
+    Returns:
+        The joint positions (B, F, 22, 3), the movement at seams and inside blocks (see `seams_of`),
+        and the joint positions after cleanup, which lack the last block.
     """
     prefix, _ = starting_point(model, None)
     first = [request[0][0] for request in requests]
@@ -221,7 +231,10 @@ def streamed(
 
 
 def seams_of(joints: np.ndarray, seams: np.ndarray) -> dict[str, float]:
-    """Returns the median and 99th percentile of a joint's largest step (m) and change of step, at seams and inside."""
+    """Returns the medians and 99th percentiles of the largest step of any joint and of its largest change, in meters.
+
+    Frames at seams and inside blocks are measured separately.
+    """
     figures = {}
     for name, order in (("step", 1), ("change of step", 2)):
         size = np.linalg.norm(np.diff(joints, order, axis=1), axis=-1).max(-1)
@@ -237,7 +250,14 @@ def seams_of(joints: np.ndarray, seams: np.ndarray) -> dict[str, float]:
 def in_period(
     joints: np.ndarray, fps: float, extractor: MotionCLIPExtractor, real: torch.Tensor
 ) -> dict[str, float]:
-    """Returns the measurements for one period, over all streams."""
+    """Returns the metrics of all streams in one period.
+
+    Args:
+        joints: joint positions (B, F, 22, 3) in the period.
+        fps: frames per second.
+        extractor: the extractor for FID.
+        real: features (N, E) of real motions.
+    """
     length = round(WINDOW * fps)
     windows = joints.reshape(-1, length, *joints.shape[2:])
     return {
@@ -259,7 +279,7 @@ def encoded(extractor: MotionCLIPExtractor, windows: np.ndarray) -> torch.Tensor
 
 
 def real_windows(count: int, length: int, fps: float, seed: int) -> np.ndarray:
-    """Returns windows (N, F, 22, 3) from unseen synthetic motions that are similar to the training data."""
+    """Returns windows (N, F, 22, 3) from synthetic motions that are similar to the training data but not part of it."""
     source = SyntheticSequences(clips=10 * count, seed=seed)
     rng = np.random.default_rng(seed)
     windows: list[np.ndarray] = []
@@ -283,9 +303,10 @@ def value(metric: FootSkating | Jitter, joints: np.ndarray) -> float:
 def recognized(
     joints: np.ndarray, requests: Sequence[Sequence[tuple[str, Attributes]]], fps: float
 ) -> dict[str, Any]:
-    """Returns how many requested actions are recognized.
+    """Counts the requested actions that are recognized.
 
-    `in_time` counts the first two seconds alone, `right` any window that ends in time.
+    `in_time` counts actions in the first two seconds after a text change. `right` counts actions in any
+    window that ends at most `LATEST` seconds after the change.
     """
     in_time = 0
     right: dict[str, list[int]] = {}
@@ -322,7 +343,7 @@ def is_shown(motion: np.ndarray, attributes: Attributes, fps: float) -> bool:
 
 
 def page(results: dict[str, Any]) -> str:
-    """Returns the page that shows the figures."""
+    """Returns the content of streams.md."""
     low, seams, shown = results["lowest_toe"], results["seams"], results["recognized"]
     cleaned = results["cleaned_toes"]
     ratio = results["jitter_last_minute"] / results["jitter_first_minute"]

@@ -1,7 +1,7 @@
 """Builds the web page that requires no installation, in build/web: `make web`.
 
-The page runs the model from this package in the browser. onnxruntime-web comes from npm at a pinned
-version.
+The page runs a model from this package in the browser. A pinned version of onnxruntime-web is
+downloaded from npm.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from flame_mdm.visualize.body import HELPERS
 from flame_mdm.visualize.player import player_page
 
 SOURCE = Path(__file__).with_suffix("")
-# The stream page's files, which the demo also uses
+# Files of the page with a stream, which the demo also uses
 LIVE = [Path(flame_mdm.demo.__file__).with_name(name) for name in ("live.js", "live.css")]
 RUNTIME, INTEGRITY = (
     "onnxruntime-web@1.30.0",
@@ -65,26 +65,26 @@ RUNTIME, INTEGRITY = (
 )
 """The npm package, and the SHA-512 of its archive."""
 RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
-STREAM = "stream"  # folder for the stream's model, if it is not the model for single motions
+STREAM = "stream"  # folder for the stream's model, unless it is also the model for single motions
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; base-uri 'none'; form-action 'none'"
 )
 
 
 def build(model: MotionGenerator, out: Path, streaming: MotionGenerator | None = None) -> None:
-    """Writes the page for a model, and the page with a stream.
+    """Writes the page for single motions and, if a model can stream, the page with a stream.
 
-    The models must have a learned text encoder, captions for single actions and SMPL's 22 joints.
+    Both models must have a learned text encoder, captions for single actions and SMPL's 22 joints.
 
     Args:
         model: the model for single motions.
-        out: folder in which the page is written.
-        streaming: the model for the stream, which continues frames. Default: `model`, if it
-            continues frames. Otherwise, there is no page with a stream.
+        out: output folder for both pages.
+        streaming: the model for the stream, which must continue frames. By default, `model` is used
+            if it continues frames; otherwise, the page with a stream is omitted.
 
     Raises:
-        UserError: If a model's captions do not name single actions, `streaming` does not continue frames, or
-            onnxruntime-web cannot be fetched.
+        UserError: If a model's captions do not name single actions, if `streaming` does not continue
+            frames, or if onnxruntime-web cannot be downloaded.
     """
     check_captions(model)
     write_model(model, out)
@@ -133,13 +133,13 @@ def check_captions(model: MotionGenerator) -> None:
 
 
 def write_model(model: MotionGenerator, folder: Path) -> None:
-    """Writes a model's graphs and `model.json`."""
+    """Writes the ONNX graphs of a model and `model.json` to a folder."""
     write_folder(model, folder, half=True)
     (folder / "runner.py").unlink()
 
 
 def write_language(out: Path) -> None:
-    """Writes `language.json` and `language.bin`, the tables with which the page interprets text.
+    """Writes the tables that the page uses to interpret text: `language.json` and `language.bin`.
 
     `language.bin` contains the word vectors, with 8 bits per number, followed by the words.
     """
@@ -193,7 +193,7 @@ def language_constants() -> dict[str, Any]:
 
 
 def write_pictures(out: Path, actions: Sequence[str]) -> None:
-    """Writes the pictures of actions, and writes their names to `pictures.json`."""
+    """Writes the pictures of actions, and `pictures.json`, which lists the picture of each action."""
     (out / "pictures").mkdir(exist_ok=True)
     pictures = {}
     for number, action in enumerate(actions):
@@ -204,7 +204,7 @@ def write_pictures(out: Path, actions: Sequence[str]) -> None:
 
 
 def figure(example: Motion) -> dict[str, Any]:
-    """Returns the body of the example motion, which the page uses to draw motions as the mannequin."""
+    """Returns the data that the page needs to draw motions as the mannequin, computed from an example motion."""
     body, names = fit_body(example), list(SMPL22.joints)
     offsets = np.asarray(example.posed().offsets)
     helpers = []
@@ -235,8 +235,8 @@ def fetch_runtime(folder: Path) -> None:
     """Downloads onnxruntime-web with npm.
 
     Raises:
-        UserError: If npm is missing or fails, or if the downloaded archive is not the pinned
-            archive.
+        UserError: If npm is missing or fails, or if the downloaded archive does not have the pinned
+            hash.
     """
     if shutil.which("npm") is None:
         raise UserError("make web requires npm to download onnxruntime-web. Install Node.js")
@@ -247,7 +247,7 @@ def fetch_runtime(folder: Path) -> None:
         (archive,) = Path(temporary).iterdir()
         if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != INTEGRITY:
             raise UserError(
-                f"{RUNTIME}: npm's archive is not the pinned archive (its SHA-512 differs)"
+                f"{RUNTIME}: the downloaded archive is not the pinned archive (its SHA-512 differs)"
             )
         folder.mkdir(exist_ok=True)
         with tarfile.open(archive) as packed:

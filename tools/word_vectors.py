@@ -3,17 +3,18 @@
     pip install "flame-mdm[offline]"
     python tools/word_vectors.py [OUT.npz]
 
-The method is model2vec (Tulkens & van Dongen 2024): each word is encoded separately, and principal
-components reduce the outputs to `WIDTH` numbers. Words are encoded after "a person", so that a word
-that is both a verb and a noun has the meaning of the verb. This was checked on the most certain
-third of the words for actions. For 83 % of them, the nearest word means the same action; without "a
-person", this holds for 69 %. Frequent words have less weight in a mean of several words (smooth
-inverse frequency, Arora et al. 2017). `flame_mdm.conditions.language.vectors` computes the weight
-from the rank of a word. Vectors have length 1 and 8 bits per number.
+The method is model2vec (Tulkens & van Dongen 2024): each word is encoded separately, and a principal
+component analysis reduces the outputs to `WIDTH` numbers. Words are encoded after "a person", so
+that a word that is both a verb and a noun has the meaning of the verb. This was checked on the
+most certain third of the action words. For 83 % of these words, the nearest word means the same
+action, compared with 69 % without "a person". In a mean over several words,
+frequent words have less weight (smooth inverse frequency, Arora et al. 2017).
+`flame_mdm.conditions.language.vectors` computes this weight from the rank of a word. Vectors have
+length 1, and each of their numbers is stored in 8 bits.
 
-The words are the first `FREQUENT` whole words of BERT's vocabulary, which is sorted by frequency,
-and the words of `actions.yaml`, `phrases.yaml` and `MOTION`. Model and vocabulary are licensed
-under the Apache License 2.0.
+The table contains the first `FREQUENT` whole words in BERT's vocabulary, which is sorted by
+frequency, and the words in `actions.yaml`, `phrases.yaml` and `MOTION`. The model and the vocabulary
+are licensed under the Apache License 2.0.
 """
 
 import io
@@ -81,7 +82,7 @@ def main(out: Path) -> None:
 
 
 def listed(model: Pretrained) -> list[str]:
-    """Returns the words in the table: frequent words by frequency, then words for motion and things."""
+    """Returns the words in the table: first the frequent words, by frequency, then words for motion and objects."""
     ranks = model.tokenizer.get_vocab()
     frequent = sorted((word for word in ranks if WORD.fullmatch(word)), key=ranks.__getitem__)[
         :FREQUENT
@@ -97,7 +98,7 @@ def listed(model: Pretrained) -> list[str]:
 
 
 def encoded(model: Pretrained, words: list[str]) -> np.ndarray:
-    """Returns the model's outputs (N, C) for single words: means over tokens, including special tokens."""
+    """Returns the model's outputs (N, C) for single words, averaged over all tokens, including special tokens."""
     texts = [f"a person {word}" for word in words]
     outputs = []
     for first in range(0, len(texts), AT_ONCE):
@@ -110,7 +111,7 @@ def encoded(model: Pretrained, words: list[str]) -> np.ndarray:
 
 
 def reduced(outputs: np.ndarray) -> np.ndarray:
-    """Returns the principal components (N, `WIDTH`) of outputs (N, C), scaled to length 1."""
+    """Returns the first principal components (N, `WIDTH`) of the outputs (N, C), scaled to length 1."""
     unit = outputs / np.linalg.norm(outputs, axis=1, keepdims=True)
     centered = unit - unit.mean(0)
     _, _, directions = np.linalg.svd(centered, full_matrices=False)

@@ -19,7 +19,7 @@ from .skeleton import SMPL22
 
 FOLDER = Path(__file__).parent
 AXES = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Rotation from y up and facing +z to Blender's z up and facing -y."""
+"""Rotation from coordinates with y up, facing +z, to Blender's coordinates with z up, facing -y."""
 POOL = ThreadPoolExecutor(1)
 
 
@@ -28,9 +28,13 @@ POOL = ThreadPoolExecutor(1)
 
 @dataclass
 class Sampled:
-    """A sampled motion for SMPL's joints: positions, rotations and offsets.
+    """A sampled motion of SMPL's 22 joints.
 
     Attributes:
+        joints: joint positions (F, 22, 3) in meters, y up.
+        world: world rotations (F, 22, 3, 3).
+        offsets: positions of the joints relative to their parents (22, 3) at rest, in meters.
+        fps: frames per second.
         summary: the actions as the model understood them, such as "walks forward".
         warnings: differences between the sentence and the motion, one line each.
     """
@@ -106,10 +110,10 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def read_armature(armature):
-    """Returns the rest pose of an armature at the origin, and the size of the armature.
+    """Returns the rest pose of an armature, moved to the origin, and the scale of the armature.
 
     Raises:
-        ValueError: If the bones belong to no known skeleton, or if the armature is mirrored, scaled
+        ValueError: If the bones match no known skeleton, or if the armature is mirrored, scaled
             unevenly or not upright.
     """
     bones = sorted(armature.data.bones, key=lambda bone: len(bone.parent_recursive))
@@ -150,7 +154,7 @@ def read_armature(armature):
 
 
 def new_armature(context, name: str, motion: Sampled):
-    """Adds an armature with the body of a motion, in a T-pose on the floor."""
+    """Adds an armature in a T-pose on the floor, with the bone lengths of a motion, and returns it."""
     rest = np.zeros_like(motion.offsets)
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + motion.offsets[joint]
@@ -177,13 +181,15 @@ def new_armature(context, name: str, motion: Sampled):
 
 
 def animate(context, armature, name: str, motion: Sampled, own: bool) -> int:
-    """Keys a motion in a new action, starting at the first frame of the scene, and returns the number of frames.
+    """Inserts the keyframes of a motion into a new action, and returns the number of frames.
+
+    The action starts at the first frame of the scene.
 
     Args:
         context: Blender's context.
         armature: the armature to animate.
-        name: name of the action.
-        motion: the motion to key.
+                name: name of the new action.
+        motion: the motion to insert.
         own: whether `new_armature` created the armature. If so, every joint is moved to its
             position in the motion.
     """
@@ -258,11 +264,11 @@ class Settings(bpy.types.PropertyGroup):
             name="Seed", description="A different seed gives a different motion", default=0
         ),
         "in_place": BoolProperty(
-            name="In place", description="Leave out the path of the hips over the floor"
+            name="In place", description="Remove the path of the hips over the floor"
         ),
         "onto_selected": BoolProperty(
             name="Onto the selected armature",
-            description="Names of Mixamo, Unreal, Unity, SMPL, or Rigify's metarig",
+            description="Animate the selected armature, with bone names of Mixamo, Unreal, Unity, SMPL or Rigify",
         ),
     }
 

@@ -322,11 +322,11 @@ SIZES: dict[str, tuple[str, list[str]]] = {
 MEMORY = """# Memory for training
 
 {head}
-This table is computed from the recipes. The figures are GiB per process, in float32, with the recipe's batch size and
+This table is computed from the recipes. Sizes are in GiB per process, for float32, the recipe's batch size and its
 longest motions. The state consists of the weights, their gradients, Adam's two states and, if the recipe averages
-weights, the averaged weights. The size of the state does not depend on the batch size. Activations are tensors that the
-forward pass keeps for the backward pass. Their size grows with `data.batch_size`. On a GPU, `speed=fast` halves this
-size. A frozen text encoder is not on the device during training. Libraries and kernels need additional memory.
+weights, the averaged weights. Its size does not depend on the batch size. Activations are the tensors that the forward
+pass keeps for the backward pass. Their size grows with `data.batch_size`, and on a GPU, `speed=fast` halves it. Frozen
+text encoders are not on the device during training. Libraries and kernels take additional memory.
 
 | model | parameters, M | batch | state | activations | with `task.checkpoint_activations` |
 |---|---:|---:|---:|---:|---:|
@@ -334,7 +334,7 @@ size. A frozen text encoder is not on the device during training. Libraries and 
 
 The wide models override `denoiser.latent_dim`, `denoiser.ff_size` (four times the width) and `denoiser.num_layers`.
 
-[GPUs and clusters](clusters.md#larger-models) explains what to do if a model does not fit.
+[GPUs and clusters](clusters.md#larger-models) explains what to do if a model does not fit into memory.
 """
 
 

@@ -110,7 +110,7 @@ def render(sections: dict[str, Any]) -> str:
         lines += [
             f"\n## {title}\n",
             body(section),
-            f"\n`{script}`, {section['date']}, machine {number}.",
+            f"\nMeasured by `{script}` on {section['date']}, on machine {number}.",
         ]
     return "\n".join(lines) + "\n"
 

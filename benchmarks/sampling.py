@@ -226,7 +226,7 @@ def measure(settings: Settings) -> Section:
         ancestral sampler and include the drawing of noise. "Distilled" refers to the sampler for distilled models,
         without guidance. The samplers are compared with {BATCH} motions per batch. The loops are timed without a
         network, for a single motion. Values are medians of {size.rounds} alternating rounds.""",
-        f"With 10 steps, one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 give "
+        f"With 10 steps, sampling one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 yield "
         f"{64 / ten['64']:.0f} motions per second.",
         {
             "latency at batch 1 and throughput at batch 64": steps,

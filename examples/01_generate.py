@@ -1,4 +1,4 @@
-"""Motions from text, and files for other programs."""
+"""Generates motions from text, and saves them as files for other programs."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import flame_mdm
 FOLDER = Path("examples_output/01_generate")
 FOLDER.mkdir(parents=True, exist_ok=True)
 
-model = flame_mdm.load("quickstart")  # also a run directory, a model file, or a model on the hub
+model = flame_mdm.load("quickstart")  # or a run directory, a model file, or a model on the hub
 texts = [
     "a person waves with the left hand",
     "a person walks in a circle clockwise, then sits down",

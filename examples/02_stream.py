@@ -1,10 +1,10 @@
-"""Endless motion whose text changes while it runs."""
+"""Streams endless motion, and changes its text while the stream runs."""
 
 import sys
 
 import flame_mdm
 
-# A DiP model; `make train EXP=synthetic/dip` trains one without a download.
+# A DiP model. `make train EXP=synthetic/dip` trains such a model without a download.
 MODEL = sys.argv[1] if len(sys.argv) > 1 else "runs/synthetic/dip/default"
 
 model = flame_mdm.load(MODEL)

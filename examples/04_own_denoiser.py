@@ -1,4 +1,4 @@
-"""A network of your own, trained and sampled like the others."""
+"""Trains a denoiser of your own, and samples from it as from any other model."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ class Convolutions(Denoiser):
 
 
 def main() -> None:
-    # The other parts come from a recipe.
+    # A recipe provides the other parts.
     config = compose("quickstart", ["data.source.clips=100", "condition.pretrain_steps=0"])
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=0)

@@ -1,4 +1,4 @@
-"""A metric of your own, next to the metrics in the package."""
+"""Defines a metric of your own, which works like the metrics in the package."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,7 @@
-"""Training in ten lines of Python; `make train EXP=quickstart` also resumes, logs and reports."""
+"""Trains a model in ten lines of Python.
+
+`make train EXP=quickstart` also resumes runs, logs curves and writes reports.
+"""
 
 from lightning import Trainer
 

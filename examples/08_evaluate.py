@@ -1,4 +1,4 @@
-"""FID and R-precision of a model, with the evaluator in the package."""
+"""Computes the FID and R-precision of a model with the evaluator in the package."""
 
 from pathlib import Path
 
@@ -17,8 +17,8 @@ def run(*words: str) -> None:
 if __name__ == "__main__":  # data sets are prepared by processes that import this file
     run("prepare", "synthetic", "force=true")
 
-    # `quick` checks that everything works, with two replications of 64 motions; the result notes
-    # this.
+    # quick=true only checks that everything works: it evaluates two replications of 64 motions.
+    # The result is marked as quick.
     run(
         "evaluate",
         "quickstart",

@@ -1,4 +1,4 @@
-"""A student that samples in one to four steps."""
+"""Distills a model into a student that samples in one to four steps."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ def run(*words: str) -> None:
 
 
 if __name__ == "__main__":  # data sets are prepared by processes that import this file
-    # 10 steps only show that it runs. A teacher takes thousands of steps, a student takes a fifth
-    # of its teacher's steps.
+    # Ten steps only show that the code runs. A teacher is trained for thousands of steps, and a
+    # student for a fifth of its teacher's steps.
     run("train", "quickstart", f"run.dir={TEACHER}", "condition.pretrain_steps=0")
     run("distill", str(TEACHER), str(STUDENT))
 

@@ -1,4 +1,4 @@
-"""A style from a few clips, as a small file that changes the model."""
+"""Teaches a model a style from a few clips. The result is a small file that changes the model."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def main() -> None:
         np.savez(CLIPS / f"clip_{number}", joints=motion.joints, fps=motion.fps)
         (CLIPS / f"clip_{number}.txt").write_text("a person walks")
 
-    # Ten steps only show that it runs; the default is enough for a style.
+    # Ten steps only show that the code runs. The default number of steps is enough for a style.
     adapter = flame_mdm.adapt(
         "quickstart", CLIPS, "proud", FOLDER / "run", overrides=["trainer.max_steps=10"]
     )

@@ -54,7 +54,7 @@ def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_meas
     assert text == run.render(again)
     assert "Steps:\n\n| training | ms |\n| --- | ---: |\n| host | 1,234 |" in text
     assert "`benchmarks/host.py at commit x` on 2001-02-03, on machine 1." in text
-    assert "`benchmarks/averaging.py`, " in text
+    assert "`benchmarks/averaging.py` on " in text
     assert text.index("## Title of host") < text.index("## Title of averaging"), (
         "in the order of the scripts"
     )

@@ -1,4 +1,5 @@
-# Installs the versions in constraints.txt and checks their hashes. Build and use: docs/clusters.md.
+# Installs the versions in constraints.txt and checks their hashes. docs/clusters.md explains how to build and
+# use the image.
 #   docker build -t flame-mdm .
 #   docker build -t flame-mdm:cpu --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu .
 # The digest is Python 3.11.16 for all platforms. For a newer base: docker buildx imagetools inspect python:3.11-slim-bookworm
@@ -6,10 +7,10 @@
 ARG BASE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 FROM $BASE
 
-# PyPI has torch for CUDA, which includes the CUDA libraries.
+# On PyPI, torch is built for CUDA and includes the CUDA libraries.
 ARG TORCH_INDEX=https://pypi.org/simple
 
-# Kernels compiled by torch.compile need a C compiler.
+# torch.compile requires a C compiler.
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends gcc libc6-dev \
@@ -18,7 +19,7 @@ RUN apt-get update \
 WORKDIR /flame_mdm
 COPY constraints.txt ./
 # The torch index contains other versions of unrelated packages, so only torch is installed from it. The packages that
-# torch needs are installed from PyPI below.
+# torch requires are installed from PyPI below.
 RUN pip install --no-cache-dir uv==0.13.9 \
     && uv pip install --system --no-cache --no-deps -c constraints.txt --default-index "$TORCH_INDEX" torch
 COPY pyproject.toml README.md LICENSE ./

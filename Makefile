@@ -1,7 +1,7 @@
-# Runs everything in .venv; the first target that needs it installs it. `make help` lists the targets.
-# `make COMMAND KEY=value ...` is `flame-mdm COMMAND key=value ...`. EXP, DATA, CKPT, TABLE, RUNS and MOTION name the
-# object of a command, OUT its output. Commands read the variables from MAKEFLAGS (--from-make), not through a shell, so
-# that quotes, brackets and dollar signs in them survive.
+# All targets run in .venv, which the first target that requires it installs. `make help` lists the targets.
+# `make COMMAND KEY=value ...` runs `flame-mdm COMMAND key=value ...`. EXP, DATA, CKPT, TABLE, RUNS and MOTION name the
+# object of a command, and OUT names its output. Commands read the variables from MAKEFLAGS (--from-make) instead of
+# through a shell, so that quotes, brackets and dollar signs in them are preserved.
 .DEFAULT_GOAL := help
 PYTHON ?= python3
 VENV := .venv
@@ -37,13 +37,13 @@ $(READY): pyproject.toml constraints.txt
 	@$(VENV)/bin/python -m compileall -qq -j 0 -x '$(UNUSED)' $(VENV)/lib || true # on all cores; some packages hold files for other versions
 	@touch $@
 
-test: $(READY) ## run all tests, except those that need external tools
+test: $(READY) ## run all tests except those that require external tools
 	@$(PYTEST) -m "not tools and not robustness"
 
 test-fast: $(READY) ## run the tests that take a few seconds at most
 	@$(PYTEST) -m "not tools and not robustness and not slow"
 
-test-tools: $(READY) ## run the tests that need external tools: a browser, ffmpeg, Blender
+test-tools: $(READY) ## run the tests that require external tools: a browser, ffmpeg, Blender
 	@$(PYTEST) -m tools
 
 test-robustness: $(READY) ## run all tests with malformed inputs, killed processes, launchers, full disks, benchmarks and long comparisons; use it before a release, and after changes to readers
@@ -55,7 +55,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/pyright
 
-bench: $(READY) ## measure the speed and write docs/benchmarks/speed.md; ONLY=steps,host selects sections; DEVICE=cuda measures on a GPU; MDM_REPO=PATH adds the authors' step
+bench: $(READY) ## measure the speed and write docs/benchmarks/speed.md; ONLY=steps,host selects sections; DEVICE=cuda measures on a GPU; MDM_REPO=PATH, a clone of the authors' code, adds their training step
 	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)" "mdm_repo=$(MDM_REPO)" "runs=$(RUNS)"
 
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
@@ -63,7 +63,7 @@ docs: $(READY) ## write the pages that are generated from the code, and build th
 	@$(VENV)/bin/python -m sphinx -W --keep-going -q docs build/docs
 	@if [ -d build/web ]; then mkdir -p build/docs/web && cp -r build/web/. build/docs/web; fi
 
-web: $(READY) ## build the page that samples in the browser, in build/web; needs Node.js; CKPT=MODEL uses a different model than the package's; STREAM=MODEL does so for the page with a stream
+web: $(READY) ## build the page that generates motions in the browser, in build/web; requires Node.js; CKPT=MODEL selects the model, and STREAM=MODEL the model for the page with a stream
 	@$(VENV)/bin/python tools/web.py "$(CKPT)" $(STREAM)
 
 blender: $(READY) ## build the Blender extension in build/; PLATFORM=windows-x64, macos-arm64 or linux-x64 (default: this machine)

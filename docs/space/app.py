@@ -1,4 +1,4 @@
-"""A public demo on a Hugging Face Space; README.md says how to create one."""
+"""Runs a public demo in a Hugging Face Space. README.md explains how to create one."""
 
 import os
 

@@ -1,4 +1,4 @@
-// Checks of model.json and of a request: flame_mdm/checkpoints/runner.py in JavaScript.
+// Checks model.json and requests: a port of the checks in flame_mdm/checkpoints/runner.py.
 import { SCHEMA } from "./schema.js"; // written by tools/web.py
 
 const TYPES = {

@@ -1,5 +1,6 @@
-// FBX: the person in template.fbx with another animation. flame_mdm/formats/fbx_writer.py wrote the template, binary FBX
-// 7.4 in centimeters, and explains what each program needs. The rest of the file is copied unchanged.
+// Writes FBX files: the person in template.fbx with a different animation. The template (binary FBX 7.4 in centimeters)
+// was written by flame_mdm/formats/fbx_writer.py, which explains what each program requires. Everything else in the
+// template is copied unchanged.
 // A record is { name, properties, children }. Properties are encoded values; children are null if there is no list.
 import { angles, localRotations } from "./figure.js";
 
@@ -30,8 +31,8 @@ export async function fbx(figure, template, motion, fps, text) {
   return new Blob(written(template, records, end), { type: "application/octet-stream" });
 }
 
-// The objects by id, the joint of each bone and of each cluster of its vertices, and which property of which object each
-// curve changes: a curve belongs to an axis of a node, and the node to a property of a bone.
+// Returns the objects by id, the joint of each bone and of each cluster of its vertices, and the property that each curve
+// changes: a curve belongs to an axis of a node, and the node to a property of a bone.
 function linked(figure, objects, connections) {
   const byId = new Map(objects.map((record) => [readId(record.properties[0]), record]));
   const joints = new Map(), targets = new Map();
@@ -45,8 +46,8 @@ function linked(figure, objects, connections) {
   return { byId, joints, targets };
 }
 
-// Gives the skeleton and the skin the motion's bone lengths, including in the bind pose of the skin: Blender connects
-// bones in this pose, and connected bones cannot move.
+// Gives the skeleton and the skin the bone lengths of the motion. This includes the bind pose of the skin, because Blender
+// connects bones in this pose, and connected bones cannot move.
 async function resize(figure, motion, { byId, joints }) {
   const records = [...byId.values()];
   const { matrices, shifts } = await boundPose(figure, motion, records.find(({ name }) => name === "Pose"), joints);
@@ -70,7 +71,7 @@ async function resize(figure, motion, { byId, joints }) {
   first(geometry, "Vertices").properties = [doubles(vertices)];
 }
 
-// Changes the pose; returns world matrices by joint, and how far the joints move. The last four of the 16 numbers in a
+// Changes the pose. Returns the world matrices by joint, and how far the joints move. The last four of the 16 numbers in a
 // matrix are its translation.
 async function boundPose(figure, motion, pose, joints) {
   const matrices = [], shifts = [];

@@ -1,5 +1,5 @@
-// From rotations to the player's body, BVH and GLB; fbx.js writes FBX. Quaternions are [w, x, y, z]; figure.json is written
-// by tools/web.py.
+// Converts rotations to the player's body, BVH and GLB; fbx.js writes FBX. Quaternions are [w, x, y, z]. tools/web.py
+// writes figure.json.
 const clamp = (x, least, most) => Math.min(most, Math.max(least, x));
 const base64 = (array) => btoa(Array.from(new Uint8Array(array.buffer), (byte) => String.fromCharCode(byte)).join(""));
 const inverse = ([w, x, y, z]) => [w, -x, -y, -z];
@@ -8,7 +8,8 @@ function times([a, b, c, d], [w, x, y, z]) {
   return [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w];
 }
 
-// World rotations of the mannequin's 22 joints in a frame: its soles are flat, its head is level, its toes bend on the floor.
+// Returns the world rotations of the mannequin's 22 joints in a frame. Soles are flat, the head is level, and toes bend on
+// the floor.
 function posed(figure, { joints, quaternions }, frame) {
   const world = [], { toes: [near, far, most], parents } = figure;
   for (const [j, parent] of parents.entries()) {
@@ -24,7 +25,7 @@ function posed(figure, { joints, quaternions }, frame) {
   return fitted;
 }
 
-// Rotations of the mannequin's joints relative to their parents, by frame and joint.
+// Returns the rotations of the mannequin's joints relative to their parents, by frame and joint.
 export function localRotations(figure, motion) {
   return Array.from({ length: motion.frames }, (_, frame) => {
     const world = posed(figure, motion, frame).map((q, j) => times(q, inverse(figure.neutral[j])));
@@ -32,7 +33,8 @@ export function localRotations(figure, motion) {
   });
 }
 
-// Angles about z, y and x in radians. Two triples describe a rotation, up to full turns: the one nearest to `before`.
+// Returns angles about z, y and x in radians. Of the two triples that describe a rotation, up to full turns, the triple
+// nearest to `before` is returned.
 export function angles([w, x, y, z], before) {
   const first = [
     Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)),

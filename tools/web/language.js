@@ -1,5 +1,5 @@
-// The recognized meaning of a text, as chips: flame_mdm/demo/chips.py in JavaScript. language_words.js,
-// language_sentences.js and language_reading.js understand the text.
+// Shows the recognized meaning of a text as chips: a port of flame_mdm/demo/chips.py. The text is interpreted by
+// language_words.js, language_sentences.js and language_reading.js.
 import { download, json } from "./sampling.js";
 import { actions, constant, useTables } from "./language_words.js";
 import { mentionsOf, understand } from "./language_sentences.js";
@@ -21,8 +21,8 @@ export function openLanguage(model, [tables, bytes, pictures]) {
 }
 
 /**
- * Returns the chips of a text: its actions in their order, their attributes, and the words that change nothing.
- * `choose` gets the text in which the chosen value takes the place of the chip.
+ * Returns the chips for a text: its actions in order, their attributes, and the words that have no effect.
+ * `choose` is called with the text in which the chosen value replaces the value of the chip.
  */
 export function chips(abilities, { steps, ignored }, choose) {
   const rows = steps.map((step, number) => {

@@ -1,5 +1,5 @@
-// What a model makes of a sentence: the captions that it reads, and what it does not know.
-// The modules wording, abilities and reading of flame_mdm.conditions.language in JavaScript.
+// Translates a sentence to captions that a model knows, and reports what the model does not know.
+// A port of the modules wording, abilities and reading of flame_mdm.conditions.language.
 import {
   actions, baseForms, constant, inflections, nearestTo, once, similarity,
 } from "./language_words.js";
@@ -55,7 +55,7 @@ function participle(words) {
   return [forms.at(-1), ...rest].join(" ");
 }
 
-/** Returns the duration in seconds of a reading's first step if the visitor chooses none. */
+/** Returns the duration of a reading's first step in seconds, for visitors who choose no duration. */
 export function usualSeconds({ steps: [step = []] }, { fps, max_frames: longest, start }) {
   const most = start ? constant("usual_seconds") : Math.min(constant("usual_seconds"), longest / fps);
   const count = step.length === 1 ? step[0].attributes.count : undefined;
@@ -145,7 +145,7 @@ export class Abilities {
 
 // ---- what a model reads ----
 
-/** A sentence that is rejected; `nearest` contains captions with similar meanings. */
+/** Thrown for a sentence that is rejected. `nearest` contains captions with similar meanings. */
 export class NotUnderstood extends Error {
   constructor(message, nearest = []) {
     super(message);
@@ -247,7 +247,7 @@ export class Reader {
     return several.map((mention) => [mention]);
   }
 
-  /** Returns a step as often as its count needs: "kicks four times" is "kicks twice", two times. */
+  /** Returns a step as often as its count requires: "kicks four times" becomes "kicks twice", two times. */
   repeated(step, notes) {
     const [mention, ...others] = step;
     const { count } = mention.attributes;
@@ -291,7 +291,7 @@ function joinedSteps(steps, names) {
   return joined;
 }
 
-/** Returns the caption for a step: the words of the sentence if the model knows one that no table explains. */
+/** Returns the caption for a step. If the model knows a word of the sentence that is in no table, the sentence is kept. */
 function captionOf(step, words, special) {
   const isSpecial = words.toLowerCase().split(/\s+/u).some((word) => special.has(word));
   return isSpecial ? words : caption(step);

@@ -1,5 +1,5 @@
-// Sentences: which actions they ask for, in which order, with which attributes.
-// The modules matching, attributes, clauses and parsing of flame_mdm.conditions.language in JavaScript.
+// Parses sentences: which actions they request, in which order and with which attributes.
+// A port of the modules matching, attributes, clauses and parsing of flame_mdm.conditions.language.
 import {
   GAP, actions, baseForms, constant, corrected, correctedToAction, isForeign, isNumber, isThing, nearestActions,
   nearestTo, numbersOf, once, phrasesByFirstWord, sizeOf, tokenize, wordValues, wordsOf,
@@ -8,7 +8,7 @@ import {
 const distinct = (values) => [...new Set(values)];
 const isDeterminer = (word) => wordsOf("determiners").has(word);
 
-/** Returns what a sentence asks for, as far as it is understood. */
+/** Returns the actions that a sentence requests, as far as they are understood. */
 export function understand(text) {
   return once(`understood ${text}`, () => {
     const nothing = { text, steps: [], objects: [], unknown: [], corrected: new Map(), isForeign: false, nearest: [] };
@@ -516,7 +516,7 @@ class Sentence {
     return [[{ ...stating(before, stated), text, typed: "" }]];
   }
 
-  /** Returns whether a clause says what happens during the previous clause: "stands still, waving". */
+  /** Returns whether a clause states what happens during the previous clause: "stands still, waving". */
   isManner(clause, steps) {
     if (clause.link || !clause.afterComma || !clause.matches.length) return false;
     const [before] = steps.at(-1);

@@ -1,5 +1,5 @@
-// Words: their tables, base forms, typos and meanings.
-// The modules tables, morphology, spelling, vectors, meaning and tokens of flame_mdm.conditions.language in JavaScript.
+// Looks up words: tables, base forms, typos and meanings.
+// A port of the modules tables, morphology, spelling, vectors, meaning and tokens of flame_mdm.conditions.language.
 
 export const GAP = "...";
 
@@ -234,7 +234,7 @@ function dot(first, second) {
   return sum;
 }
 
-/** Returns the weighted sum of vectors, of length 1. */
+/** Returns the weighted sum of vectors, scaled to length 1. */
 function unitSum(vectors, weights) {
   const sum = new Float64Array(tables.vectors.dimensions);
   for (const [number, vector] of vectors.entries()) {
@@ -244,7 +244,7 @@ function unitSum(vectors, weights) {
   return sum.map((x) => x / length);
 }
 
-/** Returns the mean vector of words, of length 1, in which frequent words count less. */
+/** Returns the mean vector of words, scaled to length 1. Frequent words have less weight. */
 function meanOf(words) {
   const rows = words.map(rank).filter((row) => row !== undefined);
   if (!rows.length) return undefined;

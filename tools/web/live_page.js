@@ -1,4 +1,4 @@
-// The page for a stream that is sampled on the visitor's device.
+// The page with a stream, which is sampled on the visitor's device.
 import { Live } from "./live.js";
 import { languageFiles, openLanguage } from "./language.js";
 

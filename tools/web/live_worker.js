@@ -17,7 +17,7 @@ async function open(seed) {
 
 const channel = new MessageChannel();
 
-// Lets a message to the worker arrive between two steps, and ends the block if it is canceled: nothing has changed then.
+// Lets messages to the worker arrive between two steps. If the block is canceled, it ends, and nothing has changed.
 async function afterStep() {
   await new Promise((done) => {
     channel.port1.onmessage = done;

@@ -39,7 +39,7 @@ function understood(text) {
   element("understood").replaceChildren(...chips(language.reader.abilities, reading, ask));
   const lines = [...reading.changes];
   if (reading.captions.length > 1) {
-    lines.push(`This page samples one action at a time, here the first: ${reading.captions[0]}. The demo samples all.`);
+    lines.push(`This page samples one action at a time, here the first: ${reading.captions[0]}. The demo samples all actions.`);
   }
   const paragraphs = lines.map((line) => Object.assign(document.createElement("p"), { textContent: line }));
   element("notes").replaceChildren(...paragraphs);

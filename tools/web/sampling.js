@@ -1,4 +1,5 @@
-// Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed yield the same motion.
+// Samples motions with onnxruntime-web: a port of flame_mdm/checkpoints/runner.py. The same text, length and seed yield
+// the same motion.
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { check, frameCount } from "./check.js";
 import { bends, reached } from "./waypoints.js";
@@ -109,7 +110,7 @@ export class Sampler {
     try { return await ort.InferenceSession.create(bytes); } catch { throw new Error(`${name} is damaged`); }
   }
 
-  // Normalized features (frames * D). The model reads the text; its noise depends on the name.
+  // Returns normalized features (frames * D). The model reads the text, and the noise depends on the name.
   async generate(text, seconds, seed, progress = () => {}, name = text) {
     const frames = frameCount(seconds, this.content), { features, start, padded_frames: least } = this.content;
     if (start) {
@@ -124,7 +125,8 @@ export class Sampler {
     return x.slice(0, frames * features);
   }
 
-  // Normalized features (padded * D) of frames that are sampled together, from the noise for a key. `guide` changes clean estimates.
+  // Returns normalized features (padded * D) of frames that are sampled together, from the noise for a key. `guide` changes
+  // the clean estimates.
   async sample(text, padded, frames, key, more = {}, progress = () => {}, guide = () => {}) {
     const { features, steps, clip_x0: clip, buckets, max_words: most } = this.content;
     const seen = new Set(this.content.vocabulary);
@@ -169,7 +171,7 @@ export class Sampler {
 
 const HELD = 4; // blocks that can be replaced
 
-// An endless motion: flame_mdm/sampling/streams.py in JavaScript. Frames that have not been shown yet can be replaced.
+// An endless motion: a port of flame_mdm/sampling/streams.py. Frames that have not been shown yet can be replaced.
 export class Stream {
   constructor(sampler, seed, name) {
     const { start, max_frames: longest, features } = sampler.content;
@@ -178,7 +180,7 @@ export class Stream {
     Object.assign(this, { prefix, number: 0, frames: 0, world: null, blocks: [] });
   }
 
-  // Normalized features of the next block.
+  // Returns the normalized features of the next block.
   async features(text, progress, guide) {
     const { sampler, size, context, width } = this;
     this.name ??= `${text}#0`;
@@ -191,7 +193,7 @@ export class Stream {
     return x;
   }
 
-  // World joints of the next block, which leads to waypoints, and the numbers of the frames that reach them.
+  // Returns the world joints of the next block, which leads to waypoints, and the numbers of the frames that reach them.
   async block(text, points = [], progress = undefined) {
     const { width, world: before, frames } = this, last = this.prefix.slice(-width);
     const guide = points.length ? await this.#guide(points) : undefined;
@@ -204,7 +206,7 @@ export class Stream {
     return { joints: placed, reached: reached(points, placed, one, frames) };
   }
 
-  // A function that bends the path in clean estimates.
+  // Returns a function that bends the path in clean estimates.
   async #guide(points) {
     const { width, size, sampler } = this, { root, fps } = sampler.content, { heading, place } = await this.#start();
     const [turn, side, ahead] = root, units = ([mean, std], value) => mean + std * value;
@@ -216,7 +218,7 @@ export class Stream {
     };
   }
 
-  // Heading and position of the root in the first frame of the next block: one step after the last frame.
+  // Returns the heading and position of the root in the first frame of the next block, one step after the last frame.
   async #start() {
     const { width, world, sampler } = this, last = this.prefix.slice(-width), [[mean, std]] = sampler.content.root;
     if (!world) return { heading: 0, place: [0, 0] };
@@ -225,7 +227,7 @@ export class Stream {
     return { heading: turnTo(joints.subarray(0, one), world).turn + mean + std * last[0], place: [next[0], next[2]] };
   }
 
-  // Drops the frames from a frame on: the next block continues the frames before it.
+  // Drops a frame and all later frames, so that the next block continues the frames before it.
   goBack(frame) {
     if (frame === this.frames) return;
     while (this.blocks.length && this.blocks.at(-1).begin >= frame) this.blocks.pop();
@@ -245,7 +247,8 @@ export class Stream {
   }
 }
 
-// A block (frames * width) whose first frames are moved to continue the frames before it (2 * width): `joined` in flame_mdm/generator.py.
+// Returns a block (frames * width) whose first frames are moved to continue the previous frames (2 * width): a port of
+// `joined` in flame_mdm/generator.py.
 function joined(before, x, width, fade) {
   if (!fade) return x;
   const moved = x.slice(), frames = Math.min(fade.frames, x.length / width);
@@ -259,7 +262,7 @@ function joined(before, x, width, fade) {
   return moved;
 }
 
-// The turn about the vertical that moves a pose to a pose in the world, and the centers of both.
+// Returns the turn about the vertical axis that moves a pose to a pose in the world, and the centers of both.
 function turnTo(pose, world) {
   const mean = (joints, k) => joints.reduce((sum, value, i) => (i % 3 === k ? sum + value : sum), 0) / (joints.length / 3);
   const [ax, az, bx, bz] = [mean(pose, 0), mean(pose, 2), mean(world, 0), mean(world, 2)];
@@ -272,7 +275,8 @@ function turnTo(pose, world) {
   return { turn: Math.atan2(sine, cosine), from: [ax, az], to: [bx, bz] };
 }
 
-// Joints of frames whose first frame is moved, about the vertical and over the floor, to a pose in the world.
+// Returns the joints of frames after a turn about the vertical axis and a shift over the floor that move the first frame
+// to a pose in the world.
 function inPlace(joints, one, world) {
   const { turn, from: [ax, az], to: [bx, bz] } = turnTo(joints.subarray(0, one), world), [s, c] = [Math.sin(turn), Math.cos(turn)];
   const placed = new Float32Array(joints);

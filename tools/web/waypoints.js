@@ -1,4 +1,4 @@
-// Bends the path of a stream toward waypoints on the floor: flame_mdm/sampling/waypoints.py in JavaScript, with the same numbers.
+// Bends the path of a stream toward waypoints on the floor: a port of flame_mdm/sampling/waypoints.py with the same results.
 export const NEAR = 0.3; // meters from the root at which a waypoint is reached
 const FASTEST = 1.3; // radians per second
 const TIGHTEST = 0.7; // meters, the minimum radius of a bend

@@ -593,7 +593,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": [0, 1.5]}, "expected a number of steps, or a list"),
         (
             {"eta": 1.0},
-            "eta=1.0: the sampler ancestral has no such option. Omit it, or use guidance_scale",
+            "eta=1.0: the sampler ancestral has no such option. Its options are guidance_scale",
         ),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: expected the name"),
@@ -602,11 +602,11 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"edit": {"mode": "trajectory"}}, "x0, x_t"),
         (
             {"edit": {"mode": "x_t", "known": torch.zeros(1, 5, 2)}},
-            "^the edit does not have the shape",
+            "^the shape of the edit does not match",
         ),
         (
             {"sampler": "dpm_solver_pp_2m", "edit": {"mode": "x_t", "resample": 2}},
-            r"with resample and x_t\. Set",
+            r"with resample and x_t\. Use",
         ),
     ],
     FlowMatching: [
@@ -619,7 +619,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"sampler": "euler", "edit": {"mode": "x_t"}}, "trajectory, x0"),
         (
             {"sampler": "dopri5", "edit": {"mode": "x0"}},
-            r"dopri5 cannot edit with x0\. Set the sampler to euler",
+            r"dopri5 does not support edits with x0\. Use one of these samplers: euler",
         ),
     ],
 }

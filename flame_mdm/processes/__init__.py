@@ -22,10 +22,10 @@ Each loss (B,) is already weighted and has one value per sample.
 class Process(nn.Module, ABC):
     """Base class for generative processes: paths between noise and data.
 
-    Subclasses are Gaussian diffusion and flow matching. A process corrupts training motions,
-    defines what the denoiser predicts, and samples motions from noise. Only the process interprets
-    the time t; the denoiser only embeds it. B is the batch size, F the number of frames, and D the
-    number of features.
+    The subclasses implement Gaussian diffusion and flow matching. A process corrupts training
+    motions, defines what the denoiser predicts, and samples motions from noise. Only the process
+    interprets the time t; the denoiser merely embeds it. B is the batch size, F the number of
+    frames, and D the number of features.
 
     Example:
         >>> import torch
@@ -53,20 +53,20 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def out_features(self, features: int) -> int:
-        """Returns the number of output channels of the denoiser for `features` D.
+        """Returns the denoiser's number of output channels for D = `features` input channels.
 
-        The number is D, or 2D with a learned variance.
+        This number is D, or 2D if the variance is learned.
         """
 
     @abstractmethod
     def training_times(self, u: Tensor) -> Tensor:
-        """Converts uniform numbers (B,) in (0, 1) to times t (B,) of training samples."""
+        """Maps uniform random numbers (B,) in (0, 1) to the times t (B,) of training samples."""
 
     @abstractmethod
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Computes the noisy motion x_t (B, F, D) at times t (B,).
+        """Computes the noisy motion x_t (B, F, D) at times t (B,) from a clean motion and noise.
 
-        It is computed from the clean motion `x` and `noise` (B, F, D).
+        The clean motion `x` and `noise` have the shape (B, F, D).
         """
 
     @abstractmethod
@@ -75,20 +75,20 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D), given the denoiser's output for the noisy motion x_t.
+        """Converts the denoiser's output for the noisy motion x_t to the clean estimate (B, F, D).
 
         If the output is target(x, noise, t) and the noisy motion is corrupt(x, noise, t), the
         clean estimate is x.
         """
 
     def table_time(self, t: Tensor) -> Tensor:
-        """Converts times (B,) of this process to times for the denoiser in [0, 1000)."""
+        """Converts times (B,) of this process to the denoiser's times, in [0, 1000)."""
         return t
 
     def clean(
         self, denoise: Denoise, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition
     ) -> Tensor:
-        """Returns the clean estimate (B, F, D) of a denoiser at times t (B,)."""
+        """Calls a denoiser at times t (B,) and returns its clean estimate (B, F, D)."""
         return self.to_x0(denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype), x_t, t)
 
     @abstractmethod
@@ -122,8 +122,8 @@ class Process(nn.Module, ABC):
                 `flame_mdm.losses.MotionLosses`.
 
         Returns:
-            Losses (B,) per sample by name: the losses of `terms`, the losses of `auxiliary`, and
-            "loss", their sum.
+            Per-sample losses (B,) by name: the losses returned by `terms` and `auxiliary`, and
+            their sum, "loss".
         """
         if t is None:
             t = self.training_times(torch.rand(len(x), device=x.device))
@@ -142,9 +142,9 @@ class Process(nn.Module, ABC):
     def terms(
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
-        """Returns the losses (B,) of the denoiser's output over the real frames.
+        """Returns per-sample losses (B,) of the denoiser's output, averaged over the real frames.
 
-        The loss "mse" is the squared error of the target.
+        The loss "mse" is the mean squared difference between the output and the target.
         """
         return {"mse": masked_mse(output, self.target(x, noise, t), mask)}
 
@@ -169,9 +169,9 @@ class Process(nn.Module, ABC):
             mask: (B, F) bool, True = real frame.
             cond: conditions of the batch.
             options: the sampler, its number of steps and its options.
-            edit: part of a motion to keep.
-            trajectory: list that receives the clean estimate (B, F, D) of each call of the
-                denoiser.
+            edit: the part of a motion that sampling keeps. Default: nothing is kept.
+            trajectory: list to which the clean estimate (B, F, D) of each denoiser call is
+                appended.
 
         Returns:
             Normalized motion (B, F, D). Frames past the end of a motion are 0.
@@ -197,14 +197,14 @@ class Process(nn.Module, ABC):
             if option not in names:
                 has = ", ".join(names)
                 raise UserError(
-                    f"{option}={value}: the sampler {name} has no such option. Omit it, or use {has}"
+                    f"{option}={value}: the sampler {name} has no such option. Its options are {has}"
                 )
         return self.samplers[name]
 
     def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
-        """Raises `UserError` if this process or sampler does not support an edit.
+        """Raises `UserError` if this process or the sampler does not support an edit.
 
-        The edit must also have the shape of the motions.
+        An error is also raised if the shape of the edit differs from the shape of the motions.
         """
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
@@ -218,10 +218,11 @@ class Process(nn.Module, ABC):
         if options.sampler not in able:
             edits = " and ".join(sorted(kinds))
             raise UserError(
-                f"{options.sampler} cannot edit with {edits}. Set the sampler to {', '.join(able)}"
+                f"the sampler {options.sampler} does not support edits with {edits}. "
+                f"Use one of these samplers: {', '.join(able)}"
             )
         shapes = [tuple(x.shape) for x in (edit.known, edit.keep, mask)]
         if shapes[0] != shapes[1] or shapes[0][:2] != shapes[2]:
             raise UserError(
-                f"the edit does not have the shape of the motions: known, keep and mask have shapes {shapes}"
+                f"the shape of the edit does not match the motions: known, keep and mask have shapes {shapes}"
             )

@@ -1,8 +1,8 @@
-"""Consistency distillation: a student learns to take many small steps of its teacher in one call.
+"""Consistency distillation: a student learns to replace many steps of its teacher by one call.
 
-f(x_t, t) is the clean estimate of a network at time t. Along a path of the teacher, f should be the
-same at all times (Song et al. 2023, "Consistency Models"). The teacher's steps are guided, so the
-student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
+Let f(x_t, t) be a network's clean estimate at time t. Along a path of the teacher, f should be the
+same at all times (Song et al. 2023, "Consistency Models"). Because the teacher's steps are guided,
+the student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
 "MotionLCM").
 """
 
@@ -30,13 +30,13 @@ def consistency_terms(
 ) -> dict[str, Tensor]:
     """Computes the losses of a student.
 
-    The student's estimate at x_t is compared with an estimate after one step of the teacher. The
-    step is a DDIM step with eta = 0 or, for a flow, an Euler step. After the last time of the grid,
-    the target is the teacher's own estimate of the data.
+    The student's estimate at x_t is compared with the estimate after one step of the teacher, which
+    is a DDIM step with eta = 0 or, for a flow, an Euler step. At the last time of the grid, the
+    target is the teacher's own clean estimate.
 
     Args:
-        process: process of the student and the teacher. It predicts the clean motion or the
-            velocity.
+        process: process that the student and the teacher share. The prediction must be the clean
+            motion or the velocity.
         student: the network to train.
         follower: the network that computes the target (the estimate after the step), without
             gradient. It is the student or an average of its weights.
@@ -50,7 +50,7 @@ def consistency_terms(
         auxiliary: geometric losses between the estimate and the target.
 
     Returns:
-        Losses (B,) per sample by name: "consistency", the auxiliary losses, and "loss", their sum.
+        Per-sample losses (B,) by name: "consistency", the auxiliary losses, and their sum, "loss".
     """
     # The step follows the teacher's path to the next time, from the teacher's clean estimate and
     # the noise that this estimate implies.

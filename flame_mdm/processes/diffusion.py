@@ -22,39 +22,42 @@ from flame_mdm.sampler_options import SamplerOptions
 class GaussianDiffusion(Process):
     """Gaussian diffusion over T steps, the process of MDM and FLAME (Ho et al. 2020).
 
-    The time t is the step 0 ... T - 1 as a float, and is passed to the denoiser unchanged. x_t =
-    sqrt(ab) x + sqrt(1 - ab) noise, where ab ("alpha bar") is given by the schedule.
+    The time t is the step, a float from 0 to T - 1, and is passed to the denoiser unchanged. The
+    noisy motion is x_t = sqrt(ab) x + sqrt(1 - ab) noise, where the schedule determines ab ("alpha
+    bar").
 
     Args:
-        num_train_timesteps: T.
+        num_train_timesteps: T, the number of diffusion steps.
         schedule: name of the noise schedule, "cosine" or "linear".
         prediction: content of the first D channels of the denoiser's output: the clean motion, the
             noise, or the velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
         variance: variance of the reverse process. "fixed_small" is the variance of the posterior.
             "fixed_large" is beta. "learned_range" lies between the two and is learned from D
             additional channels (Nichol and Dhariwal 2021, eq. 15).
-        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is
-            learned. L_vlb is a sum over T steps, so it is T times the term of one step. The value
-            0.001 at T = 1000 (Nichol and Dhariwal) corresponds to 1 in FLAME's code.
+        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), which is used only if
+            the variance is learned. L_vlb is a sum over T steps, so it is computed as T times the
+            term of one step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to 1 in
+            FLAME's code.
         average_padding: average losses over the padded length with zero noise in the padding, as
             in FLAME's code. Short motions then have less weight. The denoiser must return 0 in
             the padding.
         clip_x0: clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
         timestep_sampling: distribution of the training steps (FLAME, tables 6 and 7).
-        skip: only for prediction epsilon. The noise is sqrt(1 - ab) x_t + sqrt(ab) times the output
-            (Karras et al. 2022, eq. 7, for data of variance 1). The output is then a velocity,
-            trained with the error of the noise. The network need not pass its input through, and
-            the clean estimate is computed without division by the signal.
+        skip: add a skip connection around the network; requires the prediction "epsilon". The
+            predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al. 2022, eq.
+            7, for data of variance 1). The output is then a velocity, but it is trained with the
+            error of the noise. The network need not pass its input through, and the clean estimate
+            is computed without division by the signal.
         min_snr: weight the squared error of each step as if the clean motion were predicted with
-            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4, who use 5). None = weight 1 for every
-            prediction.
-        noise_scale: factor of the noise-to-signal ratio at each step. With 263 features that depend
-            on each other, the text is informative only at high noise. A factor above 1 assigns more
-            steps to high noise (Hoogeboom et al. 2023, section 2.2).
+            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1,
+            regardless of the prediction.
+        noise_scale: factor by which the noise-to-signal ratio of each step is multiplied. With 263
+            features that depend on each other, the text is informative only at high noise. A factor
+            above 1 assigns more steps to high noise (Hoogeboom et al. 2023, section 2.2).
 
     Raises:
-        UserError: If T or `noise_scale` is out of range, if `skip` is combined with another
-            prediction, or if `min_snr` is not above 0.
+        UserError: If T or `noise_scale` is out of range, if `skip` is combined with a prediction
+            other than "epsilon", or if `min_snr` is not above 0.
 
     Example:
         >>> import torch
@@ -103,7 +106,7 @@ class GaussianDiffusion(Process):
         return 2 * features if self.variance == "learned_range" else features
 
     def training_times(self, u: Tensor) -> Tensor:
-        """Converts uniform numbers (B,) in (0, 1) to uniform steps (B,) from 0 to T - 1."""
+        """Maps uniform random numbers (B,) in (0, 1) to uniform steps (B,) from 0 to T - 1."""
         return (u * len(self.schedule)).floor().clamp(max=len(self.schedule) - 1)
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -121,8 +124,8 @@ class GaussianDiffusion(Process):
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor | int) -> Tensor:
         """See `Process.to_x0`.
 
-        `output` may contain the channels of a learned variance. t may be a single step for the
-        entire batch.
+        `output` may also contain the channels of a learned variance, and t may be a single step for
+        the entire batch.
         """
         output = output[..., : x_t.shape[-1]]
         if self.prediction == "x0":
@@ -133,7 +136,7 @@ class GaussianDiffusion(Process):
         return signal * x_t - noise * output
 
     def grid(self, count: int) -> list[float]:
-        """Returns `count` steps, at most T, from T - 1 down to one interval before the data."""
+        """Returns `count` (at most T) steps, from T - 1 to one interval before the data."""
         total = len(self.schedule)
         count = min(count, total)
         return [float(round(total * k / count) - 1) for k in range(count, 0, -1)]
@@ -143,7 +146,8 @@ class GaussianDiffusion(Process):
     ) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`.
 
-        A fixed log-variance is a number or (B, 1, 1). A learned log-variance is (B, F, D).
+        If the variance is fixed, the result is a number or has the shape (B, 1, 1). If the variance
+        is learned, the shape is (B, F, D).
         """
         # The logarithm of a learned variance is interpolated between its two bounds.
         small = schedule.factor("posterior_log_variance", i, x_t)
@@ -179,15 +183,15 @@ class GaussianDiffusion(Process):
         snr = (
             (self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)).square().flatten()
         )
-        # A squared error of 1 in the clean motion corresponds to an error of SNR in the noise,
-        # and of SNR + 1 in the velocity.
+        # A squared error of 1 in the clean motion corresponds to a squared error of SNR in the
+        # noise and of SNR + 1 in the velocity.
         return (
             snr.clamp(max=self.min_snr)
             / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
         )
 
     def vlb(self, output: Tensor, x: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Returns terms (B, F, D) of the variational bound at steps t (B,), in nats.
+        """Returns the terms (B, F, D) of the variational bound at steps t (B,), in nats.
 
         Source: Ho et al. 2020, eq. 5. Only the variance receives a gradient (Nichol and Dhariwal
         2021, section 3.1). As in FLAME's code, the term of step 0 is the divergence with the
@@ -196,7 +200,7 @@ class GaussianDiffusion(Process):
         real = self.schedule.posterior_mean(x, x_t, t)
         mean = self.schedule.posterior_mean(self.to_x0(output, x_t, t).detach(), x_t, t)
         log_variance = torch.as_tensor(self.log_variance(output, x_t, t, self.schedule))
-        # KL divergence of two normal distributions
+        # KL divergence between two normal distributions
         difference = self.schedule.at("posterior_log_variance", t, x_t) - log_variance
         return 0.5 * (
             difference.exp() - 1 - difference + (real - mean).square() * (-log_variance).exp()
@@ -215,10 +219,10 @@ class GaussianDiffusion(Process):
     ) -> Tensor:
         """See `Process.sample`. The denoiser is called once per step.
 
-        Noise draws are numbered in the order of their use. `options.num_inference_steps` is
-        either a number of steps from 2 to T, placed by `options.spacing`, or a list of steps in
-        increasing order. The sampler "consistency" takes 1 to T steps of `grid`. An edit of mode
-        "x0" reproduces the kept part exactly.
+        Noise draws are numbered in the order in which they are used. `options.num_inference_steps`
+        is either a number of steps from 2 to T, selected according to `options.spacing`, or a list
+        of steps in increasing order. The sampler "consistency" takes 1 to T steps, selected by
+        `grid`. An edit with mode "x0" reproduces the kept part exactly.
         """
         sampler, steps = self.find_sampler(options), self._steps(options)
         if edit is not None:

@@ -13,24 +13,25 @@ from flame_mdm.sampler_options import SamplerOptions
 
 
 class FlowMatching(Process):
-    """Straight path from noise at t = 0 to motion at t = 1, the process of MFM.
+    """Flow matching on straight paths from noise at t = 0 to motion at t = 1, as in MFM.
 
-    Sources: Lipman et al. 2023; Hu et al. 2023. The denoiser receives the time 1000 t, and predicts
-    the velocity of the path or the clean motion. With s = `sigma_min`, x_t = t x + (1 - (1 - s) t)
-    noise, and the velocity is x - (1 - s) noise.
+    The denoiser receives the time 1000 t and predicts the velocity of the path or the clean motion.
+    With s = `sigma_min`, x_t = t x + (1 - (1 - s) t) noise, and the velocity is x - (1 - s) noise.
+    Sources: Lipman et al. 2023; Hu et al. 2023.
 
     Args:
-        sigma_min: standard deviation of the noise that is left at t = 1 (Lipman et al. 2023, eq.
+        sigma_min: standard deviation of the noise that remains at t = 1 (Lipman et al. 2023, eq.
             20-23).
-        prediction: output of the denoiser: the velocity of the path (MFM) or the clean motion, from
-            which the velocity is computed. A network narrower than the motion cannot represent the
-            noise in the velocity.
-        time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a
-            normal variable, which favors the middle (Esser et al. 2024, eq. 19).
-        quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's
-            code.
+        prediction: what the denoiser predicts: "velocity", the velocity of the path, as in MFM, or
+            "x0", the clean motion, from which the velocity is computed. A network that is narrower
+            than the motion cannot represent the noise in the velocity.
+        time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal",
+            the logistic function of a normal variable, which favors the middle (Esser et al. 2024,
+            eq. 19).
+        quantize_time: pass floor(1000 t) to the denoiser as a row index of the time table, as in
+            MFM's code.
         odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in
-            MFM's code. For some N, the table row of a time is then lower by one than with N equal
+            MFM's code. For some N, the table row of a time is then one lower than with N equal
             steps. This never happens for N = 10, 20 or 30.
 
     Raises:
@@ -77,7 +78,7 @@ class FlowMatching(Process):
         return features
 
     def training_times(self, u: Tensor) -> Tensor:
-        """Converts uniform numbers (B,) to times (B,) in (0, 1), following `time_distribution`."""
+        """Maps uniform numbers (B,) to times (B,) in (0, 1), following `time_distribution`."""
         return u if self.time_distribution == "uniform" else torch.special.ndtri(u).sigmoid()
 
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -92,22 +93,22 @@ class FlowMatching(Process):
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """See `Process.to_x0`. The result is exact.
 
-        MFM's code computes x_t + (1 - t) u instead, which leaves sigma_min times the noise.
+        MFM's code instead computes x_t + (1 - t) u, which retains sigma_min times the noise.
         """
         if self.prediction == "x0":
             return output
         return (1 - (1 - self.sigma_min) * t[:, None, None]) * output + (1 - self.sigma_min) * x_t
 
     def table_time(self, t: Tensor) -> Tensor:
-        """Converts flow times to times for the denoiser in [0, 1000].
+        """Converts flow times to the times in [0, 1000] that the denoiser receives.
 
-        Times are above 1000 only if a solver evaluates t > 1.
+        A time exceeds 1000 only if a solver evaluates t > 1.
         """
-        # Always in float32, because models were trained with this rounding
+        # Times are always computed in float32, because models were trained with this rounding.
         return (t.to(torch.float32) * 1000).floor() if self.quantize_time else t * 1000
 
     def times(self, count: int) -> list[float]:
-        """Returns the N + 1 times from 0 to 1 that bound N = `count` steps."""
+        """Returns the N + 1 times from 0 to 1 that delimit N = `count` steps."""
         if self.odeint_grid:
             return [*(torch.arange(count, dtype=torch.float32) * (1 / count)).tolist(), 1.0]
         return [i / count for i in range(count + 1)]
@@ -129,10 +130,11 @@ class FlowMatching(Process):
     ) -> Tensor:
         """See `Process.sample`. A flow takes N >= 1 equal steps, except that "dopri5" chooses its own steps.
 
-        Only "consistency" adds noise. An edit of mode "trajectory" is applied before each step at a
-        time <= `until`: the kept part is replaced by the straight path from its noise to the known
-        motion (MFM, algorithm 1). After this time, the model changes the kept part freely. Mode
-        "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly.
+        Only "consistency" adds noise. An edit with mode "trajectory" is applied before each step at
+        a time <= `until`: the kept part is replaced by the straight path from its noise to the
+        known motion (MFM, algorithm 1). After this time, the model may change the kept part freely.
+        Mode "x0" overwrites the kept part in the clean estimate of every call and therefore
+        reproduces it exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):

@@ -1,4 +1,4 @@
-"""Guidance by a condition, and guidance by world positions."""
+"""Classifier-free guidance, and guidance toward world positions of joints."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from flame_mdm.losses import bone_lengths
 # Number of gradient steps before each step of the sampler
 STEERING_STEPS = 2
 STEERING_LIMIT = 0.02
-"""Maximum length of a gradient step, as RMS over normalized features.
+"""Maximum length of a gradient step, as an RMS over normalized features.
 
 If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noisy motions in
-training. In one experiment, arms became longer by a third.
+training. In one experiment, arms became a third longer.
 """
 CLOSE, MOST_STEPS = 0.005, 8
 """Limits for the search for a motion that reaches positions.
@@ -33,18 +33,18 @@ It limits the size of the changes.
 def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: int) -> Denoise:
     """Returns a denoiser guided by its unconditional prediction: null + scale * (cond - null).
 
-    The batch size is 2B. Source: Ho and Salimans 2021, with w = scale - 1. In this form, which
-    MDM and FLAME (eq. 5) use, scale 1 means no guidance.
+    The original denoiser is called with batches of size 2B. Source: Ho and Salimans 2021, with w =
+    scale - 1. In this form, which MDM and FLAME (eq. 5) use, a scale of 1 means no guidance.
 
     Args:
         denoise: the denoiser. Its condition must contain a null condition.
-        scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise` itself
-            is returned.
-        features: D. Channels from D on contain a learned variance. These channels are not guided;
-            they are taken from the conditional half.
+        scale: guidance scale, either one number or one per sample (B,). If it is the number 1,
+            `denoise` itself is returned.
+        features: D, the number of features. Further channels contain a learned variance, which is
+            not guided but taken from the conditional prediction.
 
     Returns:
-        A function with the same arguments and result as `denoise`.
+        A function with the same arguments and the same kind of result as `denoise`.
 
     Example:
         >>> null = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
@@ -79,7 +79,7 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
 @dataclass
 class Positions:
-    """M coordinates of world joint positions that a motion should reach.
+    """M coordinates of joint positions, in the world, that a motion should reach.
 
     Attributes:
         frames: (M,) int64, indices of the frames.
@@ -111,10 +111,11 @@ def steer(
     denoiser. The step has Polyak's length, but at most `STEERING_LIMIT`.
 
     Args:
-        clean: returns the clean estimate (B, F, D) of a noisy motion.
+        clean: function that returns the clean estimate (B, F, D) of a noisy motion.
         x_t: (B, F, D) noisy motions.
-        to_joints: converts normalized features (B, F, D) to joint positions (B, F, J, 3) in meters.
-        positions: the positions.
+        to_joints: function that converts normalized features (B, F, D) to joint positions (B, F, J,
+            3) in meters.
+        positions: the positions that the motions should approach.
 
     Returns:
         Noisy motions (B, F, D) whose clean estimates are closer to the positions.
@@ -139,26 +140,27 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` whose joints are at given world positions.
+    """Returns the motions nearest to `x` whose joints are at the requested world positions.
 
-    Each Gauss-Newton step takes the smallest change of the normalized features that reaches the
-    positions. A Gaussian-process prior keeps the change smooth in time. In the frames of the
-    positions, bone lengths are also constraints: they must equal their medians over the motion.
-    Neighboring frames receive only part of the change, which would shorten turning bones. Their
+    Each Gauss-Newton step applies the smallest change of the normalized features that reaches the
+    positions. A Gaussian-process prior keeps the change smooth in time. In frames with a requested
+    position, bone lengths are also constrained: they must equal their medians over the motion.
+    Neighboring frames receive only part of the change, which would shorten turning bones, so their
     bone lengths are restored afterward.
 
     Args:
         x: (B, F, D) normalized motions.
-        to_joints: converts normalized features (F, D) to joint positions (F, J, 3) in meters.
-        positions: the positions.
+        to_joints: function that converts normalized features (F, D) to joint positions (F, J, 3) in
+            meters.
+        positions: the positions to reach.
         bones: (3, N) int64: frame, parent and child of the bones whose length the change could
             affect. All bones are listed for each frame.
         free: (B, F, D) bool, True = this feature may change.
         smoothness: standard deviation of the Gaussian process, in frames.
 
     Returns:
-        Normalized motions (B, F, D). The error of the positions is at most `CLOSE` meters, unless
-        `MOST_STEPS` steps are not enough.
+        Normalized motions (B, F, D). The position error is at most `CLOSE` meters unless the search
+        ends earlier, after `MOST_STEPS` steps.
     """
     # The prior's covariance K between frames is a Gaussian kernel. With the Jacobian A of the
     # constraints and their error e, the smallest change is K A^T (A K A^T)^-1 e. Below, `smooth`
@@ -209,9 +211,9 @@ def _with_bones(
     lengths: Tensor,
     free: Tensor,
 ) -> Tensor:
-    """Returns the nearest motion (F, D) whose bones have the requested lengths in each frame.
+    """Returns the nearest motion (F, D) in which the bones have the requested lengths.
 
-    Bones `edges` (N, 2) have `lengths` (F, N).
+    `lengths` (F, N) contains the lengths of the bones `edges` (N, 2) in each frame.
     """
     # Gauss-Newton steps as in `reach`, but for each frame separately: A^T (A A^T)^-1 e
 

@@ -1,8 +1,8 @@
-"""Samplers: functions that take one step from noise toward motion, and what they support.
+"""Samplers: functions that take one step from noise toward motion, and the options they support.
 
 Diffusion samplers take the steps i of a `Schedule` in decreasing order. At step i, they obtain the
 clean motion and the log-variance from `estimate`. ODE solvers follow a velocity field. Coefficients
-and times are Python numbers, so that no step waits for the device.
+and times are Python numbers, so that no step has to wait for the device.
 """
 
 import math
@@ -22,7 +22,7 @@ TOLERANCE = 1e-5
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
 """Signature: (x_t (B, F, D), step i) -> clean estimate (B, F, D), log-variance of x_{t-1}.
 
-The log-variance is a number or (B, F, D).
+The log-variance is a number or has the shape (B, F, D).
 """
 
 Velocity = Callable[[Tensor, float | Tensor], Tensor]  # (x (B, F, D), time t) -> dx/dt (B, F, D)
@@ -30,7 +30,7 @@ Velocity = Callable[[Tensor, float | Tensor], Tensor]  # (x (B, F, D), time t) -
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler: the function that takes one step, and what the sampler supports.
+    """A sampler: the function that takes one step, and the options and edits that it supports.
 
     Example:
         >>> DIFFUSION_SAMPLERS["ddim"].options
@@ -51,13 +51,13 @@ class Sampler:
 
 @dataclass
 class Descent:
-    """A run of a diffusion sampler."""
+    """State of a diffusion sampler while it generates one batch."""
 
-    #: Calls the denoiser.
+    #: Function that calls the denoiser.
     estimate: Estimate
     #: Schedule of the sampling steps.
     schedule: Schedule
-    #: Noise (B, F, D), in order of use.
+    #: Draws of noise (B, F, D), in order of use.
     draws: Iterator[Tensor]
     #: Options of the sampler.
     options: SamplerOptions
@@ -67,24 +67,24 @@ class Descent:
 
 @dataclass
 class Flow:
-    """A run of a flow sampler."""
+    """State of a flow sampler while it generates one batch."""
 
-    #: Calls the denoiser.
+    #: Function that calls the denoiser.
     velocity: Velocity
-    #: Noise (B, F, D), in order of use.
+    #: Draws of noise (B, F, D), in order of use.
     draws: Iterator[Tensor]
-    #: Standard deviation of the noise that is left at the end.
+    #: Standard deviation of the noise that remains at the end.
     sigma_min: float
 
 
 def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Draws x_{t-1} from the learned reverse process. The last step returns its mean.
+    """Draws x_{t-1} from the learned reverse process. The last step returns the mean instead.
 
     Source: Ho et al. 2020, algorithm 2.
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run; its clean estimate and variance define the step.
+        run: the sampling run, whose clean estimate and variance define the step.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -110,12 +110,12 @@ def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
 def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
     """Takes a step of DDIM.
 
-    The step is deterministic with eta = 0 (the default), and as random as a step of `ancestral`
-    with eta = 1. Source: Song et al. 2021, eq. 12 and 16 (non-Markovian sampling).
+    With eta = 0 (the default), the step is deterministic; with eta = 1, it is as random as a step
+    of `ancestral`. Source: Song et al. 2021, eq. 12 and 16 (non-Markovian sampling).
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run; its options contain eta, from 0 to 1.
+        run: the sampling run, whose options contain eta, from 0 to 1.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -143,12 +143,12 @@ def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
 def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
     """Takes a step of DPM-Solver++ (2M), a deterministic multistep solver of order 2.
 
-    It calls the denoiser once per step. The first step has order 1, because there is no previous
-    step. The last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
+    The solver calls the denoiser once per step. The first step has only order 1, because it has no
+    predecessor, and the last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run; it stores the clean estimate for the next step.
+        run: the sampling run, which stores the clean estimate for the next step.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -190,7 +190,7 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
 
     Args:
         x: (B, F, D) noisy motion at step i.
-        run: the run.
+        run: the sampling run.
         i: the step, N - 1 ... 0.
 
     Returns:
@@ -212,18 +212,18 @@ def blended(
 ) -> Tensor:
     """Samples with an edit of mode "x_t".
 
-    At each step, the known motion with the current amount of noise replaces the kept part. With the
-    blend "after", the kept part of the first x_t has the noise of the start, as if a previous step
-    had been blended. RePaint (Lugmayr et al. 2022, algorithm 1) repeats each step after adding its
-    noise again.
+    At each step, the kept part is replaced by the known motion with the current amount of noise.
+    With the blend "after", the kept part of the first x_t has the initial noise, as if a previous
+    step had been blended. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each step
+    again and repeats the step.
 
     Args:
         sampler: a diffusion sampler.
         x: (B, F, D) noisy motion at the first step.
-        run: the run.
+        run: the sampling run.
         steps: the steps to take, from noisy to clean.
         edit: the part to keep, how to blend it, and how many times to repeat each step.
-        start: (B, F, D) noise that sampling started from.
+        start: (B, F, D) noise from which sampling started.
 
     Returns:
         Normalized motion (B, F, D).
@@ -258,7 +258,7 @@ def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
     Args:
         x: (B, F, D) motion at time t.
-        run: the run.
+        run: the sampling run.
         t: time of x, in [0, 1).
         end: time of the result, in (0, 1].
 
@@ -278,7 +278,7 @@ def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
     Args:
         x: (B, F, D) motion at time t.
-        run: the run.
+        run: the sampling run.
         t: time of x, in [0, 1).
         end: time of the result, in (0, 1].
 
@@ -297,11 +297,11 @@ def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 def heun(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     """Takes a step of Heun's method, the trapezoidal rule with an Euler predictor.
 
-    It has order 2 and calls the denoiser twice.
+    The method has order 2 and calls the denoiser twice.
 
     Args:
         x: (B, F, D) motion at time t.
-        run: the run.
+        run: the sampling run.
         t: time of x, in [0, 1).
         end: time of the result, in (0, 1].
 
@@ -321,11 +321,11 @@ def heun(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     """Takes a step of Kutta's 3/8 rule, which torchdiffeq also calls rk4.
 
-    It has order 4 and calls the denoiser four times.
+    The method has order 4 and calls the denoiser four times.
 
     Args:
         x: (B, F, D) motion at time t.
-        run: the run.
+        run: the sampling run.
         t: time of x, in [0, 1).
         end: time of the result, in (0, 1].
 
@@ -348,13 +348,13 @@ def rk4(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     """Integrates with adaptive steps of order 5 (Dormand and Prince 1980).
 
-    As in MFM, rtol = atol = 1e-5. The error is measured over the entire batch. Therefore, a motion
-    depends on the other motions in its batch, but only within the tolerance. The last step may go
-    beyond the last time; the solver then interpolates back.
+    As in MFM, rtol = atol = 1e-5. Because the error is measured over the entire batch, a motion
+    depends on the other motions in its batch, but only within the tolerance. If the last step goes
+    beyond the last time, the solver interpolates back.
 
     Args:
         x: (B, F, D) motion at time t.
-        run: the run.
+        run: the sampling run.
         t: time of x, in [0, 1).
         end: time of the result, in (0, 1].
 
@@ -381,7 +381,7 @@ def consistency_flow(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
     Args:
         x: (B, F, D) motion at time t.
-        run: the run.
+        run: the sampling run.
         t: time of x, in [0, 1).
         end: time of the result, in (0, 1].
 

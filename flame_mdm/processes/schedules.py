@@ -1,4 +1,4 @@
-"""Noise schedules of Gaussian diffusion: coefficients and selection of sampling steps."""
+"""Noise schedules of Gaussian diffusion: coefficients, and selection of sampling steps."""
 
 import math
 
@@ -72,12 +72,12 @@ def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
 class Schedule:
     """Coefficients of a Gaussian diffusion, by step i from 0 (least noise) to N - 1.
 
-    Tables are float64 on the CPU, and are rounded once, when they are used. They are not buffers,
-    because casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020,
-    eq. 4 and 7.
+    The tables are float64 on the CPU and are rounded only once, when they are used. They are not
+    buffers, because casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et
+    al. 2020, eq. 4 and 7.
 
     Args:
-        betas: (N,) float64, variances of the noise that each step adds.
+        betas: (N,) float64, the variance of the noise that each step adds.
 
     Example:
         >>> schedule = Schedule(cosine_betas(1000)).respace([0, 499, 999])
@@ -119,9 +119,9 @@ class Schedule:
         return self.numbers[name][i]
 
     def at(self, name: str, i: Tensor, x: Tensor) -> Tensor:
-        """Returns a coefficient (B, 1, 1) at steps i (B,), on the device of x.
+        """Returns the values (B, 1, 1) of a coefficient at steps i (B,), on the device of x.
 
-        The coefficient has the precision of x, but at least float32.
+        The values have the precision of x, but at least float32.
         """
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
         if key not in self._moved:
@@ -129,11 +129,11 @@ class Schedule:
         return self._moved[key][i.long()][:, None, None]
 
     def factor(self, name: str, i: int | Tensor, x: Tensor) -> float | Tensor:
-        """Returns `number` for one step of the whole batch, or `at` for steps (B,)."""
+        """Returns `number` if i is one step for the entire batch, or `at` if i contains B steps."""
         return self.number(name, i) if isinstance(i, int) else self.at(name, i, x)
 
     def respace(self, steps: list[int]) -> "Schedule":
-        """Returns the schedule for a subset of the steps, given in increasing order.
+        """Returns the schedule for a subset of the steps, which must be in increasing order.
 
         Source: Nichol and Dhariwal 2021, section 4.
         """
@@ -155,7 +155,7 @@ class Schedule:
 
 
 def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0) -> Schedule:
-    """Returns a noise schedule by name.
+    """Builds a noise schedule.
 
     Args:
         name: "cosine" or "linear".
@@ -189,13 +189,13 @@ def timesteps(
     Args:
         num_train_timesteps: T.
         num_inference_steps: N, from 1 to T.
-        spacing: "linspace" includes both ends and rounds half to even. It is called "N" in the code
-            of MDM and FLAME, after Nichol and Dhariwal 2021. "stride" counts from 0 with the
+        spacing: "linspace" includes both ends and rounds half to even; the code of MDM and FLAME
+            calls it "N", following Nichol and Dhariwal 2021. "stride" counts from 0 with the
             smallest integer stride that gives N steps, so the noisiest step may be well below T -
-            1. It is called "ddimN" in their code, after Song et al. 2021.
+            1; their code calls it "ddimN", following Song et al. 2021.
 
     Returns:
-        N increasing steps from 0 ... T - 1.
+        N increasing steps in the range 0 ... T - 1.
 
     Raises:
         UserError: If N is out of range, or if no stride gives N steps.
@@ -215,8 +215,8 @@ def timesteps(
             f"no stride selects {count} of {total} steps. Choose another number of steps, or set spacing=linspace"
         )
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
-    # This is a running sum instead of i * stride, because its rounding decides ties. The released
-    # models were sampled at these steps.
+    # A running sum is used instead of i * stride, because its rounding decides ties. The released
+    # models were sampled at the resulting steps.
     steps, position = [], 0.0
     for _ in range(count):
         steps.append(round(position))

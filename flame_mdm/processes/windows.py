@@ -1,9 +1,9 @@
 """Long motions from overlapping windows: a wrapper with the interface of a denoiser.
 
 At each sampling step, the denoiser processes all windows of a motion in one batch, each with its
-own condition. The outputs are averaged where windows overlap (Bar-Tal et al. 2023,
-"MultiDiffusion"; Zhang et al. 2023, "DiffCollage"). For equal x_t and t, outputs are affine in the
-clean estimate, so averaging them also blends the clean estimates.
+own condition. Where windows overlap, the outputs are averaged (Bar-Tal et al. 2023,
+"MultiDiffusion"; Zhang et al. 2023, "DiffCollage"). For fixed x_t and t, the output is an affine
+function of the clean estimate, so averaging outputs also blends the clean estimates.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def spans(
             frame 0.
 
     Returns:
-        Index of the part, first frame and number of frames of each window.
+        The index of the part, the first frame and the number of frames of each window.
 
     Example:
         >>> spans([10, 10], longest=16, overlap=4)
@@ -99,11 +99,11 @@ def cover(
     """Returns the frames and weights of windows, without conditions.
 
     The weight of a window rises over the overlap at its start and falls over the overlap at its
-    end. Past its end, a window contains the following frames of the motion. The last frame of a
-    motion is followed by its first frame.
+    end. Past its end, a window contains the frames of the motion that follow, where the last frame
+    is followed by the first one.
 
     Args:
-        windows: W windows, each as the index of its motion, its first frame and its number of
+        windows: W windows, each given by the index of its motion, its first frame and its number of
             frames.
         totals: number of frames of each motion.
         overlap: number of frames over which a weight rises or falls.

@@ -11,20 +11,21 @@ class Denoiser(nn.Module, ABC):
     """Base class for denoisers.
 
     A denoiser predicts the target of a process from a noisy motion. Subclasses take some of the
-    following arguments. The first three depend on other parts, and `Parts.build` passes them. All
-    other arguments are set in the configuration.
+    following arguments. The first three depend on other parts of the model, and `Parts.build`
+    passes them; all others are set in the configuration.
 
     Args:
-        in_features: D, the number of features of a frame.
+        in_features: D, the number of features per frame.
         out_features: D, or 2D with a learned variance.
-        cond_features: C, the width of the condition; 0 = unconditioned.
+        cond_features: C, the width of the condition; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads; divides `latent_dim`.
-        dropout: probability of dropout after the positions and inside the layers, in [0, 1).
-        project_condition: False adds the condition to the time without projection, as MDM does
-            with action embeddings. C must then be `latent_dim`.
+        num_heads: number of attention heads, which must divide `latent_dim`.
+        dropout: probability of dropout after the positional encoding and inside the layers, in [0,
+            1).
+        project_condition: False adds the condition to the time embedding without a projection, as
+            MDM does with action embeddings. C must then equal `latent_dim`.
 
     Example:
         >>> import torch
@@ -48,15 +49,16 @@ class Denoiser(nn.Module, ABC):
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         """Returns the prediction (B, F, out_features).
 
-        The network is a pure function, except for dropout during training.
+        The network is a pure function of its inputs, except for dropout during training.
 
         Args:
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time as a row index of the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
-            cond: the condition. Dropped samples already have the null condition.
+            cond: the condition. Samples whose condition was dropped already have the null
+                condition.
 
         Raises:
-            UserError: If a motion is too long for the network, if there are no or too many
-                condition tokens, or if the prefix does not have `context_frames` frames.
+            UserError: If a motion is too long for the network, if there are no condition tokens or
+                too many of them, or if the prefix does not have `context_frames` frames.
         """

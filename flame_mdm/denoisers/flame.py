@@ -14,18 +14,18 @@ from flame_mdm.errors import UserError
 class FLAME(Denoiser):
     """The network of FLAME: a transformer decoder over frames, with cross-attention to the text.
 
-    Its input is [ML, TS, CLS, frame 1, frame 2, ...]. Its memory is [ML, TS, CLS, text tokens].
-    ML embeds the length of the motion, TS is the sinusoid of the time, and CLS is the projected
-    pooled condition. The output past the end of a motion is 0.
+    The input of the decoder is [ML, TS, CLS, frame 1, frame 2, ...], and its memory is [ML, TS,
+    CLS, text tokens]. ML embeds the length of the motion, TS is the sinusoid of the time, and CLS
+    is the projected pooled condition. The output past the end of a motion is 0.
 
     Args:
-        in_features: D.
+        in_features: D, the number of features per frame.
         out_features: D, or 2D with a learned variance.
-        cond_features: C; 0 = unconditioned.
+        cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads; divides `latent_dim`.
+        num_heads: number of attention heads, which must divide `latent_dim`.
         dropout: probability of dropout inside the layers.
         max_frames: maximum length of a motion that ML can embed.
         length_token: False omits ML (table 4, first row).
@@ -33,8 +33,8 @@ class FLAME(Denoiser):
             first two rows).
         condition_frames: also add TS and CLS to every frame. A small network then learns to
             follow the text in fewer steps.
-        length_unit: the lengths of the training windows are multiples of this number of frames. ML
-            embeds the length rounded down to such a multiple.
+        length_unit: ML embeds the length rounded down to a multiple of this number of frames,
+            because the lengths of training windows are such multiples.
 
     Example:
         >>> denoiser = FLAME(

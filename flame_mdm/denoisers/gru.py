@@ -9,23 +9,22 @@ from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
 
 
 class MDMGRU(Denoiser):
-    """GRU over the frames.
+    """GRU over the frames of a motion.
 
-    The sum of the time and condition embeddings is concatenated to each frame.
-
-    The network runs forward in time, so padding at the end does not affect real frames.
+    The sum of the time and condition embeddings is concatenated to each frame. The network runs
+    forward in time, so padding at the end does not affect real frames.
 
     Args:
-        in_features: D.
+        in_features: D, the number of features per frame.
         out_features: D, or 2D with a learned variance.
-        cond_features: C; 0 = unconditioned.
+        cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         num_layers: number of layers of the GRU.
-        dropout: probability of dropout after the positions.
-        project_condition: False adds the condition to the time without projection.
+        dropout: probability of dropout after the positional encoding.
+        project_condition: False adds the condition to the time embedding without a projection.
         recur_over_batch: recur from sample to sample instead of from frame to frame, as MDM's
-            released code does because of swapped axes. For reproduction only: results then depend
-            on the order of the batch.
+            released code does because its axes are swapped. This option is only for reproduction:
+            results then depend on the order of the samples in the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

@@ -13,8 +13,8 @@ from flame_mdm.errors import UserError
 def sinusoid(position: Tensor, features: int) -> Tensor:
     """Returns sinusoidal embeddings (N, features) for positions (N,) (Vaswani et al. 2017, section 3.5).
 
-    Even channels are sines, and odd channels are cosines. They are computed in float32, regardless
-    of the precision of the network, as when the released weights were trained.
+    Even channels are sines, and odd channels are cosines. They are always computed in float32,
+    regardless of the network's precision, as they were when the released weights were trained.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
@@ -22,14 +22,14 @@ def sinusoid(position: Tensor, features: int) -> Tensor:
 
 
 def with_prefix(mask: Tensor, prefix: int) -> Tensor:
-    """Extends a mask (B, N) to (B, prefix + N). The prefix is always real."""
+    """Extends a mask (B, N) to (B, prefix + N), where all entries of the prefix are real."""
     return torch.cat([mask.new_ones(mask.shape[0], prefix), mask], 1)
 
 
 class Attention(nn.Module):
     """Multi-head attention from x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), as in the released weights, so that
+    As in the released weights, query, key and value share one matrix (3C, C), so that
     self-attention needs only one projection.
     """
 
@@ -74,9 +74,9 @@ class Attention(nn.Module):
 
 
 class TransformerLayer(nn.Module):
-    """Self-attention, optional cross-attention and feed-forward, each followed by a norm.
+    """Self-attention, optional cross-attention, and a feed-forward network.
 
-    The norm is applied after the residual sum.
+    Each of these sublayers is followed by a residual sum and a layer norm.
     """
 
     def __init__(
@@ -109,9 +109,9 @@ class TransformerLayer(nn.Module):
 
         Args:
             x: (B, N, C), the sequence.
-            mask: (B, N) bool, True = real; None = all are real.
-            memory: (B, S, C), for cross-attention.
-            memory_mask: (B, S) bool, True = real; None = all are real.
+            mask: (B, N) bool, True = real entry; None = all entries are real.
+            memory: (B, S, C), the keys and values of cross-attention.
+            memory_mask: (B, S) bool, True = real entry; None = all entries are real.
         """
         x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
         if self.cross_attention is not None and self.cross_norm is not None:
@@ -150,9 +150,9 @@ class Transformer(nn.Module):
 
         Args:
             x: (B, N, C), the sequence.
-            mask: (B, N) bool, True = real; None = all are real.
-            memory: (B, S, C), for a decoder.
-            memory_mask: (B, S) bool, True = real; None = all are real.
+            mask: (B, N) bool, True = real entry; None = all entries are real.
+            memory: (B, S, C), the memory of a decoder. Encoders have none.
+            memory_mask: (B, S) bool, True = real entry; None = all entries are real.
         """
         for layer in self.layers:
             x = layer(x, mask, memory, memory_mask)
@@ -160,11 +160,11 @@ class Transformer(nn.Module):
 
 
 class TimeAndCondition(nn.Module):
-    """The token z_tk of MDM (Tevet et al. 2023, section 3).
+    """Embedding of time and condition, the token z_tk of MDM (Tevet et al. 2023, section 3).
 
-    It is the sinusoid of the time after two linear layers, plus the projected condition. The null
-    condition is a zero vector *before* the projection, so that only the bias of the projection
-    remains.
+    The embedding is the sinusoid of the time after two linear layers, plus the projected condition.
+    The null condition is a zero vector *before* the projection, so that only the bias of the
+    projection remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):
@@ -190,7 +190,7 @@ class TimeAndCondition(nn.Module):
     def forward(self, t: Tensor, condition: Tensor) -> Tensor:
         """Embeds times (B,) and a condition (B, C) as (B, features).
 
-        For a condition (B, S, C), the result is (B, S, features).
+        A condition (B, S, C) is embedded as (B, S, features).
         """
         return self.add(self.time(t), condition)
 

@@ -16,22 +16,22 @@ class MDMEncoder(Denoiser):
     """Transformer encoder over [time + condition, frame 1, frame 2, ...]; used by MDM and MFM.
 
     Args:
-        in_features: D.
+        in_features: D, the number of features per frame.
         out_features: D, or 2D with a learned variance.
-        cond_features: C; 0 = unconditioned.
+        cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads; divides `latent_dim`.
-        dropout: probability of dropout after the positions and inside the layers.
-        project_condition: False adds the condition to the time without projection.
-        max_tokens: maximum number of condition tokens between the time and the frames (MFM with T5:
-            30). 0 = no tokens; the pooled condition is added to the time instead. The positions of
-            the frames do not depend on the number of tokens.
+        num_heads: number of attention heads, which must divide `latent_dim`.
+        dropout: probability of dropout after the positional encoding and inside the layers.
+        project_condition: False adds the condition to the time embedding without a projection.
+        max_tokens: maximum number of condition tokens between the time and the frames (30 in MFM
+            with T5). 0 = no tokens; the pooled condition is added to the time instead. The
+            positional encoding of the frames does not depend on the number of tokens.
         mask_padding: False lets frames attend to padding, as in the released models of MDM and
             MFM. Motions are then sampled with the padded length of training, and cropped.
-        condition_frames: also add time + condition (with `max_tokens`, only the time) to every
-            frame. A small network then learns to follow the text in fewer steps.
+        condition_frames: also add time + condition to every frame or, with `max_tokens`, only the
+            time. A small network then learns to follow the text in fewer steps.
 
     Example:
         >>> denoiser = MDMEncoder(6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0)
@@ -72,7 +72,7 @@ class MDMEncoder(Denoiser):
         """See `Denoiser.forward`.
 
         Raises:
-            UserError: If `max_tokens` is above 0, and there are no or too many tokens.
+            UserError: If `max_tokens` is above 0 and there are no tokens or too many of them.
         """
         token_mask = mask[:, :0]
         if self.max_tokens:
@@ -89,7 +89,7 @@ class MDMEncoder(Denoiser):
             prefix = self.condition(t, cond.pooled)[:, None]
         size = prefix.shape[1]
         positions = torch.arange(1 + self.max_tokens + x_t.shape[1], device=x_t.device)
-        # Frames keep their positions if there are fewer tokens than `max_tokens`.
+        # Frames have the same positions even if there are fewer tokens than `max_tokens`.
         positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])
         frames = self.input(x_t)
         x = torch.cat([prefix, frames + prefix[:, :1] if self.condition_frames else frames], 1)
@@ -102,35 +102,36 @@ class MDMEncoder(Denoiser):
 class MDMDecoder(Denoiser):
     """Transformer decoder over the frames; used by MDM and DiP.
 
-    The memory of its cross-attention is time + condition. With `context_frames`, clean frames
+    The memory of the cross-attention is time + condition. With `context_frames`, clean frames
     precede the noisy frames, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1). Only their
-    positions mark them as clean, and their outputs are dropped.
+    positions identify them as clean, and their outputs are discarded.
 
     Args:
-        in_features: D.
+        in_features: D, the number of features per frame.
         out_features: D, or 2D with a learned variance.
-        cond_features: C; 0 = unconditioned.
+        cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads; divides `latent_dim`.
-        dropout: probability of dropout after the positions and inside the layers.
-        project_condition: False adds the condition to the time without projection.
-        input_token: token before the frames. "condition" is time + condition, as in the paper's "+
-            input token" and in the released model. "time" is only the time, as in MDM's code since
-            February 2025.
-        token_memory: use all condition tokens as memory and add the time to each of them, as MDM
+        num_heads: number of attention heads, which must divide `latent_dim`.
+        dropout: probability of dropout after the positional encoding and inside the layers.
+        project_condition: False adds the condition to the time embedding without a projection.
+        input_token: content of the token before the frames, if any. "condition" is time +
+            condition, as in the paper's "+ input token" and in the released model. "time" is only
+            the time, as in MDM's code since February 2025.
+        token_memory: use all condition tokens as memory, and add the time to each of them, as MDM
             does with DistilBERT.
-        memory: how the time enters a memory of all tokens. "add": the time is added to each token.
-            "concat": the time is a token before them.
+        memory: how the time enters a memory of all tokens: "add" adds it to each token, and
+            "concat" places it before them as a separate token.
         mask_padding: False lets frames attend to padding, as in the released models without
             `mask_frames`.
         context_frames: number of clean frames before the motion, in `Condition.prefix`.
-        target_encoder: network that embeds `Condition.target`. The result is added to the time.
-            "none" ignores targets.
+        target_encoder: network that embeds `Condition.target`. Its output is added to the time
+            embedding. "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
         condition_frames: also add time + condition to every noisy frame. A small network then
-            learns to follow the text in fewer steps, and noisy frames differ from clean frames.
+            learns to follow the text in fewer steps, and noisy frames can be distinguished from
+            clean frames.
 
     Raises:
         UserError: If arguments contradict each other.

@@ -18,9 +18,9 @@ def stacked_layers(denoiser: nn.Module) -> list[nn.Module]:
 def recompute_activations(denoiser: nn.Module) -> None:
     """Makes the backward pass recompute the activations inside stacked layers instead of storing them.
 
-    Only the inputs of the layers are stored, which takes less memory and about a third more
+    Only the inputs of the layers are stored, which saves memory but requires about a third more
     operations (Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost"). Random draws are
-    repeated, so that the gradients are the same, bit for bit.
+    repeated, so that the gradients are bitwise identical.
     """
     for layer in stacked_layers(denoiser):
         layer.forward = partial(_recomputed, layer.forward)

@@ -20,7 +20,7 @@ SLOTS = 8
 class TargetEncoder(nn.Module, ABC):
     """Embeds the target of a condition as (B, features). Without a target, the embedding is 0.
 
-    A target that requests no joint differs from no target, because its embedding contains the
+    A target that requests no joint is not the same as no target, because its embedding contains the
     biases of the network.
 
     Example:
@@ -42,7 +42,7 @@ class TargetEncoder(nn.Module, ABC):
 
 
 class SingleTarget(TargetEncoder):
-    """One network for the values of all slots."""
+    """Embeds the values of all slots with a single network."""
 
     def __init__(self, features: int, layers: int):
         super().__init__()
@@ -54,7 +54,7 @@ class SingleTarget(TargetEncoder):
 
 
 class SplitTarget(TargetEncoder):
-    """One network per slot, whose outputs are concatenated."""
+    """Embeds each slot with a separate network, and concatenates the outputs."""
 
     def __init__(self, features: int, layers: int):
         super().__init__()
@@ -74,10 +74,10 @@ class SplitTarget(TargetEncoder):
 
 
 class MultiTarget(TargetEncoder):
-    """One network per slot; the outputs of requested slots are summed with learned weights.
+    """Embeds each slot with a separate network, and returns a weighted sum over requested slots.
 
-    As in the authors' code, the weights are divided by their sum over all slots, which may be
-    near 0. `layers` has no effect.
+    The weights are learned. As in the authors' code, they are divided by their sum over all slots,
+    which may be near 0. `layers` has no effect.
     """
 
     def __init__(self, features: int, layers: int):

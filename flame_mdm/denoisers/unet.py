@@ -1,8 +1,8 @@
-"""The U-Net of MDM (Tevet et al. 2023, section 4.1). Its code is not public.
+"""The U-Net of MDM (Tevet et al. 2023, section 4.1), whose code is not public.
 
 The paper specifies convolutions over time, joints as channels, and 23.47 M parameters. All other
-details are as in the network of DDPM (Ho et al. 2020, appendix B), with the scale-and-shift
-injection of Dhariwal and Nichol 2021.
+details follow the network of DDPM (Ho et al. 2020, appendix B), with the scale-and-shift injection
+of Dhariwal and Nichol 2021.
 """
 
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ class MDMUNet(Denoiser):
     level is real if the first of its two finer frames is real.
 
     Args:
-        in_features: D.
+        in_features: D, the number of features per frame.
         out_features: D, or 2D with a learned variance.
-        cond_features: C; 0 = unconditioned.
+        cond_features: C; 0 = unconditional.
         latent_dim: width of the time and condition embeddings.
         channels: width of each level. Each level has half the frame rate of the previous one.
-        num_groups: number of groups of the group norms; divides all widths.
+        num_groups: number of groups of the group norms, which must divide all widths.
         dropout: probability of dropout inside the blocks.
-        project_condition: False adds the condition to the time without projection.
+        project_condition: False adds the condition to the time embedding without a projection.
 
     Example:
         >>> denoiser = MDMUNet(6, 6, 4, latent_dim=8, channels=[8, 16], num_groups=4, dropout=0.0)
@@ -92,7 +92,10 @@ class MDMUNet(Denoiser):
 
 
 class ResidualBlock(nn.Module):
-    """Norm, SiLU and convolution, twice. Time and condition scale and shift the second norm."""
+    """Residual block: norm, SiLU and convolution, twice.
+
+    The embedding of time and condition scales and shifts the output of the second norm.
+    """
 
     def __init__(
         self, in_channels: int, out_channels: int, features: int, num_groups: int, dropout: float

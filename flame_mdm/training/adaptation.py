@@ -1,5 +1,5 @@
 # pyright: standard
-"""Adaptation of a trained model to a few of the user's clips. `docs/own-motion.md` is the guide."""
+"""Adaptation of a trained model to a few of the user's clips. Guide: `docs/own-motion.md`."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -40,7 +40,7 @@ from flame_mdm.visualize import player_page
 
 # Number of motions that are sampled from the base model if its training data is missing
 SAMPLED = 300
-# Number of clips on which the page compares the models
+# Number of clips for which the page compares the losses of the models
 COMPARED = 32
 # Parts of the recipe that are taken from the base model
 OF_BASE = (
@@ -54,13 +54,13 @@ OF_BASE = (
 
 
 class AdaptationTask(GeneratorTask):
-    """Continues training a model on a few clips of the user and on clips from its own training data."""
+    """Continues to train a model on a few of the user's clips and on clips of its training data."""
 
     def pretrain(self) -> None:
         """Does nothing, because the text encoder is already trained."""
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws which captions are dropped, but never drops captions of the user's clips.
+        """Draws the captions to drop, but never drops the captions of the user's clips.
 
         If these clips had the null condition, guidance would lead away from their motions.
         """
@@ -88,7 +88,7 @@ def adapt(
 
     The model is trained on the user's clips and on clips of its original training data, so that
     it does not forget what it has learned. Prompts request the new motions with "in NAME style".
-    `docs/own-motion.md` is the guide.
+    For a guide, see `docs/own-motion.md`.
 
     Args:
         base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a
@@ -99,15 +99,15 @@ def adapt(
         action: whether the clips show an action that the model does not know, instead of a style.
         full: whether to train all weights. The result is then a model file instead of an adapter.
         force: whether to accept clips that drift upward or float.
-        rank: rank of the low-rank updates of the weights, 1 or more. Increase it for motions that are very
-            different from the model's training data.
-        data_root: folder of the prepared data sets. If it lacks the base model's data set, 300 motions are sampled
-            from the base model instead.
+        rank: rank of the low-rank updates of the weights, at least 1. Increase it for motions that
+            differ greatly from the model's training data.
+        data_root: folder of the prepared data sets. If the base model's data set is not in this
+            folder, 300 motions sampled from the base model are used instead.
         overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
 
     Returns:
-        Path of the adapter or, with `full`, path of the model file: OUT/NAME.safetensors. The
-        page OUT/adaptation.html compares motions before and after training.
+        Path of the adapter or, with `full`, of the model file: OUT/NAME.safetensors. The page
+        OUT/adaptation.html compares motions before and after training.
 
     Raises:
         FileNotFoundError: If there is no such model or folder.
@@ -145,7 +145,7 @@ def adapt(
         )
     if not force:
         check_clips(source, model.representation.fps)
-    check_tree(out)  # `_prior` writes its motions there before training begins
+    check_tree(out)  # `_prior` writes motions to this folder before training begins
     config = _recipe(model, captions, name, out, overrides)
     config["base"], config["adapter"] = (
         str(base),
@@ -171,7 +171,7 @@ def adapt(
         )
 
     write_results()
-    # All processes wait here, because the launcher ends them when the first process exits.
+    # All processes wait here, because the launcher terminates them when the first one exits.
     if torch.distributed.is_initialized():
         torch.distributed.barrier()
     return path
@@ -200,7 +200,7 @@ def _recipe(
 ) -> Config:
     """Returns the recipe of an adaptation.
 
-    Raises `UserError` for overrides of parts that the base model determines.
+    Raises `UserError` if an override changes a part that the base model determines.
     """
     if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
@@ -215,8 +215,9 @@ def _recipe(
     config["experiment"] = f"adapt/{name}"
     config["run"]["name"] = config["data"]["name"] = name
 
-    # Crop, kind of motion and learning rate are taken from the base model. A released model has no
-    # data, so its crops are as long as its longest motion, rounded down to a multiple of 4 frames.
+    # The crop, the kind of motion and the learning rate are taken from the base model. The recipe
+    # of a released model has no data section, so its crops are as long as its longest motion,
+    # rounded down to a multiple of 4 frames.
     data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
     config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
     if not any(word.startswith("optimizer.lr=") for word in overrides):
@@ -233,10 +234,10 @@ def _recipe(
 
 
 def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
-    """Returns the folder of a store with data for the base model.
+    """Returns the folder of a store with the base model's training data, or with a substitute.
 
-    If `root` contains the store of the base model's training data, its folder is returned. Otherwise,
-    the folder is a store in `out`, with motions sampled from the base model.
+    If `root` does not contain the store of the training data, motions are sampled from the base
+    model and stored in a folder in `out`.
     """
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
@@ -259,7 +260,7 @@ def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str
 
 
 class _Samples(MotionSource):
-    """A data set of `SAMPLED` motions that a model generates. A tenth of them are for validation."""
+    """A data set of `SAMPLED` motions generated by a model. A tenth of them are for validation."""
 
     name, workers = "prior", 1
 
@@ -285,7 +286,10 @@ class _Samples(MotionSource):
 
 
 def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
-    """Returns the page that compares motions and losses of the base model and the adapted model."""
+    """Returns the body of a page that compares the base model and the adapted model.
+
+    The page shows the motions and the losses of both.
+    """
     data.setup("fit")
     before, after = (task.generator for task in tasks)
     clips = data.train.clips

@@ -15,16 +15,16 @@ class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, for validation and for the saved model.
 
     By default, it computes the same average as Lightning's `EMAWeightAveraging`, but with a single
-    call for all parameters. Lightning's class iterates over all modules in every step, and waits
-    for the device on CUDA. Buffers are not averaged.
+    call for all parameters, whereas Lightning's class iterates over all modules in every step and,
+    on CUDA, waits for the device. Buffers are not averaged.
 
     Args:
         decay: factor from 0 to 1 in average = decay * average + (1 - decay) * weights.
-        update_every_n_steps: the average is updated at multiples of this number of steps.
+        update_every_n_steps: number of steps between updates of the average.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
             them. The first update always copies them.
         from_initial_weights: whether the average starts from the weights before the first step, as
-            in MDM's code. The first update is then also an average.
+            in MDM's code. The first update then averages instead of copying.
     """
 
     def __init__(
@@ -49,13 +49,13 @@ class MovingAverage(WeightAveraging):
     def averaged(self) -> Any:
         """Returns the copy of the task that contains the averaged weights.
 
-        During validation, this copy contains the trained weights instead.
+        During validation, the two are swapped, and the copy contains the trained weights.
         """
         assert self._average_model is not None
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of the model and the average once, because collecting them takes time."""
+        """Collects the parameters of the model and the average once, because this takes time."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):

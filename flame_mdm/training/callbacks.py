@@ -46,8 +46,8 @@ from flame_mdm.training.provenance import device_name
 REAL = 64
 # Number of motions without a prompt
 UNCONDITIONED = 4
-# In meters. Even if a model has learned little, its samples for different prompts differ by more
-# than this.
+# Motions that differ by less than this number of meters count as the same. Even if a model has
+# learned little, its samples for different prompts differ by more.
 SAME = 0.01
 Values = Mapping[str, float]  # values by metric, or by metric/part
 
@@ -61,12 +61,12 @@ class Interrupted(Exception):
 
 
 class Checkpoints(Checkpoint):
-    """Writes `last.ckpt` periodically, at the last step and when interrupted.
+    """Writes `last.ckpt` periodically, at the last step, and when training is interrupted.
 
     `keep_every_n_steps` is the number of steps between the checkpoints that are kept. Signals stop
     training at the end of the current step (`StopRequest`) or, with several ranks, at the end of
-    the next step. Validation is never interrupted, because averaged weights replace the trained
-    weights during validation.
+    the next step. Validation is never interrupted, because the averaged weights replace the trained
+    weights while it runs.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -82,22 +82,22 @@ class Checkpoints(Checkpoint):
         self.step = -1
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Starts recording signals, so that they do not end the process."""
+        """Starts recording signals, so that they do not terminate the process."""
         self.step = trainer.global_step
         self.stop.install()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Saves a checkpoint if it is due.
+        """Saves a checkpoint if one is due.
 
-        If any rank received a signal, saves a checkpoint and stops.
+        If any rank received a signal, saves a checkpoint and stops training.
         """
         if trainer.global_step == self.step:  # gradients are still being accumulated
             return
         self.step = trainer.global_step
         signum = self.stop.signum
         if trainer.world_size > 1:
-            # All processes act on the signal that was exchanged in the previous step. Reading the
-            # signal of the current step would wait until the device has finished the step.
+            # All processes act on the signal that was exchanged in the previous step. To read the
+            # signal of the current step, they would have to wait until the device has finished it.
             signum, received = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
             torch.distributed.all_reduce(received, torch.distributed.ReduceOp.MAX)
             self.exchanged = received
@@ -121,13 +121,13 @@ class Checkpoints(Checkpoint):
 class Measurements(Callback):
     """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps` steps.
 
-    The values that the task reports are logged at the same steps. Other steps are not slowed down.
-    The norm of all gradients is measured before clipping. Seconds per step do not include validation.
+    The values that the task reports are logged at the same steps, and no other step is slowed down.
+    The norm of all gradients is measured before clipping. Seconds per step exclude validation.
 
     Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
     `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
-    peak memory. On CUDA, this is the memory of tensors. On other devices, it is the memory of the
-    first process.
+    peak memory, which is the memory of tensors on CUDA and the memory of the first process on other
+    devices.
     """
 
     def __init__(self) -> None:
@@ -138,7 +138,7 @@ class Measurements(Callback):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Restores the sums that the run had reached before its interruption."""
+        """Restores the totals that the run had reached before it was interrupted."""
         self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -153,7 +153,7 @@ class Measurements(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Adds the duration and the peak memory so far to the facts in the checkpoint."""
+        """Adds the duration and peak memory so far to the facts in the checkpoint."""
         if pl_module.device.type == "cuda":
             memory = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
         else:
@@ -181,7 +181,7 @@ class Measurements(Callback):
             pl_module.report({"train/grad_norm": norm, "train/lr": lr})
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Logs the reported values, and steps and clips per second."""
+        """Logs the values that the task reported, as well as the speed."""
         step = trainer.global_step
         steps = step - self.first
         if step % trainer.log_every_n_steps or not steps:  # type: ignore[attr-defined]  # or gradients are accumulated
@@ -205,7 +205,7 @@ class Measurements(Callback):
 
 
 def log_values(trainer: Trainer, values: Mapping[str, Tensor | float]) -> None:
-    """Writes values of a training step to all loggers, and passes them to all callbacks.
+    """Writes the values of a training step to all loggers, and passes them to all callbacks.
 
     Tensors are copied from the device together, so that the host waits for the device only once.
     """
@@ -256,7 +256,7 @@ class Report(Callback):
 
 
 def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
-    """Returns the name of the package's extractor for a model's motions, or "" if there is no such extractor."""
+    """Returns the name of this package's extractor for a model's motions, or "" if there is none."""
     name = f"motion_clip_{facts.get('dataset')}"
     if name not in SHIPPED or "captions" not in facts:
         return ""
@@ -265,7 +265,7 @@ def _extractor_in_package(config: Config, facts: Mapping[str, Any]) -> str:
 
 
 def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric]) -> list[str]:
-    """Returns lines that explain metrics with their docstrings, and show values for generated and real motions."""
+    """Returns lines that explain each metric and show its values for generated and real motions."""
     lines = []
     for name, metric in metrics.items():
         shown = {key: value for key, value in values.items() if key.partition("/")[0] == name}
@@ -322,9 +322,9 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Whether motions differ by less than `SAME`, which means that the network ignores its input.
+    """Returns whether motions differ by less than `SAME`, so that the input is clearly ignored.
 
-    If the learning rate is too high, the network may learn to return the same pose for every prompt
+    If the learning rate is too high, the network may learn to return the same pose for all prompts
     and noise. Its loss is finite and even decreases slightly, so curves do not show the failure.
     """
     if len(motions) < 2:
@@ -335,7 +335,7 @@ def are_same(motions: Sequence[Motion]) -> bool:
 
 
 class SampleMotions(Callback):
-    """Samples fixed prompts with fixed noise, writes files to the run directory, and logs a video.
+    """Generates samples for fixed prompts and noise, writes them to files, and logs a video.
 
     Args:
         folder: folder of the samples. The samples of each step are in a subfolder such as
@@ -343,11 +343,11 @@ class SampleMotions(Callback):
         every_n_steps: minimum number of steps between samples, which are generated at validation
             and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None =
-            `UNCONDITIONED` motions. If a model is conditioned on actions and no prompt is an
-            action, its first actions are used instead.
+            `UNCONDITIONED` motions without prompts. If a model is conditioned on actions and no
+            prompt is an action, its first actions are used instead.
         seconds: length of the motions in seconds.
-        metrics: torchmetrics by name. Their `update` takes some of these arguments: joints (B, F,
-            J, 3), mask (B, F), keys, requested.
+        metrics: torchmetrics metrics by name. Their `update` takes some of these arguments: joints
+            (B, F, J, 3), mask (B, F), keys, requested.
     """
 
     def __init__(
@@ -374,14 +374,14 @@ class SampleMotions(Callback):
         return [text for text, _ in self.prompts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Plans the first samples, and chooses the conditions of models without text."""
+        """Schedules the first samples, and chooses the conditions of models without text."""
         self.next = trainer.global_step + self.every_n_steps
         assert isinstance(pl_module, GeneratorTask)
         actions = pl_module.facts["actions"]
         if isinstance(pl_module.generator.condition, ActionLabels) and not set(self.texts) & set(
             actions
         ):
-            # The prompts are texts if a text-to-motion recipe was overridden with condition=action
+            # The prompts are texts if a text-to-motion recipe was overridden with condition=action.
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -399,8 +399,8 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Writes the samples of the final model, and prints their metrics and the metrics of real motions."""
-        # The last validation may already have written the samples of this step
+        """Writes samples of the final model, and prints their metrics and those of real motions."""
+        # The last validation may already have written the samples of this step.
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)
         _, folder, values = self.written
@@ -413,7 +413,7 @@ class SampleMotions(Callback):
             )
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Samples a share of the motions on each rank. Rank 0 measures, writes and logs all motions."""
+        """Samples some of the motions on each rank. Rank 0 measures, writes and logs all of them."""
         assert isinstance(pl_module, GeneratorTask)
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
@@ -465,7 +465,7 @@ class SampleMotions(Callback):
         return sample(model, resolve(request, model, check_words=False))
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
-        """Computes all metrics for up to `REAL` training clips with the attributes that all prompts request."""
+        """Computes all metrics for up to `REAL` training clips that have the attributes of all prompts."""
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
         common, all_names = (
@@ -487,7 +487,8 @@ class SampleMotions(Callback):
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()
-            # Returns False: metrics are not synchronized, because this process has all motions
+            # `bool()` returns False: metrics are not synchronized, because this process has all
+            # motions.
             metric.distributed_available_fn = bool
             for key, (motion, attributes) in enumerate(zip(motions, requested, strict=True)):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)

@@ -1,8 +1,8 @@
 """Atomic checkpoints, and resuming from them.
 
-A run directory may come from somebody else. Reading a checkpoint does not run code, and does not take
-more memory than the size of the file. Only files in the checkpoint folder are removed, even if the state of
-a callback names other files.
+A run directory may come from an untrusted source. Therefore, reading a checkpoint never runs code
+and takes no more memory than the size of the file, and only files in the checkpoint folder are
+removed, even if the state of a callback names other files.
 """
 
 import math
@@ -23,7 +23,7 @@ from flame_mdm.safe_io.paths import check_within, temporary_beside
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 # Checkpoints from older versions of Lightning are rejected, because Lightning migrates them with
-# code that trusts their content
+# code that trusts their content.
 OLDEST_LIGHTNING = Version("2.6")
 
 # Numbers in the state of a learning-rate schedule
@@ -44,9 +44,9 @@ class Resumed(NamedTuple):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints to a temporary file, which is synced and renamed.
+    """Writes each checkpoint to a temporary file, which is then synced and renamed.
 
-    The previous last checkpoint is kept as `previous.ckpt`.
+    The checkpoint before the last one is kept as `previous.ckpt`.
     """
 
     def __init__(self, folder: Path, resumed: Resumed | None = None):
@@ -54,7 +54,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         self.folder, self.resumed = folder, resumed
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
-        """Returns the content of the checkpoint from which the run resumes, already checked by `newest`."""
+        """Returns the checkpoint from which the run resumes, which `newest` has already checked."""
         assert self.resumed is not None
         content = self.resumed.content
         # The checkpoint is released, because it takes as much memory as the model and its
@@ -99,7 +99,10 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 
 def newest(folder: Path) -> Resumed | None:
-    """Returns the checkpoint from which to resume: the last one, or the previous one if it is damaged."""
+    """Returns the checkpoint from which to resume.
+
+    This is the last checkpoint or, if it is damaged, the previous one.
+    """
     paths = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
     for path in paths:
         try:
@@ -127,7 +130,7 @@ def newest(folder: Path) -> Resumed | None:
 def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None:
     """Raises `UserError` if the saved state of the optimizer and its schedule does not match the recipe.
 
-    PyTorch accepts any values, and would only fail in the first training step.
+    PyTorch accepts any values and would fail only in the first training step.
     """
     try:
         misfits = list(_misfits(resumed.content, optimizer))
@@ -158,7 +161,7 @@ def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Itera
 
 
 def _is_alike(value: Any, usual: Any) -> bool:
-    """Whether a saved option of an optimizer has the same type as the usual value."""
+    """Returns whether a saved option of an optimizer has the same type as the usual value."""
     if isinstance(usual, bool) or usual is None:
         return value is None or isinstance(value, bool)
     if isinstance(usual, int | float):
@@ -172,7 +175,10 @@ def _is_alike(value: Any, usual: Any) -> bool:
 
 
 def _is_state(value: Any, weight: Tensor) -> bool:
-    """Whether a saved value can be the state of a weight: a number, or a tensor of at most the weight's size."""
+    """Returns whether a saved value can be the state of a weight.
+
+    A state is a number, or a tensor that is no larger than the weight.
+    """
     if isinstance(value, Tensor):
         return value.numel() <= max(1, weight.numel()) and not value.dtype.is_complex
     return isinstance(value, int | float)

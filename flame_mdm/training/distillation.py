@@ -1,5 +1,5 @@
 # pyright: standard
-"""Trains models that sample in one to four steps, with the help of a teacher that takes more steps."""
+"""Distillation: trains models that sample in one to four steps from a teacher that takes more."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -25,9 +25,9 @@ from flame_mdm.training.averaging import MovingAverage
 class DistillationTask(GeneratorTask):
     """Trains a student to sample in one to four steps, with built-in guidance.
 
-    The student starts with its teacher's weights, and has the same parts, data and captions. The
-    teacher is needed only for training. The text encoder is not trained, and there is no dropout.
-    `experiments/distillation/consistency.yaml` explains the section `distillation`.
+    The student starts with its teacher's weights and has the same parts, data and captions. The
+    teacher is needed only during training. The text encoder is not trained, and dropout is
+    disabled. `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
 
     kind = DistilledGenerator
@@ -49,7 +49,7 @@ class DistillationTask(GeneratorTask):
         return task.eval()
 
     def train(self, mode: bool = True) -> Self:
-        """Stays in evaluation mode, because dropout would add noise to the targets."""
+        """Keeps the task in evaluation mode, because dropout would add noise to the targets."""
         return super().train(False)
 
     def setup(self, stage: str) -> None:
@@ -101,7 +101,7 @@ class DistillationTask(GeneratorTask):
             )
 
     def on_fit_start(self) -> None:
-        """Moves the teacher, which is not a submodule, to the device."""
+        """Moves the teacher to the device, because it is not a submodule."""
         super().on_fit_start()
         self.teacher[0].to(self.device)
 
@@ -128,7 +128,7 @@ class DistillationTask(GeneratorTask):
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`.
 
-        Validation, which passes `u`, uses the grid of times with which training ends.
+        Validation, which passes `u`, uses the grid of times that is used at the end of training.
         """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None
@@ -170,7 +170,7 @@ class DistillationTask(GeneratorTask):
 
 
 def read_teacher(path: Path) -> MotionGenerator:
-    """Loads a teacher. Raises `UserError` if it predicts noise, or if it is itself a student."""
+    """Loads a teacher. Raises `UserError` if it predicts noise or is itself a distilled model."""
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(

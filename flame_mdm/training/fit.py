@@ -31,7 +31,7 @@ from flame_mdm.training.provenance import WriteProvenance
 from flame_mdm.training.speed import accelerate
 
 SHARDING = ("fsdp", "deepspeed", "modelparallel")
-"""Parts of the names of strategies that shard a model."""
+"""Substrings of the names of strategies that shard a model."""
 
 
 def fit(folder: Path, config: Config) -> None:
@@ -73,7 +73,7 @@ def fit(folder: Path, config: Config) -> None:
     measurements, checkpoints = Measurements(), AtomicCheckpoints(folder / "checkpoints", resumed)
     callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
-        # Added before the callbacks that use the averaged weights in validation
+        # This callback comes before those that use the averaged weights in validation.
         callbacks.append(MovingAverage(**config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     # The progress bar shows values that `measurements` has logged.
@@ -82,7 +82,7 @@ def fit(folder: Path, config: Config) -> None:
     loggers = [instantiate(config["logger"])] if config["logger"] else []
     plugins: list[Any] = [checkpoints]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
-        # Lightning would save during a step, to a file that it would then prefer to `last.ckpt`
+        # Lightning would save during a step, to a file that it would then prefer to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
     unless_chosen = {} if config["trainer"].get("profiler") else {"profiler": NoProfiler()}
     trainer: Trainer = instantiate(
@@ -112,7 +112,7 @@ def fit(folder: Path, config: Config) -> None:
             _requeue(job)
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
-        # Otherwise, the other processes would wait for this process for half an hour.
+        # Otherwise, the other processes would wait half an hour for this process.
         if trainer.strategy.launcher is not None:
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
@@ -133,7 +133,7 @@ def fit(folder: Path, config: Config) -> None:
 def check_devices(trainer: Config) -> None:
     """Raises `UserError` if this machine lacks the devices of a recipe, or if the recipe shards the model.
 
-    On a CPU, there is at most one process per core.
+    A recipe for the CPU may use at most one process per core.
     """
     _check_strategy(trainer.get("strategy", "auto"))
     accelerator, devices = trainer.get("accelerator", "auto"), trainer.get("devices", 1)

@@ -19,10 +19,10 @@ from flame_mdm.safe_io.paths import check_tree, remove_abandoned
 
 @contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Holds the lock `run.lock` in the run directory.
+    """Holds the lock `run.lock` in the run directory, which may come from an untrusted source.
 
-    The directory may come from somebody else. Raises `UserError` if a process on any host holds the
-    lock, or if links in the directory lead out of it.
+    Raises `UserError` if another process on any host holds the lock, or if links in the directory
+    lead out of it.
     """
 
     def refuse(owner: str) -> None:
@@ -40,8 +40,8 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            # Without a configuration, training has never started, and the folder only contains
-            # files of loggers.
+            # If there is no configuration, training has never started, and the folder contains only
+            # the files of loggers.
             if new and not (folder / "config.yaml").exists():
                 shutil.rmtree(folder, ignore_errors=True)
 
@@ -49,18 +49,18 @@ def only_run(folder: Path) -> Iterator[None]:
 class BadLoss(Callback):
     """Stops training when a loss is not finite or explodes, before a checkpoint is written.
 
-    A loss explodes if it exceeds `factor` times the median of the previous interval.
-    `bad_batch.json` in the run directory describes the first bad batch. It contains the step and,
-    for each rank, the batch index, the clip ids and the loss.
+    A loss explodes if it exceeds `factor` times the median loss of the previous log interval. The
+    first bad batch is described in `bad_batch.json` in the run directory, with the step and, for
+    each rank, the batch index, the clip ids and the loss.
 
     Args:
         folder: the run directory.
-        factor: maximum ratio of a loss to the median of the previous interval.
+        factor: maximum ratio of a loss to the median loss of the previous log interval.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
-        # Copying a loss from the GPU waits until the step is finished. Therefore, losses stay on
-        # the device and are copied together, at the log interval and before a checkpoint.
+        # Copying a loss from the GPU requires waiting until the step is finished. Therefore, losses
+        # stay on the device and are copied together, at the log interval and before a checkpoint.
         self.path, self.factor = Path(folder) / "bad_batch.json", factor
         self.usual = float("inf")
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
@@ -73,7 +73,7 @@ class BadLoss(Callback):
         batch: MotionBatch,
         batch_idx: int,
     ) -> None:
-        """Stores the loss of the batch on its device, and checks all stored losses at the log interval."""
+        """Stores the loss of the batch on its device. Checks all losses at the log interval."""
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
@@ -82,7 +82,7 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Checks the losses before a checkpoint is written, so that it never contains weights from after a bad loss."""
+        """Checks the losses, so that no checkpoint contains weights from after a bad loss."""
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
@@ -123,8 +123,8 @@ class BadLoss(Callback):
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns an explanation if an error means that a data loading process died, or None otherwise."""
-    # If a worker dies while a checkpoint is written, its error is the cause of another error.
+    """Returns an error message if `error` means that a data loading process died, or else None."""
+    # If a worker dies while a checkpoint is being written, its error is the cause of another error.
     message = f"{error} {error.__cause__ or ''}"
     lost = re.search(
         r"DataLoader worker \(pid.*?\) (is killed by signal|exited unexpectedly)", message
@@ -140,7 +140,7 @@ def lost_worker(error: BaseException) -> UserError | None:
 
 
 def out_of_memory(error: BaseException, step: int) -> UserError | None:
-    """Returns an explanation if an error means that memory is exhausted, or None otherwise."""
+    """Returns an error message if `error` means that memory is exhausted, or else None."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
     return UserError(

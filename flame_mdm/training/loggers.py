@@ -60,9 +60,9 @@ class History(Logger):
 
 
 class TensorBoardRun(TensorBoardLogger):
-    """TensorBoard logger without Lightning's `epoch`.
+    """TensorBoard logger that omits Lightning's `epoch`.
 
-    The epoch is always 0, because training is a single pass over drawn batches.
+    The epoch is always 0, because training is a single pass over randomly drawn batches.
     """
 
     @rank_zero_only
@@ -84,7 +84,7 @@ class Kept(TypedDict, total=False):
 class WandbRun(WandbLogger):
     """Weights & Biases logger that continues its wandb run when training is resumed.
 
-    No step is logged twice.
+    Steps that the run repeats are not logged again.
     """
 
     def __init__(self, save_dir: str, **options: Any):
@@ -106,7 +106,7 @@ class WandbRun(WandbLogger):
         """Logs metrics, except for steps that were logged before the run was resumed."""
         if step is not None and step < self.logged_step:
             return
-        # Weights & Biases numbers the rows of an offline part from 0 again
+        # For each offline part, Weights & Biases numbers the rows from 0 again.
         if self.experiment.step < self.rows:
             self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)
@@ -118,7 +118,7 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """Ends the wandb run, because the next run of a sweep is in the same process."""
+        """Ends the wandb run, because the next run of a sweep uses the same process."""
         super().finalize(status)
         if self._experiment is not None:
             self._experiment.finish(exit_code=int(status != "success"))

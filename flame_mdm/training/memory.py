@@ -1,4 +1,4 @@
-"""Memory that training requires, computed from a recipe without building the network."""
+"""Memory that training requires, computed from a recipe without allocating the network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from flame_mdm.representations import Representation
 TOKENS = 20
 """Number of tokens in a caption."""
 FLOAT = 4
-"""Number of bytes of a weight, a gradient, and each of the two states of Adam."""
+"""Number of bytes per weight, per gradient, and per value of each of Adam's two states."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class TrainingMemory:
         parameters: number of weights of the denoiser.
         state: weights, gradients, both states of Adam and, if the recipe averages weights, the
             average. Their size does not depend on the batch size.
-        activations: tensors that the backward pass needs, for the longest batch. In bfloat16, they
-            take about half of this memory.
-        recomputed: `activations` with `task.checkpoint_activations=true`.
+        activations: tensors that the backward pass needs, for the batch with the longest motions.
+            In bfloat16, they take about half of this memory.
+        recomputed: the same as `activations`, but with `task.checkpoint_activations=true`.
     """
 
     parameters: int
@@ -85,8 +85,8 @@ def training_memory(config: Config) -> TrainingMemory:
 def _saved(denoiser: nn.Module, forward: Callable[[], object]) -> tuple[int, list[tuple[int, int]]]:
     """Returns the number of bytes that a forward pass saves for the backward pass.
 
-    For each layer of `stacked_layers`, it also returns the number of bytes saved inside the layer,
-    and the size of its input.
+    Also returns, for each layer of `stacked_layers`, the number of bytes saved inside the layer and
+    the size of its input.
     """
     weights = {p.untyped_storage()._cdata for p in denoiser.parameters()}
     kept: dict[int, Tensor] = {}  # by storage; kept alive, so that no address is used twice
@@ -123,7 +123,7 @@ def _fused_attention(query: Tensor, key: Tensor, value: Tensor, **_: Any) -> Ten
 
 
 class _FusedAttention(torch.autograd.Function):
-    """Saves what a fused attention kernel saves: its inputs and its result, not its weights."""
+    """Saves what a fused attention kernel saves: inputs and result, but no attention weights."""
 
     @staticmethod
     def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor) -> Tensor:

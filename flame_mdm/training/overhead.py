@@ -1,7 +1,7 @@
-"""Skips work that Lightning does in every step, although this framework's training does not need it.
+"""Skips work that Lightning does in every step, but that this framework does not need.
 
-A step of a small network takes about 2 ms, and a third of this time is Lightning's bookkeeping. On
-a GPU, the device waits for the host during this time.
+A step of a small network takes about 2 ms, a third of which is Lightning's bookkeeping. During this
+time, a GPU waits for the host.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -24,8 +24,7 @@ STEP_HOOKS = (
 class NoProfiler(PassThroughProfiler):
     """Profiler that measures nothing.
 
-    Lightning's class for this purpose enters a generator for each of about 100 measured parts of
-    a step.
+    Lightning's equivalent enters a generator for each of about 100 measured parts of a step.
     """
 
     nothing: AbstractContextManager[Any] = nullcontext()
@@ -38,8 +37,8 @@ class NoProfiler(PassThroughProfiler):
 def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
     """Replaces the hooks of each step that do nothing with None, so that Lightning does not call them.
 
-    There are six hooks per step, most of which are not overridden by callbacks. Calling a hook
-    takes longer than many operations of torch.
+    There are six hooks per step, most of which callbacks do not override. Calling a hook takes
+    longer than many of torch's operations.
     """
     owners: list[tuple[object, type]] = [(task, LightningModule)]
     owners += [(callback, Callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
@@ -52,8 +51,8 @@ def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
 def skip_exchange_of_signals(trainer: Trainer) -> None:
     """Prevents Lightning from asking all processes in every step whether one of them received SIGTERM.
 
-    Each request waits until the device has finished the previous step. `Checkpoints` replaces
-    Lightning's handler of SIGTERM, and exchanges signals without waiting.
+    Each such request waits until the device has finished the previous step. `Checkpoints` replaces
+    Lightning's SIGTERM handler and exchanges signals without waiting.
     """
     trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
 

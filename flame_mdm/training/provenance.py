@@ -23,7 +23,7 @@ PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "
 
 
 class WriteProvenance(Callback):
-    """Writes and logs `config.yaml` and `provenance.json` at the start of training, and prints a summary."""
+    """Writes and logs the recipe and the provenance when training starts, and prints a summary."""
 
     def __init__(self, config: Config):
         self.config = config
@@ -97,7 +97,10 @@ def device_name(trainer: Trainer) -> str:
 
 
 def environment() -> dict[str, Any]:
-    """Returns the command, code version, machine and package versions, which every run and result records."""
+    """Returns the command, code version, machine and package versions.
+
+    Every run and every result records them.
+    """
     return {
         "command": sys.argv,
         "commit": _git("rev-parse", "HEAD"),

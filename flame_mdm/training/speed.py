@@ -1,4 +1,7 @@
-"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention; see docs/benchmarks/speed.md."""
+"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention.
+
+See docs/benchmarks/speed.md.
+"""
 
 import torch
 from torch import Tensor, nn
@@ -15,9 +18,9 @@ COMPILED_FROM = 5000
 In shorter runs, compilation would take more time than it saves.
 """
 PAD_MULTIPLE = 32
-"""Batches of a compiled network are padded to multiples of this number of frames.
+"""Batches for a compiled network are padded to multiples of this number of frames.
 
-The network is compiled once per length.
+The network is compiled once per padded length.
 """
 # Maximum number of lengths and modes for which the network is compiled. The default of torch is 8.
 MOST_SHAPES = 64
@@ -26,13 +29,14 @@ MOST_SHAPES = 64
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     """Prepares the task and the data for `speed=fast` before training. Returns the trainer's precision.
 
-    On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM`
-    steps or more.
+    On CUDA, training uses bfloat16 if the device supports it and, in runs of at least
+    `COMPILED_FROM` steps, a compiled denoiser.
 
-    On a CPU: bfloat16 if the CPU has instructions for bfloat16 products, `CheapDropout`, and
-    `attention`, without dropout of the attention weights. Compilation made no difference on CPUs.
+    On a CPU, training uses bfloat16 if the CPU has instructions for bfloat16 products,
+    `CheapDropout`, and `attention`, which does not drop attention weights. Compilation made no
+    difference on CPUs.
 
-    If the recipe sets a precision other than 32-true, it is kept.
+    If the recipe sets a precision other than 32-true, this precision is kept.
     """
     trainer, supported = config["trainer"], False
     device = trainer["accelerator"]
@@ -52,7 +56,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
                 "takes less time"
             )
             denoiser = task.generator.denoiser
-            # Networks without this attribute would learn from padding
+            # Networks that do not mask padding would learn from it.
             if denoiser.mask_padding:
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES
@@ -75,10 +79,10 @@ def _simplify(network: nn.Module) -> None:
 
 
 class CheapDropout(nn.Module):
-    """Dropout that makes four decisions with one 64-bit random number.
+    """Dropout that decides about four elements with a single 64-bit random number.
 
-    The probability is rounded to a multiple of 2^-16. On a CPU, torch draws one random number per
-    element in a single thread, which takes a fifth of a training step.
+    The probability is rounded to a multiple of 2^-16. On a CPU, torch's dropout draws one random
+    number per element in a single thread, which takes a fifth of a training step.
     """
 
     def __init__(self, p: float):
@@ -87,7 +91,7 @@ class CheapDropout(nn.Module):
         self.threshold = round(p * 2**16) - 2**15
 
     def forward(self, x: Tensor) -> Tensor:
-        """Returns `x` with some elements dropped and the others scaled. In evaluation mode, returns `x`."""
+        """Drops some elements of `x` and scales the others. Returns `x` in evaluation mode."""
         if not self.training or self.p == 0:
             return x
         words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64).random_(-(2**63), None)

@@ -51,9 +51,9 @@ def train(config: Config) -> None:
 def recipe_changes(config: Config) -> list[str]:
     """Returns "key=value" for each key whose value differs from the recipe that the configuration names.
 
-    Some keys are not compared: keys that may differ when a run is resumed, the seed, and keys that
-    the configuration lacks because it was written by a different version. If the class of a part
-    differs, all other keys of this part are left out. If the recipe is not in `experiments/`, the
+    Some keys are not compared: the seed, keys that may differ when a run is resumed, and keys that
+    are missing from the configuration because a different version wrote it. If the class of a part
+    differs, the other keys of this part are left out. If the recipe is not in `experiments/`, the
     result is empty.
     """
     name = config.get("experiment")

@@ -141,19 +141,19 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
 
 
 def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[int, int]:
-    """Copies the trained weights of another model whose names and shapes match.
+    """Copies those trained weights of another model whose names and shapes match.
 
     The statistics of the features are not copied, since they belong to the data.
 
     Args:
-        model: model that receives the weights. All other weights are unchanged.
+        model: model that receives the weights. Its other weights are left unchanged.
         source: a path or name, as in `find`.
 
     Returns:
-        Number of copied tensors, and number of trained tensors in the model.
+        The number of copied tensors, and the number of trained tensors in the model.
 
     Raises:
-        UserError: If no tensor fits.
+        UserError: If no tensor matches.
     """
     weights = read_merged(find(source))["state_dict"]
     parameters = dict(model.named_parameters())
@@ -174,7 +174,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
 
 
 def write_adapter(path: Path, trained: Path) -> None:
-    """Writes the adapter of a training checkpoint atomically."""
+    """Extracts the adapter from a training checkpoint and writes it atomically."""
     from safetensors.torch import save
 
     checkpoint = read_checkpoint(trained)

@@ -40,9 +40,8 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
     Args:
         source: the model, as in `flame_mdm.load`.
         out: path of the file.
-        half: whether weight matrices are stored in half precision. Vectors, such as the statistics
-            of the features, keep single precision. Loaded models always compute in single
-            precision.
+        half: whether to store weight matrices in half precision. Vectors, such as the statistics of
+            the features, keep single precision. Loaded models always compute in single precision.
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises the same errors as `flame_mdm.load`.
@@ -109,7 +108,7 @@ def _check_written(folder: Path) -> None:
 
 
 def card(model: Mapping[str, Any], repository: str, file_sha256: str) -> str:
-    """Returns the model card, given the content of a model file and the hash of the file."""
+    """Returns the model card for a model file with the given content and hash."""
     from jinja2 import Template
 
     config, facts = model["config"], model["facts"]

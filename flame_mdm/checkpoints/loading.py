@@ -43,7 +43,7 @@ NO_GPU = (
     if torch.version.cuda or torch.version.hip
     else "this PyTorch was built without CUDA"
 )
-"""The reason why PyTorch cannot use a GPU, on machines where it cannot."""
+"""Explains, on machines without a usable GPU, why PyTorch cannot use one."""
 
 
 def load(
@@ -66,8 +66,8 @@ def load(
         device: device of the weights, such as "cuda".
         which: the checkpoint of a run directory, "last" or "best". For files, this argument has
             no effect.
-        adapter: one or several files that `flame_mdm.adapt` wrote for this model. By default,
-            there is no adapter.
+        adapter: one or several files that `flame_mdm.adapt` wrote for this model. Default: no
+            adapter.
         strength: strength of all adapters, or one number per adapter. 0 = the model without the
             adapter; 1 = the model as it was adapted.
 
@@ -115,7 +115,7 @@ def load_task(
     try:
         model = _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # an invalid recipe may fail anywhere
-        # The missing file belongs to a text encoder
+        # The missing file belongs to a text encoder.
         if isinstance(error, FileNotFoundError):
             raise
         kind_of_error = (
@@ -147,8 +147,8 @@ def check_device(device: str | torch.device) -> None:
 def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     """Builds the model of a checkpoint and loads its weights.
 
-    This project's networks are built on the meta device, so that a recipe does not take more
-    memory than the weights in the file. Other classes, which the user must trust, are built as in
+    This project's networks are built on the meta device, so that a recipe cannot take more memory
+    than the weights in the file. Other classes, which the user must trust, are built as in
     training.
     """
     config, state = checkpoint["config"], checkpoint["state_dict"]
@@ -156,7 +156,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     trust(parts)
     classes: dict[str, Any] = dict(GENERATORS) if kind is MotionGenerator else {}
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
-    # modules are imported first, because tensors that they create must not be on the meta device
+    # Modules are imported first, because tensors that they create must not be on the meta device.
     classes |= {target: get_class(target) for target in targets if target not in classes}
     model_class = classes[config["task"]["_target_"]]
     if kind is MotionGenerator:  # the user's own class
@@ -195,7 +195,7 @@ class _CallLimit(TorchFunctionMode):
         if self.left < 0:
             raise UserError("its recipe describes a larger model than the weights saved with it")
         # On the meta device, random draws would import torch's compiler, which takes longer than
-        # building the model
+        # building the model.
         if func is torch.nn.init.normal_:
             return kwargs["tensor"] if kwargs else args[0]
         func = torch.empty if func is torch.randn else func

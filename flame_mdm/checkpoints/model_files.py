@@ -1,9 +1,8 @@
-"""File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
+"""File formats of models: training checkpoints (.ckpt) and model files (.safetensors).
 
-A model file contains the (averaged) weights, including the statistics of the features. Its metadata
-has two keys. `flame_mdm` is JSON with the recipe, the metadata of the data set and the origin of
-the weights. `sha256` is the hash of this JSON text and the weights. A model file contains no
-code.
+A model file contains the (averaged) weights, including the statistics of the features, but no code.
+Its metadata has two keys. `flame_mdm` is JSON with the recipe, the metadata of the data set and the
+origin of the weights. `sha256` is the hash of this JSON text and the weights.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ FORMAT_KEY = "flame_mdm_format"
 KEY = "flame_mdm"
 ADAPTER = "flame_mdm_adapter"
 FILE = "model.safetensors"
-# Maximum number of frames that a model file may declare as the length of a motion: more than an
-# hour at 20 frames per second
+# Maximum motion length, in frames, that a model file may declare: more than an hour at 20 frames
+# per second
 MOST_FRAMES = 100_000
 
 
@@ -158,7 +157,7 @@ class _Metadata(TypedDict):
 def checked(path: Path, content: Any) -> dict[str, Any]:
     """Returns the content of a checkpoint or model file after checking it.
 
-    The content must have a recipe of plain values, metadata and weights.
+    The content must include a recipe of plain values, metadata and weights.
     """
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
@@ -180,7 +179,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     """Raises `UserError` unless `weights` maps names to dense tensors of real numbers.
 
-    Together, they must not be larger than the file at `path`.
+    The tensors must not be larger, in total, than the file at `path`.
     """
     import torch
 
@@ -198,7 +197,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
                 f"{path} is damaged: its weights are not a mapping of names to dense tensors of real "
                 f"numbers: {shown}"
             )
-    # The factor 2 allows for tensors with two names, which the file contains only once.
+    # The factor 2 allows for tensors that have two names but are stored only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())
     if size > 2 * path.stat().st_size:
         raise UserError(f"{path} is damaged: its weights are declared to be larger than the file")

@@ -56,12 +56,12 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
     Args:
         source: the model, as in `flame_mdm.load`.
         out: the folder.
-        half: whether weight matrices are stored in half precision.
+        half: whether to store weight matrices in half precision.
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: As in `flame_mdm.load`, and if a part cannot be exported, or if a graph's outputs
-            differ from PyTorch's.
+        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if the outputs of a
+            graph differ from PyTorch's.
     """
     try:
         import onnxruntime  # noqa: F401
@@ -91,7 +91,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     """Returns the content of `model.json`, without the hashes of the graphs.
 
     Raises:
-        UserError: If a value is outside the limits of the runner, or the sampler cannot be
+        UserError: If a value is outside the limits of the runner, or if the sampler cannot be
             exported.
     """
     representation = model.representation
@@ -149,8 +149,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 def root_units(representation: HumanML) -> list[list[float]]:
     """Returns the mean and standard deviation of each of the first three features.
 
-    The three features are the turn of the root in radians, and its steps to the left and forward
-    in meters.
+    These are the turn of the root in radians, and its steps to the left and forward in meters.
     """
     scale = representation.mean.new_ones(3)
     scale[0] = representation.turn_unit
@@ -163,15 +162,15 @@ def root_units(representation: HumanML) -> list[list[float]]:
 class Probe:
     """Records how a sampler combines noise and clean estimates.
 
-    The probe replaces the denoiser, the noise and the `Guide`. `variance` is the constant that it
-    returns in the channels for a learned variance.
+    The probe takes the place of the denoiser, the noise and the `Guide`. `variance` is the constant
+    that it returns in the channels of a learned variance.
     """
 
     # All exported samplers are linear: each noisy motion is a weighted sum of noise draws and clean
     # estimates. The sampler is therefore run once on unit vectors instead of motions.
     # Draw n is unit vector n, and clean estimate k is unit vector `calls` + 1 + k.
-    # The entries of a noisy motion (1, 1, 2 `calls` + 1) in this run are then its weights, and
-    # `_plan` solves for the four numbers of each step. No sampler needs its own formula here.
+    # The entries of a noisy motion (1, 1, 2 `calls` + 1) in this run are then its weights, from
+    # which `_plan` computes the four numbers of each step. No sampler needs its own formula here.
     def __init__(self, process: Process, calls: int, variance: float):
         self.process, self.calls, self.variance, self.output = process, calls, variance, variance
         self.time, self.draws = 0.0, 0
@@ -183,12 +182,12 @@ class Probe:
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
-        """Returns a unit vector instead of a noise draw, and counts the draws."""
+        """Counts the draws, and returns a unit vector instead of noise."""
         self.draws = draw + 1
         return self.unit(draw)
 
     def denoise(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Returns a constant instead of the denoiser's output, and records the call's diffusion time."""
+        """Records the time of the call, and returns a constant instead of the denoiser's output."""
         self.time = float(t[0])
         return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
 
@@ -264,7 +263,8 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
 class Graph(NamedTuple):
     """A module to export.
 
-    `examples` are inputs by name; `dimensions` names their axes of variable length.
+    `examples` contains example inputs by name, and `dimensions` names their axes of variable
+    length.
     """
 
     name: str
@@ -372,7 +372,7 @@ class Function(nn.Module):
 def graphs(model: MotionGenerator) -> list[Graph]:
     """Returns the graphs of a model: the guided denoiser, and the decoders to joints and rotations.
 
-    Only SMPL's skeleton has rotations.
+    There is a decoder to rotations only for SMPL's skeleton.
     """
     representation = model.representation
     encoder = model.condition
@@ -434,8 +434,7 @@ def traced(graph: Graph) -> torch.export.ExportedProgram:
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
     """Writes a graph.
 
-    Raises `UserError` if its outputs differ from the outputs of PyTorch for a batch of one or two
-    motions.
+    Raises `UserError` if its outputs differ from PyTorch's for a batch of one or two motions.
     """
     import onnxruntime
 

@@ -1,7 +1,7 @@
 """Import of the checkpoints released by the authors of MDM, MFM and FLAME.
 
-Each learned weight must be used exactly once; otherwise, the import fails. Frozen text encoders
-and sinusoids are skipped.
+The import fails unless each learned weight is used exactly once. Frozen text encoders and sinusoids
+are skipped.
 """
 
 from collections.abc import Mapping
@@ -33,12 +33,12 @@ NETWORKS = {
 }
 """Architectures of MDM, by the authors' names.
 
-Each entry contains the project's network, the authors' name of the transformer, and the layer
-names.
+Each entry contains the project's network, the authors' name for the transformer, and the names of
+the layers.
 """
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES, ACTION_FRAMES = 196, 60
-# guidance scale of models that continue a prefix, in the authors' evaluation
+# Guidance scale for models that continue a prefix, as in the authors' evaluation
 PREFIX_GUIDANCE = 7.5
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
 POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
@@ -65,11 +65,11 @@ class Released(NamedTuple):
 def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool = False) -> Released:
     """Converts a model of MDM or MFM.
 
-    The network of the model is an encoder, a decoder, a decoder with an input token, or a GRU. The
-    condition is text, actions or nothing.
+    The network may be an encoder, a decoder, a decoder with an input token, or a GRU. The condition
+    may be text, actions or nothing.
 
     Args:
-        state: weights from `released_state`. The sizes of the network are read from their shapes.
+        state: weights from `released_state`, whose shapes determine the sizes of the network.
         args: options of the authors' code.
         time_token: whether the decoder's input token contains only the time, as in the code since
             February 2025. The released model with an input token is older.
@@ -108,7 +108,7 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
             "context_frames": args.context_len,
             **_target_options(ours),
         }
-        # in the code that introduced DistilBERT, the token contains only the time
+        # In the code that introduced DistilBERT, the token contains only the time.
         if args.emb_trans_dec:
             options["input_token"] = "time" if time_token or distilbert else "condition"
     if (args.lambda_target_loc or args.multi_target_cond) and "target_encoder" not in options:
@@ -121,7 +121,7 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
 
 
 def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Returns the options of the target encoder, given its weights under the project's names."""
+    """Infers the options of the target encoder from its weights, which have the project's names."""
     layers = sum(key.startswith("target.network.") and key.endswith(".weight") for key in ours) - 1
     if layers >= 0:
         return {"target_encoder": "single", "target_layers": layers}
@@ -136,7 +136,7 @@ def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
     """Converts FLAME's network, except for RoBERTa.
 
-    FLAME's number of attention heads (8) cannot be read from the weights.
+    The number of attention heads, which is 8 in FLAME, cannot be inferred from the weights.
     """
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
     names, num_layers = theirs.layer_names(learned, "tf_decoder", theirs.DECODER_LAYER)
@@ -265,7 +265,7 @@ def import_released(
 ) -> Path:
     """Converts a released checkpoint to a model file and returns its path.
 
-    The arguments are keys of `flame-mdm import`.
+    The arguments correspond to the keys of `flame-mdm import`.
     """
     file = Path(file)
     if (args is None) != (kind in ("flame", "mclip")):

@@ -1,7 +1,7 @@
 # pyright: standard
 """Options of released models.
 
-An option is read, ignored because it has no effect on the model, or rejected.
+Each option is either read, ignored because it has no effect on the model, or rejected.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.schemas import Number, Schema, check_shape
 
-# JSON is read as YAML 1.1, in which 2e-2 is text
+# JSON is read as YAML 1.1, in which 2e-2 is text.
 YamlNumber = Annotated[float, BeforeValidator(lambda x: float(x) if isinstance(x, str) else x)]
 
 # The value of an option may be the name of an enum member, in upper or lower case.
@@ -90,7 +90,7 @@ def read_options(path: str | Path | None, changes: dict[str, Any]) -> Options:
 
 
 def _check_prefix(options: Options) -> None:
-    """Raises `ValueError` if options of a network that continues clean frames (DiP) contradict its other options."""
+    """Raises `ValueError` if the options for continuing frames (DiP) contradict other options."""
     decoder = options.arch == "trans_dec" and options.text_encoder_type == "bert"
     for name, value in (("context_len", options.context_len), ("emb_policy", options.emb_policy)):
         if value not in (0, "add") and not decoder:
@@ -115,7 +115,7 @@ def check_hyperparameters(checkpoint: Mapping[str, Any], kind: str) -> None:
 
 
 def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: str = "") -> None:
-    """Raises `ValueError` for an unknown option, or for an option with an effect that cannot be imported."""
+    """Raises `ValueError` for an option that is unknown or whose effect cannot be imported."""
     for name, value in options.items():
         shown = f"{prefix}{shortened(str(name), 40)}={shortened(str(value), 40)}"
         if name in table["neutral"]:
@@ -133,7 +133,7 @@ def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: s
 
 
 def _equal(value: Any, neutral: Any) -> bool:
-    """Whether two values are equal. A number may be text, such as 1e-5 in YAML 1.1."""
+    """Returns whether two values are equal. A number may be text, such as 1e-5 in YAML 1.1."""
     try:
         return value == neutral or (isinstance(neutral, float) and float(value) == neutral)
     except (TypeError, ValueError):

@@ -15,17 +15,18 @@ from flame_mdm.safe_io import read_package_yaml
 Network = TypeVar("Network", bound=nn.Module)
 
 NAMES: dict[str, Any] = read_package_yaml(Path(__file__).with_name("released.yaml"))
-"""The authors' names, and the project's names."""
+"""Mappings from the authors' names to the project's names."""
 ENCODER_LAYER, DECODER_LAYER = NAMES["encoder_layer"], NAMES["decoder_layer"]
 
 
 def read_released(
     path: Path, *, run_code: bool = False, advice: str = "Save only its state dict"
 ) -> Mapping[str, Any]:
-    """Reads a released file. With `run_code`, pickles of other objects are also read, which runs any code in them.
+    """Reads a released file.
 
-    Raises `UserError` if the file is damaged or, without `run_code`, if it contains such objects.
-    `advice` is the end of the error message.
+    With `run_code`, the file may also contain pickled objects of other classes; reading them runs
+    any code in them. Raises `UserError` if the file is damaged or, without `run_code`, if it
+    contains such objects. The error message about these objects ends with `advice`.
     """
     try:
         check_torch(path)
@@ -56,7 +57,7 @@ def read_released(
 
 
 def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
-    """Returns the state dict in a released file, or under a key in it.
+    """Returns the state dict that a released file contains, at the top level or under `key`.
 
     Raises `UserError` if there is no state dict.
     """
@@ -98,7 +99,7 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def layer_names(
     state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
 ) -> tuple[dict[str, str], int]:
-    """Returns a mapping from prefixes of torch's layers to the project's prefixes, and the number of layers."""
+    """Returns a mapping from torch's layer prefixes to the project's, and the number of layers."""
     count = sum(
         key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
     )
@@ -143,7 +144,8 @@ def load_strictly(
 ) -> Network:
     """Loads all weights into a network and returns it in evaluation mode.
 
-    The message of a `UserError` begins with `source`.
+    Raises `UserError` if weights are missing, unexpected or of a different shape. `source` is named
+    at the beginning of the message.
     """
     try:
         network.load_state_dict(state, strict=True, assign=assign)

@@ -4,9 +4,9 @@
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
-The same caption, length and seed result in the same motion as `flame_mdm.generate`, which also
-understands sentences that differ from the captions of the training data. A model that continues
-frames starts from a person who is standing.
+For the same caption, length and seed, the motion is the same as from `flame_mdm.generate`, which
+also understands sentences that differ from the captions of the training data. A model that
+continues frames starts from a standing person.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NUMBERS = frozenset(
 MASK = (1 << 64) - 1
 # Maximum duration in seconds for a model that continues frames
 LONGEST = 600
-# the last graph exists only for SMPL's joints
+# The last graph exists only for SMPL's joints.
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
 # Maximum size of model.json in bytes
 MAX_DESCRIPTION = 64 * 2**20
@@ -132,10 +132,9 @@ TYPES: dict[str, type | tuple[type, ...]] = {
 def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
     """Returns the dotted names of the values that a JSON schema rejects.
 
-    An item of a list is reported by the name of the list.
-
-    The schema contains types, bounds for numbers and for the number of items, patterns for entire
-    strings, and required keys. Objects may contain keys that are not in the schema.
+    If an item of a list is rejected, the name of the list is returned. The schema contains types,
+    bounds for numbers and for the number of items, patterns for entire strings, and required keys.
+    Objects may contain keys that are not in the schema.
     """
     kind = schema["type"]
     if not _has_type(value, kind):
@@ -194,7 +193,10 @@ def check(content: Any) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Returns the content of a regular file with at most `most` bytes. Otherwise raises `ValueError` or `OSError`."""
+    """Returns the content of a regular file of at most `most` bytes.
+
+    Raises `ValueError` for any other file, and `OSError` if the file cannot be read.
+    """
     if path.exists() and not path.is_file():
         raise ValueError(f"{path.name} is a folder, a pipe or a device")
     with path.open("rb") as file:
@@ -211,7 +213,7 @@ def first_line(error: Exception) -> str:
 
 
 class Sampler:
-    """A model in a folder: `content` of `model.json`, and sessions of onnxruntime.
+    """An exported model in a folder: the `content` of `model.json`, and onnxruntime sessions.
 
     `poses` is None unless the model generates SMPL's joints.
     """
@@ -247,9 +249,9 @@ class Sampler:
         return content
 
     def _session(self, name: str, threads: int) -> Any:
-        """Returns the session of a graph.
+        """Opens a graph and returns its session.
 
-        The weights must be in its file: a graph may not name other files to read.
+        The weights must be in the same file: a graph may not name other files to read.
         """
         import onnxruntime
 
@@ -271,7 +273,7 @@ class Sampler:
     def unknown(self, text: str) -> list[str]:
         """Returns the content words of a text that the model does not know.
 
-        Raises `ValueError` if the model knows no content word of the text.
+        Raises `ValueError` if the model knows none of the content words.
         """
         seen, skipped = set(self.content["vocabulary"]), set(self.content["function_words"])
         content = [word for word in dict.fromkeys(words(text)) if seen and word not in skipped]
@@ -288,11 +290,11 @@ class Sampler:
         sample: int = 0,
         text: str | None = None,
     ) -> np.ndarray:
-        """Returns normalized features (F, D) of one motion, for a text or an action.
+        """Returns the normalized features (F, D) of one motion, for a text or an action.
 
         For an unconditional model, the prompt is "". `sample` is the sample index, which
-        distinguishes several motions for one text. `seconds` is 3 by default, or the model's
-        maximum if that is lower. For a model that continues frames, the maximum is 600. Raises
+        distinguishes several motions for the same prompt. `seconds` is 3 by default, or the model's
+        maximum if this is lower. For a model that continues frames, the maximum is 600. Raises
         `ValueError` for an invalid length or an unknown action, or if the result is not finite.
 
         `text` is the sentence that selects the noise, if it differs from the caption `prompt`:
@@ -331,7 +333,7 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Returns normalized features (F, D) of frames that are sampled together. `number` seeds the noise."""
+        """Returns normalized features (F, D) of frames sampled together. `number` seeds the noise."""
         content = self.content
         x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
@@ -356,11 +358,11 @@ class Sampler:
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 
     def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rest-pose offsets and the local rotations. They are only defined for SMPL's 22 joints.
+        """Returns the rest-pose offsets and local rotations, which exist only for SMPL's 22 joints.
 
-        The offsets (22, 3) are positions relative to the parents in the rest pose, in which the arms
-        are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y, z); the quaternion of
-        the root is in world coordinates.
+        The offsets (22, 3) are the positions of the joints relative to their parents in the rest
+        pose, in which the arms are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y,
+        z); the quaternion of the root is in world coordinates.
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")
@@ -458,7 +460,7 @@ def mixed(counters: np.ndarray) -> np.ndarray:
 
 
 def joined(before: np.ndarray, x: np.ndarray, fade: Mapping[str, int] | None) -> np.ndarray:
-    """See `flame_mdm.generator.joined`; `before` (2, D) are the frames before the block x (F, D)."""
+    """See `flame_mdm.generator.joined`. `before` (2, D) contains the frames before x (F, D)."""
     if fade is None:
         return x
     share = np.arange(min(fade["frames"], len(x)), dtype=np.float32) / np.float32(fade["frames"])
@@ -489,9 +491,9 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
 def write(path: str | Path, **arrays: Any) -> None:
     """Writes an .npz file under a temporary name, and renames it at the end.
 
-    A failure leaves no files behind. A link at `path` is replaced, and the target of the link does
-    not change. Raises `ValueError` if `path` is a folder, a pipe or a device, and `OSError`
-    if the file cannot be written.
+    A failure leaves no files behind. If `path` is a link, the link is replaced, and its target does
+    not change. Raises `ValueError` if `path` is a folder, a pipe or a device, and `OSError` if the
+    file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -522,7 +524,7 @@ def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Writes one motion as .npz with joint positions `joints` (F, J, 3) in meters, and `fps`."""
+    """Writes one motion as .npz, with joint positions `joints` (F, J, 3) in meters, and `fps`."""
     positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
     options = dict(word.split("=", 1) for word in arguments if word not in positional)
     if len(positional) != 3:

@@ -29,7 +29,7 @@ def read_torch(path: Path) -> Any:
 
 
 def check_torch(path: Path) -> None:
-    """Checks the sizes and checksums in an archive written by `torch.save`. `torch.load` does not check them."""
+    """Checks the sizes and checksums in an archive from `torch.save`, which `torch.load` ignores."""
     size = regular_file(path)
     if not _is_archive(path):
         return
@@ -54,12 +54,12 @@ def check_torch(path: Path) -> None:
 
 
 def check_keys(path: Path) -> None:
-    """Raises `UserError` if keys in a file may share one hash.
+    """Raises `UserError` if many keys in a file may share one hash.
 
-    A dictionary with such keys takes quadratic time in `torch.load(weights_only=True)`: hours for a
-    file of one megabyte. Strings have random hashes, and small integers have different hashes. If the
-    pickle names an object that PyTorch refuses, the check stops there without an error, because
-    PyTorch stops at the same place and names the object.
+    Loading a dictionary with such keys by `torch.load(weights_only=True)` takes quadratic time:
+    hours for a file of one megabyte. Strings have random hashes, and small integers have different
+    hashes. If the pickle names an object that PyTorch refuses, the check stops there without an
+    error, because PyTorch stops at the same place and names the object.
     """
     regular_file(path)
     damage = naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: ")
@@ -81,9 +81,9 @@ def _is_archive(path: Path) -> bool:
 
 
 class _Named:
-    """A function or class that a pickle names, or an object that it would create.
+    """A function or class that a pickle names, or an object that the pickle would create.
 
-    Nothing is called.
+    The function or class is never called.
     """
 
     def __init__(self, name: str):
@@ -110,7 +110,7 @@ class _KeyCheck(pickle._Unpickler):
         super().__init__(file, encoding="bytes")
 
     def passes(self) -> bool:
-        """Whether the pickle was read to its end; False if PyTorch stops at an unknown object."""
+        """Returns whether the pickle was read to its end, that is, without a refused object."""
         try:
             self.load()
         except _Refused:
@@ -118,7 +118,7 @@ class _KeyCheck(pickle._Unpickler):
         return True
 
     def find_class(self, module_name: str, global_name: str, /) -> _Named:
-        # PyTorch writes Python 2's names, as required by protocol 2, and maps them in the same way
+        # PyTorch writes Python 2's names, as required by protocol 2, and maps them in the same way.
         if (module_name, global_name) in NAME_MAPPING:
             module_name, global_name = NAME_MAPPING[module_name, global_name]
         name = f"{IMPORT_MAPPING.get(module_name, module_name)}.{global_name}"
@@ -166,8 +166,8 @@ class _KeyCheck(pickle._Unpickler):
     def _load_set(self) -> None:
         self.append(_Named("builtins.set"))
 
-    # These are exactly the instructions of PyTorch's own reader, so that a file that passes here
-    # does not fail there.
+    # These are exactly the instructions of PyTorch's own reader, so that PyTorch can read every
+    # file that passes.
     dispatch = {  # pyright: ignore[reportAssignmentType]
         code[0]: pickle._Unpickler.dispatch[code[0]]
         for code in (

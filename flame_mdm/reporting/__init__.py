@@ -1,4 +1,4 @@
 """Tables, run reports, comparisons and data set pages.
 
-Pages and tables are generated from files, without loading a model.
+Pages and tables are generated from existing files, without loading a model.
 """

@@ -19,7 +19,7 @@ from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
 SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
-"""Perturbations of sets that show the bias of a metric, and the motions measured at their strongest grades."""
+"""Perturbations that show the bias of a metric, each with a phrase for its strongest grade."""
 ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
@@ -34,13 +34,15 @@ LEGEND = (
 class Seen:
     """Response of a metric to a perturbation. A grade of None means that no grade meets the condition."""
 
-    # The paired difference from real motions is not 0 at this and all stronger grades
+    # Weakest grade such that, at this and all stronger grades, the paired difference from real
+    # motions is not 0
     grade: float | None
-    # Values are outside the 95 % interval of real motions at this and all stronger grades
+    # Weakest grade such that, at this and all stronger grades, the value is outside the 95 %
+    # interval of real motions
     outside: float | None
     # Whether the strongest grade is rated better than real motions
     rewarded: bool
-    # Whether every stronger grade differs by at least as much, within its interval
+    # Whether the difference never decreases from one grade to the next, within its interval
     monotone: bool
 
 
@@ -75,8 +77,8 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 def card_name(card: AuditCard) -> str:
     """Returns the name of a card's files: data set, extractor, number of motions, and a hash.
 
-    The hash depends on the motions and the crop, so that an audit of other motions or with a
-    different crop does not overwrite a stronger card.
+    The hash depends on the motions and the crop, so that an audit with other motions or a different
+    crop does not overwrite a stronger card.
     """
     extractor = card.extractor.sha256[:12] if card.extractor else "none"
     facts = card.model_dump(include={"protocol", "data", "split", "seed", "motions", "resamples"})
@@ -94,13 +96,13 @@ class ListedCard(ClosedSchema):
     data: Data
 
     def cited(self, folder: Path) -> CitedCard:
-        """Returns the card for citation in results, with the path of its page in `folder`."""
+        """Returns the card as results cite it, with the path of its page in `folder`."""
         return CitedCard(folder / f"{self.name}.html", self.motions, self.split, self.data)
 
 
 @dataclass(frozen=True)
 class CitedCard:
-    """The page of a card, and the audited motions."""
+    """A reference to a card: the path of its page, and the motions that were audited."""
 
     path: Path
     motions: int
@@ -110,8 +112,8 @@ class CitedCard:
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
         """Returns a sort key, which is larger for cards that fit the evaluated data better.
 
-        Cards with the same length limits are best, followed by cards for the test split, cards for
-        the same data, and cards with more motions.
+        The criteria, in order, are: the same length limits, the test split, the same data, and the
+        number of motions.
         """
         same_frames = self.data.frames == data.frames
         return (
@@ -128,9 +130,9 @@ class CitedCard:
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
     """Returns the strongest card of an extractor that fits the evaluated data, or None.
 
-    Without an extractor, the card covers the metrics of joint positions. Cards are in the folder
-    FLAME_MDM_AUDITS (default: runs/audit), and in the repository, whose cards are listed in
-    audited.json.
+    Without an extractor, the card covers the metrics computed from joint positions. Cards are in
+    the folder FLAME_MDM_AUDITS (default: runs/audit) and in the repository, where audited.json
+    lists them.
     """
     extractor = sha256[:12] if sha256 else None
     listed = read_json(Path(__file__).with_name("audited.json"), list[ListedCard])
@@ -154,7 +156,7 @@ def read_card(path: Path) -> AuditCard:
 def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Path]:
     """Writes one card, or two cards side by side, as a web page and as Markdown. Returns the paths.
 
-    `name` is the name of the files. The default consists of the names of the cards.
+    `name` is the name of the files. By default, it consists of the names of the cards.
     """
     metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
     metrics.sort(key=lambda metric: any(_facts_of(card, metric).exact for card in cards))
@@ -249,7 +251,7 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def findings(card: AuditCard) -> list[str]:
-    """Returns sentences about perturbations that metrics do not detect, or rate better than real motions."""
+    """Returns sentences about perturbations that metrics miss, or rate better than real motions."""
     table = {
         (perturbation.name, metric): seen(card, perturbation, metric)
         for perturbation in card.perturbations
@@ -325,7 +327,7 @@ def _cell(
 
 
 def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> str:
-    """Returns text that lists the grades at which a metric has no value."""
+    """Returns a phrase that lists the grades at which a metric has no value."""
     grades = [grade.grade for grade in perturbation.grades if None in grade.values[metric][2:]]
     if None in card.real[metric] or len(grades) == len(perturbation.grades):
         return "not computed"

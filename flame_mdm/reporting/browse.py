@@ -24,8 +24,8 @@ SECONDS = 15  # only the first seconds of a longer clip are shown, to keep the p
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
     """Returns the clips of a split (None = all splits) whose id and captions contain all words of `search`.
 
-    Upper and lower case are not distinguished. Each clip is grouped with its mirrored copy,
-    original first. A group matches if one of its clips matches.
+    The search ignores case. Each clip is grouped with its mirrored copy, and the original comes
+    first. A group matches if any of its clips matches.
     """
     ids = {clip.id for clip in clips}
     families: dict[str, list[Entry]] = {}
@@ -40,7 +40,7 @@ def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[En
         for f in families.values()
         if any(all(word in texts[clip.id] for word in words) for clip in f)
     )
-    # The id of a mirrored copy is longer
+    # The id of a mirrored copy is longer than the original's.
     return [sorted(family, key=lambda clip: len(clip.id)) for family in matching]
 
 
@@ -77,7 +77,7 @@ def write_page(
     title: str,
     body: Mesh | None,
 ) -> None:
-    """Writes a player with clips, grouped by split. A mirrored copy is next to its original."""
+    """Writes a page that plays clips, grouped by split. A mirrored copy is next to its original."""
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],
@@ -94,15 +94,15 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip with several captions is given the first caption that no earlier clip has, so that
-    captions are unique if possible.
+    To make captions unique if possible, a clip with several captions is written with the first one
+    that no earlier clip has.
 
     Args:
         folder: the folder to write.
         store: the prepared data set.
         representation: the representation of its features.
         clips: the clips to write.
-        longest: number of frames to which longer clips are cut, as in evaluations.
+        longest: maximum number of frames. Longer clips are cut, as in evaluations.
 
     Raises:
         UserError: If the folder contains other motions, which would be mistaken for these clips.

@@ -105,7 +105,7 @@ def in_all(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
 
 
 def only_runs(compared: Sequence[ComparedRun]) -> dict[str, Run]:
-    """Returns the runs by label, without the folders of motions."""
+    """Returns the runs by label, leaving out the folders of motions."""
     return {entry.label: entry.run for entry in compared if entry.run is not None}
 
 
@@ -115,7 +115,7 @@ def comparison(
     mesh: Mesh | None = None,
     evidence: Callable[[Motion], Sequence[Mark]] = lambda motion: (),
 ) -> str:
-    """Returns a page that compares runs side by side. The same runs result in the same bytes.
+    """Returns a page that compares runs side by side. The same runs always yield the same bytes.
 
     Args:
         compared: runs and folders of motions.
@@ -212,7 +212,7 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD` with the differences in all metrics, or why there are none.
+    """Returns rows for `HEAD` with the differences in all metrics, or the reason for their absence.
 
     Both results must come from the same evaluation: the same protocol, data and extractor.
     """
@@ -249,9 +249,9 @@ def _difference(name: str, first: Value | None, second: Value | None) -> list[st
 
 
 def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float, float]:
-    """Returns the mean of second - first over R pairs, and its 95 % interval by Student's t.
+    """Returns the mean of second - first over R pairs, and the bounds of its 95 % interval.
 
-    The interval is NaN if R is 1.
+    The interval uses Student's t distribution. It is NaN if R is 1.
     """
     from scipy.stats import t
 
@@ -266,7 +266,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
-    """Groups the results for the same protocol, data and extractor by title, with the labels of their runs."""
+    """Groups results with the same protocol, data and extractor. Returns run labels and results."""
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, run in runs.items():
         for result in run.results.values():
@@ -276,7 +276,7 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 
 
 def in_common(runs: Mapping[str, Run]) -> list[str]:
-    """Returns why no evaluations can be compared, or [] if two runs have the same evaluation."""
+    """Explains why no evaluations can be compared. Returns [] if two runs share an evaluation."""
     groups = grouped(runs)
     if len(runs) < 2 or any(
         len({label for label, _ in columns}) > 1 for columns in groups.values()
@@ -289,7 +289,7 @@ def in_common(runs: Mapping[str, Run]) -> list[str]:
 
 
 def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:
-    """Returns the titles and rows (see `HEAD`) of the differences between each result and the first result."""
+    """Returns tables (titles and rows, see `HEAD`) of the differences from the first result."""
     (first, base), *others = columns
     tables = []
     for index, (label, result) in enumerate(others, 2):

@@ -1,4 +1,4 @@
-"""Self-contained web pages from templates. The same input results in the same bytes."""
+"""Self-contained web pages from templates. The same input always yields the same bytes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 def render(template: str, **values: Any) -> Markup:
     """Renders a file of `templates/`.
 
-    In HTML and SVG, all text is escaped, except the output of other templates.
+    In HTML and SVG, all text is escaped except for the output of other templates.
     """
     from markupsafe import Markup
 
@@ -55,7 +55,7 @@ def _environment() -> Environment:
 
 
 def number(value: float | None) -> str:
-    """Formats a number with four digits for a table. A missing value is shown as a dash."""
+    """Formats a number for a table with four significant digits, or as a dash if it is missing."""
     if value is None:
         return "–"
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
@@ -64,14 +64,14 @@ def number(value: float | None) -> str:
 
 
 def filled(head: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Returns a table without empty columns and rows. The first column contains the names of the rows."""
+    """Removes the empty columns and rows of a table, whose first column contains the row names."""
     rows = [row for row in rows if {*row[1:]} - {"–", ""}]
     kept = [k for k in range(len(head)) if not k or {row[k] for row in rows} - {"–", ""}]
     return [head[k] for k in kept], [[row[k] for k in kept] for row in rows]
 
 
 def interval(mean: float | None, half: float | None) -> str:
-    """Formats a mean and the half width of its interval, if any."""
+    """Formats a mean, followed by the half width of its interval if it has one."""
     return number(mean) + (f" ± {half:.2g}" if mean is not None and half is not None else "")
 
 

@@ -1,4 +1,4 @@
-"""Curves, scatter plots and histograms as SVG. The same values result in the same bytes."""
+"""Curves, scatter plots and histograms as SVG. The same values always yield the same bytes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 # Height of a line of text
 ROW = 16
-# Maximum number of segments per curve. The lowest and highest point of each segment are drawn.
+# Maximum number of segments per curve. The lowest and highest points of each segment are drawn.
 MOST = 300
 LOG_RANGE = 15  # positive values that span more than this factor get a logarithmic axis
 COLORS = 8
@@ -32,7 +32,7 @@ Curve = Mapping[int, float]  # values by step
 class Series:
     """Points (x, y) in ascending order, drawn in one color as a line, a dashed line or dots.
 
-    Each point may have the half width of a 95 % interval.
+    A point may have a 95 % interval, given by its half width.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Histogram:
 class Panel:
     """A pair of axes with labels.
 
-    The x-axis may be logarithmic, or begin at 0. `levels` are horizontal lines.
+    The x-axis may be logarithmic or begin at 0. `levels` are the values of horizontal lines.
     """
 
     content: Sequence[Series] | Histogram
@@ -77,7 +77,7 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
 
 
 def svg_file(drawing: Markup) -> str:
-    """Returns the text of a standalone SVG file with a drawing and its styles."""
+    """Returns a drawing and its styles as the text of a standalone SVG file."""
     style = (TEMPLATES / "plot.css").read_text(encoding="utf-8")
     return str(drawing).replace(">", f"><style>{style}</style>", 1)
 
@@ -87,7 +87,7 @@ def chart(
 ) -> Markup:
     """Draws curves over training steps and lists their last finite values.
 
-    `bands` are half widths of intervals.
+    `bands` contains the half widths of intervals, by the name of the curve.
     """
     spread = {
         name: {x: abs(width) for x, width in _finite(curve)}
@@ -212,8 +212,8 @@ def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
         begin, end = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
         low, high = begin * step, end * step
     else:
-        # A tick may lie slightly beyond the end of an axis: an axis that ends at step 2999 has a
-        # tick at 3k.
+        # A tick may lie slightly beyond the end of an axis. For example, an axis that ends at step
+        # 2999 has a tick at 3k.
         begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)
     return _Axis(low, high, [k * step for k in range(begin, end + 1)])
 

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
-"""Training curves that are not losses but show speed and optimization."""
+"""Training curves that show speed and optimization instead of losses."""
 
 
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
     """Writes `report.html` into a run directory and returns its path.
 
-    The same run results in the same bytes.
+    The same run always yields the same bytes.
     """
     from omegaconf import OmegaConf
 
@@ -83,8 +83,8 @@ def _player(run: Run, body: Mesh | None) -> str:
     from flame_mdm.formats.readers import read
     from flame_mdm.visualize import player_page
 
-    # The player is generated again from the motions, because an existing `player.html` may be
-    # untrusted, and its scripts would run in the report.
+    # The player is generated again from the motions, because the existing `player.html` may be
+    # untrusted and its scripts would run in the report.
     return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))], body=body)
 
 
@@ -99,10 +99,9 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
 
 
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
-    """Groups the curves of each heading into charts.
+    """Groups curves into headings and, under each heading, into charts.
 
-    Below a heading, curves whose names differ only in their family (`train/loss`, `val/loss`) share
-    a chart.
+    Curves whose names differ only in their family (`train/loss`, `val/loss`) share a chart.
     """
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {
@@ -157,7 +156,7 @@ def evaluation_title(result: Result) -> str:
 
 
 def labeled(name: str, value: Value | None) -> str:
-    """Returns the name of a metric with its unit, if any."""
+    """Returns the name of a metric, followed by its unit if it has one."""
     return f"{name} ({value.unit})" if value and value.unit else name
 
 
@@ -182,7 +181,7 @@ def sampling(result: Result) -> str:
 
 
 def marks(result: Result) -> list[str]:
-    """Returns reasons not to publish a result, and its differences from the protocol."""
+    """Returns the reasons not to publish a result, and its differences from the protocol."""
     reasons = ["Quick run — not for publication"] if result.quick else []
     reasons += [f"not valid: {reason}" for reason in result.invalid_because]
     changed = ", ".join(f"{name} {value}" for name, value in result.changed.items())
@@ -192,7 +191,7 @@ def marks(result: Result) -> list[str]:
 
 
 def printed(value: Value | None) -> str:
-    """Returns a value with its interval as text, or – if there is no value."""
+    """Formats a value with its interval, or a missing value as a dash."""
     return interval(value.mean, value.half) if value else "–"
 
 

@@ -1,4 +1,4 @@
-"""User study: a page on which people rate motions, and the counts of their answers."""
+"""User study: a page on which people compare motions, and counts of their answers."""
 
 from __future__ import annotations
 
@@ -147,11 +147,11 @@ def _pairs(
 
 
 def tally(files: Sequence[Path]) -> list[Pair]:
-    """Counts the answers of several raters, per pair of runs.
+    """Counts the answers of several raters for each pair of runs.
 
     Raises:
-        UserError: If a file is malformed, if a rater's answers to one page are given twice, or if a
-            rating compares a run with itself.
+        UserError: If a file is malformed, if two files contain the same rater's answers to the same
+            page, or if a rating compares a run with itself.
     """
     answered: dict[tuple[str, str], Path] = {}
     pairs: dict[tuple[str, str], Pair] = {}
@@ -185,9 +185,9 @@ def tally(files: Sequence[Path]) -> list[Pair]:
 
 
 def wilson(wins: int, votes: int) -> tuple[float, float, float]:
-    """Returns the fraction of wins and the limits of its 95 % interval (Wilson 1927).
+    """Returns the fraction of wins and the bounds of its 95 % interval (Wilson 1927).
 
-    Votes are assumed to be independent.
+    The votes are assumed to be independent.
     """
     if not votes:
         return 0.0, 0.0, 1.0

@@ -465,7 +465,10 @@ class SampleMotions(Callback):
         return sample(model, resolve(request, model, check_words=False))
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
-        """Computes all metrics for up to `REAL` training clips that have the attributes of all prompts."""
+        """Computes all metrics for up to `REAL` training clips.
+
+        Only clips labeled with the attributes that all prompts request are used.
+        """
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
         common, all_names = (

@@ -1,4 +1,4 @@
-"""Builds tables from existing results, published numbers, recipes, lengths and ratings."""
+"""Builds tables from existing results, published numbers, recipes, motion lengths and ratings."""
 
 import functools
 import math
@@ -72,7 +72,7 @@ def build(name: str, spec: Config, results: Path) -> Table:
 
 @functools.cache
 def _published(path: Path, changed: int) -> Config:
-    """Returns the published numbers, which are cached until the file changes."""
+    """Returns the published numbers. They are cached until the file changes."""
     return load_mapping(path)
 
 
@@ -145,14 +145,14 @@ def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
 def _condition_notes(
     conditions: list[dict[str, str]], columns: Mapping[str, Mapping[str, None]]
 ) -> list[tuple[str, str]]:
-    """Returns the footnotes on conditions.
+    """Returns the footnotes about conditions.
 
-    A footnote that differs from the first footnote in up to three items lists only these items.
+    A footnote that differs from the first one in at most three items lists only these items.
 
     Args:
         conditions: the conditions, in the order of their letters.
-        columns: the columns that were measured under the conditions of a letter. Letters without an
-            entry apply to all columns.
+        columns: for each letter, the columns that were measured under its conditions. A letter
+            without an entry applies to all columns.
     """
     notes = []
     for facts in conditions:
@@ -217,8 +217,8 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
     Args:
         result: the result.
-        timed: whether the table shows its seconds per motion.
-        shows_multimodality: whether the table shows multimodality. If it does not, it is irrelevant
+        timed: whether the table shows the seconds per motion.
+        shows_multimodality: whether the table shows multimodality. Otherwise, it does not matter
             whether multimodality was measured.
     """
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
@@ -256,9 +256,9 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Returns text that states the numbers of motions and replications for most values.
+    """Returns a sentence with the numbers of motions and replications behind most values.
 
-    The number of real motions is added if it is different.
+    If the number of real motions is different, it is added.
     """
     values = [value for value in (result.values or {}).values() if value and value.replications]
     if not values:
@@ -344,7 +344,7 @@ def _line(
 
 
 def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
-    """Returns the numbers of replications and motions for most metrics, and the exceptions."""
+    """Returns the numbers of replications and motions of most metrics, and then the exceptions."""
     counts = {}
     for result, name in zip(results, values, strict=True):
         entry = (result.values or {}).get(name) if result else None
@@ -392,8 +392,8 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Formats the numbers of each column with the same number of decimals.
 
-    The largest number has about three digits. Values of settings with at most one decimal are
-    unchanged. Numbers that would be rounded to zero are shown with two significant digits.
+    The largest number gets about three digits. Settings with at most one decimal are shown
+    unchanged, and numbers that would be rounded to zero are shown with two significant digits.
     """
     for index in range(columns):
         cells = [

@@ -1,6 +1,6 @@
 """Writes tables of results as Markdown, LaTeX, CSV and HTML, with figures.
 
-The same table results in the same bytes.
+The same table always yields the same bytes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SHARED = (
 
 @dataclass
 class Cell:
-    """A cell: printed text, number, half width of the 95 % interval, and rank (1 = best, 2 = second best)."""
+    """A cell: text, number, half width of its 95 % interval, and rank (1 = best, 2 = second)."""
 
     text: str
     value: float | None = None
@@ -60,7 +60,7 @@ class Line:
     label: str
     kind: str  # a key of `KINDS`
     cells: list[Cell | None]
-    # Footnote marks; only rows with the same marks are compared
+    # Footnote marks. Only rows with the same marks are compared.
     marks: str = ""
     # "" if the row is complete and valid; otherwise a reason, such as "no checkpoint"
     state: str = ""
@@ -154,9 +154,9 @@ def _unranked(table: Table) -> str:
 
 
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
-    """Splits a footnote into texts and their links.
+    """Splits a footnote into pieces of text and their links.
 
-    The link of plain text, and of a card that is not on this machine, is "".
+    The link is "" for plain text and for a card that is not on this machine.
     """
     return [
         (
@@ -265,7 +265,7 @@ def comma_separated(table: Table) -> str:
 
 
 def _inert(text: str) -> str:
-    """Returns the text of a cell, preceded by an apostrophe if a spreadsheet program would read it as a formula."""
+    """Puts an apostrophe before the text of a cell if a spreadsheet would read it as a formula."""
     text = one_line(text)
     number = re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?( ?± ?[\d.,]+)?", text)
     return text if number or not text.lstrip().startswith(("=", "+", "-", "@")) else f"'{text}"
@@ -274,8 +274,8 @@ def _inert(text: str) -> str:
 def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG. Returns None if the figure has no points.
 
-    Curves are labeled with the names of the rows. Curves of reported values are dashed. If the
-    best value of a column is the value of real motions, this value is drawn as a dotted line.
+    Curves are labeled with the names of the rows, and curves of reported values are dashed. If
+    values are best when they equal the value of real motions, this value is drawn as a dotted line.
     """
     panels = []
     for column in figure.y:
@@ -313,8 +313,8 @@ def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list
 def ranks(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
     """Ranks values: 1 for the best, 2 for the second best, 0 for all others.
 
-    A single value is not ranked. `better` is higher, lower, real (closest to `real`, the value of
-    real motions) or none. Missing values are None.
+    A single value is not ranked. `better` is "higher", "lower", "real" (closest to `real`, the
+    value of real motions) or "none". Missing values are None.
     """
     if (
         better == "none"

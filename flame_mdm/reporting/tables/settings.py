@@ -26,7 +26,10 @@ def hyperparameters(name: str) -> dict[str, Any]:
 
 
 def value(config: Config, key: str) -> Any:
-    """Returns the value of a dotted key in a recipe. Unset keys get the default value of the class, or None."""
+    """Returns the value of a dotted key in a recipe.
+
+    For an unset key, this is the default of the class, or None.
+    """
     *path, name = key.split(".")
     node: Any = config
     for part in path:
@@ -39,7 +42,7 @@ def value(config: Config, key: str) -> Any:
 
 
 def _sizes(config: Config) -> dict[str, float]:
-    """Returns the number of features, and the number of parameters of the denoiser in millions.
+    """Returns the number of features, and the number of the denoiser's parameters in millions.
 
     The parameters of the language model are not counted.
     """
@@ -71,7 +74,7 @@ def setting_text(value: Any) -> str:
 def settings_table(name: str, part: Config, reported: Config | None) -> Part:
     """Builds a table of hyperparameters.
 
-    The rows are keys if there are more keys than recipes; otherwise, the rows are recipes.
+    If there are more keys than recipes, the rows are keys; otherwise, they are recipes.
     """
     for key in part["keys"].values():
         if key not in HYPERPARAMETERS:

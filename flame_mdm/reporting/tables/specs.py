@@ -32,7 +32,7 @@ SWEPT = (
     "strength",
     "batch_size",
 )
-"""Options of a row that may be lists. Each value of a list results in one row."""
+"""Options of a row that may be lists. A row is expanded to one row per value of a list."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
 """Maximum numbers of rows (after expanding lists of options), columns and plots in a table.
 
@@ -41,7 +41,7 @@ Tables in papers have about 20 rows.
 
 
 class Options(ClosedSchema):
-    """Keys for `flame-mdm evaluate` that a part, a row or a column may set."""
+    """Keys of `flame-mdm evaluate` that a part, a row or a column may set."""
 
     protocol: str = ""
     extractor: str = ""
@@ -129,7 +129,7 @@ def as_list(value: Any) -> list[Any]:
 
 
 class Figure(ClosedSchema):
-    """Plots columns of a part over an option of its rows; with `points`, as a scatter plot."""
+    """A plot of columns of a part over an option of its rows: curves or, with `points`, dots."""
 
     part: str
     x: str
@@ -171,7 +171,7 @@ class Lengths(Schema):
 
 
 def spec_names() -> list[str]:
-    """Returns the names of this project's tables. Numbers in names are sorted as numbers."""
+    """Returns the sorted names of this project's tables. Numbers in names are sorted as numbers."""
     names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
     return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 
@@ -216,7 +216,10 @@ class Evaluation:
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Returns the path of the result, which depends only on the keys, so that tables can share results."""
+        """Returns the path of the result.
+
+        The path depends only on the keys, so that tables can share results.
+        """
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         subject = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(
@@ -229,7 +232,7 @@ class Evaluation:
 
     @property
     def absent(self) -> dict[str, str]:
-        """Missing files by the reason that a table shows, such as "no checkpoint"."""
+        """The missing files, by the reason that the table shows, such as "no checkpoint"."""
         files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
         paths = {reason: str(self.keys.get(key) or "none") for reason, key in files.items()}
         return {

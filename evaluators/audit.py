@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluator audit: perturbs real motions at graded strengths, and measures them like generated motions."""
+"""Evaluator audit: perturbs real motions in grades, and measures them like generated motions."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
-    """Measures perturbed motions from a split, with intervals from bootstrap resamples; see docs/audit.md.
+    """Measures perturbed motions from a split, with intervals from bootstrap resamples.
 
-    An interrupted audit continues with the metric inputs in the folder `cache`. Raises `UserError` if
-    data, protocol and extractor do not match.
+    See docs/audit.md. The folder `cache` stores metric inputs, so that an interrupted audit can be
+    continued. Raises `UserError` if data, protocol and extractor do not match.
     """
     data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")
@@ -145,7 +145,7 @@ def _measured(
 
 
 def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> Inputs:
-    """Returns the metric inputs for motions: cached inputs, or the results of one feature pass."""
+    """Returns the metric inputs for motions, from the cache or from a feature pass."""
     if path.exists():
         return read_npz(path)
     extracted = evaluator.extract(MotionsOf(ids, make()))
@@ -162,7 +162,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 
 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
-    """Returns, by name, the metrics for which the audit has all inputs."""
+    """Returns, by name, the metrics for which the audit can provide all inputs."""
     metrics = make_metrics(evaluator.metrics)
     return {
         name: metric
@@ -178,9 +178,9 @@ def _named(metric: str, part: str) -> str:
 class _Measure:
     """Computes metrics from cached inputs, for all motions and for each bootstrap resample.
 
-    Each motion or pair is weighted by the number of times that it is drawn, so retrieval
-    candidates are not resampled. FID is recomputed for each resample. Retrieval and diversity
-    are means over all pools and pairs that a protocol may draw.
+    Each motion or pair is weighted by how often it is drawn, so the candidates for retrieval are
+    not resampled. FID is recomputed for each resample. Retrieval and diversity are averaged over
+    all pools and pairs that a protocol may draw.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ class _Measure:
         self.real_texts, self.of_motions = texts, {}
 
     def __call__(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns the values (1 + R,) of each metric."""
+        """Returns the values (1 + R,) of each metric: for all motions, and for R resamples."""
         values: dict[str, np.ndarray] = {}
         for name, metric in self.metrics.items():
             reused = self.of_motions.get(name) if inputs is self.inputs[BASE] else None
@@ -246,7 +246,10 @@ class _Measure:
         return self.metrics[metric].direction_of(part)
 
     def facts_of(self, name: str) -> dict[str, Any]:
-        """Returns the facts that a card states about a value, except for its direction; see `AuditedMetric`."""
+        """Returns the facts that a card states about a value; see `AuditedMetric`.
+
+        The direction is not included.
+        """
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]
         return {
@@ -259,7 +262,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that reads every requested attribute exactly, or None if there is no such value."""
+        """Name of the value that reads requested attributes exactly, or None if there is none."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -267,7 +270,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Signs of the values that judge motion-text pairs by their features: 1, or -1 if lower is better."""
+        """Values that judge motion-text pairs by features: 1, or -1 if lower is better, by name."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -311,7 +314,7 @@ class _Measure:
         }
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
-        """Returns features (N, E) of texts, float64. Each distinct caption is encoded once."""
+        """Returns features (N, E) of texts in float64. Each distinct caption is encoded once."""
         assert self.extractor is not None
         new = {text.caption: text for text in texts if text.caption not in self.encoded}
         if new:
@@ -346,13 +349,12 @@ def _agreement(
     scores: Sequence[Mapping[str, np.ndarray]],
     perturbations: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, float | None]]:
-    """Returns how well metrics that judge pairs agree with the exact attributes, by metric.
+    """Returns, by metric, how well metrics that judge pairs agree with the exact attributes.
 
     "auc" is the probability that a pair with every requested attribute has a better score than a
-    pair that lacks an attribute. It is computed from pairs with real motions and pairs with the
-    strongest perturbations of the meaning. "correlation" is Spearman's rank correlation over these
-    perturbations at all grades.
-    Returns {} if the exact attributes are unknown.
+    pair that lacks an attribute. It is computed from pairs with real motions and from pairs with
+    the strongest perturbations of the meaning. "correlation" is Spearman's rank correlation over
+    these perturbations at all grades. Returns {} if the exact attributes are unknown.
     """
     truth = measure.truth
     if truth is None or truth not in scores[0]:

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluation during training."""
+"""Callback that evaluates a model during training."""
 
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,18 @@ class Evaluate(Callback):
     replications, .../ci is the half width of the 95 % interval.
 
     The evaluation runs at the first validation and then at multiples of `every_n_steps`. It uses
-    averaged weights if the recipe averages weights. The motions are divided among all ranks.
+    averaged weights if the recipe averages weights. The motions are divided among all ranks. Raises
+    `UserError` before training begins if the extractor does not exist.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
         extractor: source of the protocol's extractor, as in `flame-mdm evaluate`: a file, a folder,
             a model in the package or a run directory. None = the extractor named in the protocol;
             "none" = skip metrics that need features.
-        samples: motions per replication; None = the protocol's number.
-
-    Raises `UserError` before training begins if the extractor does not exist.
+        every_n_steps: number of training steps between evaluations.
+        samples: number of motions per replication. None = the protocol's number.
+        replications: number of replications.
+        batch_size: number of motions per batch.
     """
 
     def __init__(
@@ -58,7 +60,7 @@ class Evaluate(Callback):
         self.real: dict[str, Value | None] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Opens the protocol and the extractor, so that a mismatch with the data is reported before training."""
+        """Opens the protocol and the extractor, so that mismatches are reported before training."""
         assert isinstance(pl_module, GeneratorTask)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
         model = pl_module.generator
@@ -104,7 +106,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Adds the value that selects checkpoints, and the curves for dashboards."""
+        """Adds a value for the selection of checkpoints, and its curves for dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name
@@ -116,8 +118,8 @@ class Evaluate(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Logs the values of the last evaluation."""
-        # The values were computed at the start of the validation epoch, because the averaged weights
-        # have been swapped out by now.
+        # The values were computed at the start of the validation epoch, because the averaged
+        # weights have been swapped out by now.
         pl_module.log_dict(self.curves)
         pl_module.log_dict(
             {name: x for name, x in self.values.items() if name not in self.curves}, logger=False

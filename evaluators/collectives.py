@@ -25,7 +25,10 @@ def world_size() -> int:
 
 
 def is_first() -> bool:
-    """Whether this process is the first one, which computes metrics, writes files and shows progress."""
+    """Returns whether this is the first process.
+
+    The first process computes metrics, writes files and shows progress.
+    """
     return world_size() == 1 or dist.get_rank() == 0
 
 
@@ -38,7 +41,7 @@ def shared(value: T) -> T:
 
 
 def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
-    """Returns the results for all items, in every process. Each of the N processes computes every N-th result."""
+    """Returns the results for all items on every rank. Each of N ranks computes every N-th one."""
     count = world_size()
     if count == 1:
         return [function(item) for item in items]
@@ -69,8 +72,8 @@ def processes(device: str | None) -> Iterator[str]:
     # process while Python shuts down.
     from torch.distributed.nn import functional  # noqa: F401
 
-    # Motions are gathered once per replication, on the CPU. A process that finishes early may wait
-    # for hours.
+    # Motions are gathered once per replication, on the CPU. A process that finishes early may have
+    # to wait for hours.
     dist.init_process_group("gloo", timeout=timedelta(days=7))
     try:
         yield device

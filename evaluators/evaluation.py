@@ -35,15 +35,15 @@ def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files from another system or a baseline, and writes the result file.
 
     Real motions are measured first. If their values differ from the values that the protocol
-    expects, the data or the extractor is wrong, and nothing is generated. The guide is
+    expects, the data or the extractor is wrong, and nothing is generated. For a guide, see
     `docs/evaluation.md`.
 
     Args:
         request: the keys of `flame-mdm evaluate`.
 
     Raises:
-        UserError: If model, data, protocol and extractor do not match, or if real motions do not
-            have the expected values.
+        UserError: If the model, data, protocol and extractor do not match, or if real motions do
+            not have the expected values.
 
     Example:
         >>> from evaluators.evaluation_request import EvaluationRequest
@@ -79,7 +79,7 @@ class Evaluation:
     protocol: Protocol
     # Clips of the evaluated split
     clips: Clips
-    # The opened extractor. If it is None, metrics that need features have no value.
+    # The opened extractor, or None, in which case metrics that need features have no value
     extractor: Extractor | None
     # Representation of the motions, on the device that computes the metrics
     representation: Representation
@@ -87,7 +87,7 @@ class Evaluation:
     seed: int = 0
     # Batch size of the extractor
     batch_size: int = 64
-    # The training split, for metrics that search for copies of its motions
+    # The training split, for metrics that detect copies of its motions
     training: Clips | None = None
 
     def run(
@@ -100,15 +100,15 @@ class Evaluation:
     ) -> Measured:
         """Evaluates the real motions in all replications, and then the motions from the source.
 
-        Each rank generates a share of the batches and computes their features. Rank 0 computes the
-        metrics, and all ranks return the result. If real motions do not have the expected values,
-        raises `UserError` before anything is generated, unless `force` is True.
+        Each rank generates some of the batches and computes their features. Rank 0 computes the
+        metrics, and all ranks return the result. Unless `force` is True, raises `UserError` before
+        anything is generated if real motions do not have the expected values.
 
         Args:
             source: source of the motions; None = only real motions are measured.
-            ground_truth: whether to also measure real motions.
+            ground_truth: whether to measure real motions, too.
             force: whether to generate motions even if real motions do not have the expected values.
-            resamples: number of sets that are drawn from the motions of the first replication,
+            resamples: number of bootstrap sets to draw from the motions of the first replication,
                 for intervals over motions.
         """
         real_sets, real = self._measure_real(source, ground_truth)
@@ -141,7 +141,7 @@ class Evaluation:
     @cached_property
     def evaluator(self) -> Evaluator:
         """The evaluator for the motions of each replication."""
-        # True with extractor=none
+        # `skips` is True for extractor=none.
         skips = self.extractor is None and self.protocol.extractor is not None
         evaluator = Evaluator(
             self.extractor,
@@ -198,10 +198,10 @@ class Evaluation:
             if ground_truth:
                 scores.append(self._score(self.evaluator, paired, paired, real, replication))
             if source is not None:
-                # Checked before any motion is generated
+                # The inputs are checked before any motion is generated.
                 for checked in filter(None, (self.evaluator, self.several)):
                     checked.check(paired)
-                # All replications are kept in memory. Joints are the largest part, and are kept
+                # All replications are kept in memory. Joints take the most memory, so they are kept
                 # only if metrics compare them.
                 real_sets.append(
                     (
@@ -237,7 +237,7 @@ class Evaluation:
         return lines
 
     def _expected(self) -> dict[str, list[float]]:
-        """Returns the expected value of real motions and its tolerance for each metric.
+        """Returns, for each metric, the expected value of real motions and its tolerance.
 
         Returns {} unless the test split is evaluated.
         """
@@ -254,7 +254,7 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns notes on the limitations of the values: repeated clips, and unchecked values of real motions."""
+        """Returns notes on limitations: repeated clips, and unchecked values of real motions."""
         lines = []
         clips = len(self.protocol.selected(self.clips))
         drawn = {
@@ -288,7 +288,7 @@ class Evaluation:
             rows = self.protocol.rows(self.clips, self.seed, replication)
             samples = source(f"rep_{replication}", rows, replication)
             costs.append(samples.cost)
-            # Motions from another system may not cover all clips
+            # Motions from another system may not cover all clips.
             if len(samples.rows) != len(rows):
                 ids = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
@@ -337,9 +337,9 @@ class Evaluation:
         )
 
     def _generated(self, samples: Samples) -> Motions:
-        """Returns the motions to measure.
+        """Returns the motions to measure, smoothed over time if the protocol requires it.
 
-        Each motion is smoothed over time without padding, as in FLAME's code.
+        Each motion is smoothed without its padding, as in FLAME's code.
         """
         sigma, features = self.protocol.smoothing, samples.features
         if sigma is not None:
@@ -372,7 +372,7 @@ class Evaluation:
     ) -> Motions:
         """Returns motions with the conditions of their rows.
 
-        If `captions` are given, they replace the captions of the rows.
+        `captions`, if not None, replace the captions of the rows.
         """
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None

@@ -1,7 +1,7 @@
 # pyright: standard
 """The keys of an evaluation.
 
-This module does not import torch, so that invalid keys are reported at once.
+This module does not import torch, so that invalid keys are reported immediately.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class EvaluationRequest(EvaluationKeys):
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-        """Creates a request from a mapping of keys to values. Keys of the sampler become `options`."""
+        """Creates a request from a mapping of keys to values. Sampler keys become `options`."""
         kinds = (cls, SamplerOptions)
         keywords, options = (
             {key.name: config[key.name] for key in fields(kind) if key.name in config}

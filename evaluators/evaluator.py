@@ -1,5 +1,5 @@
 # pyright: standard
-"""The evaluator computes many metrics with one feature pass over the motions."""
+"""The evaluator, which computes many metrics with a single feature pass over the motions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from flame_mdm.seeds import key
 
 # Motions per update of a metric. More motions would not fit into the CPU cache.
 CHUNK = 64
-# Inputs of metrics that come from an extractor
+# Metric inputs that come from an extractor
 FEATURES = {"generated", "real", "text", "logits"}
 PAIRED = {
     "generated": "real",
@@ -38,7 +38,7 @@ PAIRED = {
     "nearest": "real_nearest",
     "references": "references",
 }
-"""Names of the inputs from generated motions, by the names of the same inputs from paired real motions."""
+"""Names of inputs from generated motions -> names of the same inputs from paired real motions."""
 
 
 @dataclass
@@ -53,9 +53,9 @@ class Motions:
     captions: list[str] | None = None
     # "word/PART" tokens of the captions, if the data has tokens
     tokens: list[list[str] | None] | None = None
-    # Additional inputs by their names in `evaluators.metrics`
+    # Additional inputs, by their names in `evaluators.metrics`
     inputs: dict[str, Any] = field(default_factory=dict)
-    # The parts kept from real motions: arguments `region` and `joints` of `kept_parts`
+    # The parts that an edit kept: the arguments `region` and `joints` of `kept_parts`
     edit: Mapping[str, Any] | None = None
 
     def __len__(self) -> int:
@@ -63,9 +63,9 @@ class Motions:
 
 
 Rows = dict[str, Any]
-"""Metric inputs for N motions by their names in `evaluators.metrics`.
+"""Metric inputs for N motions, by their names in `evaluators.metrics`.
 
-The inputs are tensors, or lists of N entries (such as joints).
+An input is a tensor, or a list of N entries (such as joints).
 """
 
 
@@ -73,9 +73,9 @@ The inputs are tensors, or lists of N entries (such as joints).
 class Evaluator:
     """Computes metrics for motions, with one feature pass for all metrics.
 
-    For the same features, all values are bit-identical for any batch size and order. If there are
-    several processes, they share the feature pass. Each process receives whole batches, so that
-    features do not depend on the number of processes. The first process computes the metrics.
+    For the same features, all values are bit-identical for any batch size and order. Several
+    processes share the feature pass: each one receives whole batches, so that features do not
+    depend on the number of processes. The first process computes the metrics.
 
     Example:
         >>> from flame_mdm.representations.humanml import HumanML
@@ -137,9 +137,9 @@ class Evaluator:
         return rows
 
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
-        """Returns the training motions that other motions are compared with.
+        """Returns the training motions with which other motions are compared.
 
-        They consist of the poses of all frames, and the features of windows.
+        They are stored as the poses of all frames, and the features of windows.
         """
         facing = self.representation.skeleton.facing
         joints = replace(self, extractor=None).extract(whole)["joints"]
@@ -151,10 +151,9 @@ class Evaluator:
 
     @torch.no_grad()
     def reference(self) -> Rows | None:
-        """Returns the features of the extractor's own real motions.
+        """Returns the features of the extractor's own real motions, or None if it has none.
 
-        Returns None for an extractor without such motions. Sets are then compared with motions
-        of the data set.
+        Without such motions, sets are compared with motions of the data set.
         """
         features = self.extractor and self.extractor.reference()
         if features is None:
@@ -189,9 +188,9 @@ class Evaluator:
         }
 
     def _texts(self, motions: Motions, indices: Sequence[int]) -> Tensor | None:
-        """Returns features of captions.
+        """Returns the features of captions.
 
-        Every rank computes all features, since extractors cache captions.
+        Every rank computes all of them, because extractors cache captions.
         """
         if self.extractor is None or motions.captions is None:
             return None
@@ -206,11 +205,11 @@ class Evaluator:
     ) -> tuple[dict[str, float | None], dict[str, str]]:
         """Computes all metrics for generated motions and their paired real motions, in the same order.
 
-        Comparisons of sets use `real`, a separate draw, because the distance from a set to itself
-        is 0. Returns the values by name (`metric` or `metric/part`), and the reasons for missing
-        values by metric. A value that cannot be computed is None. Both mappings are empty in all
-        processes except the first. Raises `UserError` if the motions lack an input that a metric
-        needs.
+        Metrics that compare sets use `real`, a separate draw of real motions, because the distance
+        from a set to itself is 0. Returns the values by name (`metric` or `metric/part`), and the
+        reasons for missing values by metric. A value that cannot be computed is None. Both mappings
+        are empty in all processes except the first. Raises `UserError` if the motions lack an input
+        that a metric requires.
         """
         if not is_first():
             return {}, {}
@@ -220,11 +219,11 @@ class Evaluator:
     def resample(
         self, generated: Rows, paired: Rows, real: Rows, seed: int, resamples: int
     ) -> dict[str, list[float | None]]:
-        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap.
+        """Computes all metrics for `resamples` sets of motions drawn with replacement (bootstrap).
 
-        Metrics that compare two sets draw from both sets. The draws depend only on `seed` and the
-        numbers of motions, so that two models are compared on the same draws. The arguments are
-        described in `score`. Returns values (resamples,) by name.
+        For metrics that compare two sets, motions are drawn from both sets. The draws depend only
+        on `seed` and the numbers of motions, so that two models are compared on the same draws. See
+        `score` for the arguments. Returns values (resamples,) by name.
         """
         count, others = len(generated["keys"]), len(real["keys"])
         if not is_first() or not count or not resamples:
@@ -251,7 +250,8 @@ class Evaluator:
         """Updates all metrics with the motions. Returns all of them, and those that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
-            # Returns False: metrics are not synchronized, because this process has all motions
+            # `bool()` returns False: metrics are not synchronized, because this process has all
+            # motions.
             metric.distributed_available_fn = bool
         count = len(generated["keys"])
         usable = self.check(generated, metrics) if count else {}
@@ -270,7 +270,7 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name, from which declared properties can be read."""
+        """The metrics by name, for reading the properties that they declare."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:
@@ -279,7 +279,7 @@ class Evaluator:
         return self.declared[metric].unit_of(part)
 
     def compares_sets(self, name: str) -> bool:
-        """Returns whether a value compares the set of motions with a set of real motions."""
+        """Returns whether a value compares a set of motions with a set of real motions."""
         return isinstance(self.declared[name.partition("/")[0]], TwoSets)
 
     def reads(self, name: str) -> bool:
@@ -319,7 +319,7 @@ def keys_of(names: Sequence[str]) -> Tensor:
 
 
 def _chunk(generated: Rows, paired: Rows, part: slice) -> Rows:
-    """Returns the padded inputs of some motions and of their paired real motions, with masks."""
+    """Returns the padded inputs of some motions and their paired real motions, with masks."""
     rows = {name: values[part] for name, values in generated.items()}
     rows |= {real: paired[name][part] for name, real in PAIRED.items() if name in paired}
     for joints, mask in (("joints", "mask"), ("real_joints", "real_mask")):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from flame_mdm.data.store import Entry
 
-# Names of the attribute that states the action; clips without it have no near misses
+# Names of the attribute that states the action. Clips that lack it have no near misses.
 ACTION = (
     "action",
     "content",
@@ -17,10 +17,10 @@ _Stated = frozenset[tuple[str, str | int | float]]
 
 
 def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
-    """Returns sorted near misses of each clip, by the attribute that differs.
+    """Returns, for each clip, its sorted near misses by the attribute that differs.
 
-    A caption of another clip is a near miss if both clips show the same action, and differ in
-    exactly one of the attributes (side, style, count, ...) that both of them have. For example,
+    A caption of another clip is a near miss if both clips show the same action but differ in
+    exactly one of the attributes (side, style, count, ...) that they both have. For example,
     "walks backward" is a near miss of a slow walk forward.
     """
     stated = [_stated(clip) for clip in clips]
@@ -32,7 +32,10 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip, with slots in the action: "wave-left-hand" becomes "wave-{side}-hand"."""
+    """Returns the attributes of a clip, with placeholders in the action.
+
+    For example, "wave-left-hand" becomes "wave-{side}-hand".
+    """
     stated = {
         name: value
         for name, value in clip.attributes.items()

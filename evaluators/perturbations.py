@@ -1,9 +1,9 @@
 # pyright: standard
-"""Graded perturbations of real motions for audits: changes that a metric should detect, or ignore.
+"""Graded perturbations of real motions for audits: changes that a metric should detect or ignore.
 
 Each function takes joint positions (F, J, 3) in meters, y up, and keeps the number of frames unless
-its docstring says otherwise. All random draws come from a generator, so that the grades of a
-perturbation share their draws.
+its docstring states otherwise. All random draws come from a generator that is passed, so that the
+grades of a perturbation share their draws.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GROUND = np.array([1.0, 0.0, 1.0])
 WOBBLE = 1.0
 # Seconds over which a motion is blended into another motion
 BLEND = 0.4
-# Grades of perturbations that replace motions: percentage of the motions
+# Grades of perturbations that replace motions: the percentage of the motions
 SHARES = (5, 10, 20, 50, 100)
 
 
@@ -52,7 +52,7 @@ def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Join
 
 
 def skate(joints: Joints, factor: float) -> Joints:
-    """Multiplies the horizontal speed of the root and keeps the poses, so that the feet slide."""
+    """Multiplies the horizontal speed of the root but keeps the poses, so that the feet slide."""
     return joints + (factor - 1) * ((joints[:, :1] - joints[:1, :1]) * GROUND)
 
 
@@ -94,18 +94,27 @@ def draw_in(joints: Joints, centimeters: float) -> Joints:
 
 
 def freeze(joints: Joints, percent: float) -> Joints:
-    """Holds one frame over a given share of the duration, until the end of the motion."""
+    """Freezes a motion by holding one of its frames until the end.
+
+    `percent` is the share of the duration over which the frame is held.
+    """
     moving = max(1, round(len(joints) * (1 - percent / 100)))
     return joints[np.minimum(np.arange(len(joints)), moving - 1)]
 
 
 def play(joints: Joints, factor: float, fps: float) -> Joints:
-    """Plays the motion faster, which shortens it, or slower; a slower motion is cut to the original length."""
+    """Plays the motion faster or slower.
+
+    A faster motion is shorter. A slower motion is cut to the original length.
+    """
     return resample(joints, fps * factor, fps)[: len(joints)]
 
 
 def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
-    """Resamples linearly to another frame rate and back. Frames after the last resampled frame repeat that frame."""
+    """Resamples a motion linearly to another frame rate and back.
+
+    Frames after the last resampled frame repeat this frame.
+    """
     back = resample(resample(joints, fps, rate), rate, fps)
     return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
 
@@ -118,8 +127,9 @@ def crop(joints: Joints, percent: float) -> Joints:
 def drop_repetition(joints: Joints, count: int) -> Joints:
     """Cuts one of `count` repetitions out of a motion, which shortens it.
 
-    The cut joins two frames with similar poses: the nearest poses whose distance in time is within
-    20 % of one period. The second part continues at the position where the first part ends.
+    The cut joins the two frames with the most similar poses among those whose distance in time
+    differs by at most 20 % from one period. The second part continues at the position where the
+    first part ends.
     """
     poses = joints - joints[:, :1] * GROUND
     change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
@@ -137,9 +147,9 @@ def drop_repetition(joints: Joints, count: int) -> Joints:
 
 
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
-    """Replaces the second half with the second half of another motion, starting at the same position.
+    """Replaces the second half with the second half of another motion.
 
-    Poses are blended over `BLEND` seconds.
+    It starts at the position where the first half ends. Poses are blended over `BLEND` seconds.
     """
     half = len(joints) // 2
     rest = other[len(other) // 2 :]
@@ -157,7 +167,7 @@ second draw of real motions, for metrics that compare sets.
 """
 
 Inputs = dict[str, np.ndarray]
-"""Metric inputs for N motions by name: features (N, E), and the readings of the metrics."""
+"""Metric inputs for N motions, by name: features (N, E), and the readings of the metrics."""
 
 Motions = Callable[[], list[np.ndarray]]
 """A function that computes a set of N motions as features (F, D)."""
@@ -176,32 +186,33 @@ class Perturbation:
     grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation (or one per kind) with all possible grades, or [] if none is possible."""
+        """Returns the perturbation (or one per kind) with its possible grades, or [] without any."""
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns, by name, the sets of motions from which `apply` selects."""
+        """Returns, by name, the sets of motions from which `apply` takes motions."""
         return {}
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions and texts at a grade. Pair i belongs to real motion i with texts[i]."""
+        """Returns the motions and texts at a grade. Pair i replaces real motion i and texts[i]."""
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the motions (N,) in the order in which they are perturbed, which is the same at all grades."""
+        """Returns the indices (N,) of motions in the order of perturbation, equal at all grades."""
         return scene.draws("order", self.name).permutation(len(scene))
 
 
 @dataclass(frozen=True)
 class ChangedJoints(Perturbation):
-    """Changes the joints of all motions. The draws of a motion are the same at all grades.
+    """Changes the joints of all motions. The random draws for a motion are the same at all grades.
 
     Attributes:
         change: function of joints (F, J, 3), the grade, and the options in `takes`.
-        takes: names of options of `change`: "draws" (a generator) and "fps" (frames per second).
-        sign: factor of the grade, 1 or -1.
+        takes: names of the options of `change`: "draws" (a generator) and "fps" (frames per
+            second).
+        sign: 1 or -1, by which the grade is multiplied.
     """
 
     change: Callable[..., Joints] = lambda joints, grade: joints
@@ -235,7 +246,7 @@ class ChangedJoints(Perturbation):
 
 @dataclass(frozen=True)
 class ChangedSet(Perturbation):
-    """Replaces all motions; `make` computes the new motions from the scene."""
+    """Replaces all motions with new ones, which `make` computes from the scene."""
 
     make: Callable[[Scene], list[np.ndarray]] = lambda scene: scene.features
 
@@ -270,22 +281,28 @@ class ReplacedShare(ChangedSet):
 
 @dataclass(frozen=True)
 class DroppedRepetition(ReplacedShare):
-    """Cuts one repetition out of a share of the motions. Motions without repetitions are unchanged."""
+    """Cuts one repetition out of a share of the motions, except those without repetitions."""
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation if a motion has repetitions."""
+        """Returns the perturbation if any motion has repetitions."""
         return [self] if any(repetitions(row) > 1 for row in scene.rows) else []
 
 
 @dataclass(frozen=True)
 class ReplacedCaptions(Perturbation):
-    """Replaces a share of the captions, in percent, with wrong captions of the kind `name` in `Scene.wrong`."""
+    """Replaces a share of the captions, in percent, with wrong captions.
+
+    `name` is the kind of the wrong captions in `Scene.wrong`.
+    """
 
     unit: str = "% of captions"
     grades: Sequence[float] = (1, 2, 5, 10, 20, 50, 100)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns a perturbation for each kind of wrong captions, up to the share of motions that have one."""
+        """Returns a perturbation for each kind of wrong captions.
+
+        The largest grade is the share of motions that have a wrong caption of this kind.
+        """
         offered = []
         for kind in scene.wrong if captioned else ():
             if kind.partition(":")[0] == self.name:
@@ -308,7 +325,7 @@ class ReplacedCaptions(Perturbation):
 class DroppedActions(Perturbation):
     """Drops a share of the actions, in percent.
 
-    The remaining motions are repeated, with their texts, to replace them.
+    Motions of these actions are replaced by repeating the remaining motions and their texts.
     """
 
     unit: str = "% of actions"
@@ -320,7 +337,7 @@ class DroppedActions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns motions of the remaining actions with their texts, repeated up to the same number."""
+        """Returns as many motions as before, all of the remaining actions, with their texts."""
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]
@@ -333,7 +350,7 @@ class DroppedActions(Perturbation):
 
 @dataclass(frozen=True)
 class FewerMotions(Perturbation):
-    """Keeps only the first motions; the grade is their number."""
+    """Keeps only the first motions. The grade is the number of motions."""
 
     unit: str = "motions"
 
@@ -350,7 +367,7 @@ class FewerMotions(Perturbation):
 
 
 def base_motions(scene: Scene) -> list[np.ndarray]:
-    """Returns the real motions, decoded and encoded like perturbed motions."""
+    """Returns the real motions after decoding and encoding them like perturbed motions."""
     return encode(scene.representation, scene.joints)
 
 
@@ -391,7 +408,10 @@ def _other_half(scene: Scene) -> list[np.ndarray]:
 
 
 def _memorized(scene: Scene) -> list[np.ndarray]:
-    """Returns, for each motion, a training motion with the same captions or action, or the motion itself."""
+    """Returns, for each motion, a training motion with the same captions or action.
+
+    If there is none, the motion itself is returned.
+    """
     training, copies = scene.data.clips("train"), []
     for row in scene.rows:
         same = [clip for clip in training.clips if clip.captions == row.clip.captions]
@@ -428,7 +448,10 @@ def through_others(representation: HumanML) -> list[Perturbation]:
 
 
 def perturbations_of(scene: Scene, captioned: bool) -> list[Perturbation]:
-    """Returns all perturbations that the motions and captions allow. Near misses are also listed by attribute."""
+    """Returns all perturbations that the motions and captions allow.
+
+    Near misses are also listed by attribute.
+    """
     listed = [*PERTURBATIONS, *through_others(scene.representation)]
     return [
         offered for perturbation in listed for offered in perturbation.offered(scene, captioned)
@@ -471,4 +494,7 @@ PERTURBATIONS: list[Perturbation] = [
     ChangedJoints("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), crop),
 ]
 # fmt: on
-"""All perturbations except near misses by attribute and other representations, which depend on the data."""
+"""All perturbations except those that depend on the data.
+
+These are near misses by attribute, and other representations.
+"""

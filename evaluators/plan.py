@@ -28,17 +28,18 @@ from flame_mdm.sampling.motion_request import EditRequest
 class Plan:
     """All parts of an evaluation, opened and checked before anything is measured.
 
-    Raises `UserError` or `FileNotFoundError` if a file is missing, or if model, data, protocol and
-    extractor do not match.
+    Raises `UserError` or `FileNotFoundError` if a file is missing, or if the model, data, protocol
+    and extractor do not match.
 
     Attributes:
-        model, file, sampling: the model, its checkpoint and its sampling options. Without a
-            model, they are None, None and {}.
+        model, file, sampling: the model, its checkpoint and its sampling options. If the motions do
+            not come from a model, they are None, None and {}.
         clips, representation: the evaluated split of `data`, and the representation on its
             device.
-        skeleton: the source of bone lengths for joints that are computed from SMPL's rotations, or
-            None if the data has joint positions.
-        protocol, changed: the protocol in the requested size, and the options that changed.
+        skeleton: where the bone lengths come from if joints are computed from SMPL's rotations.
+            None = the data has joint positions.
+        protocol, changed: the protocol with the requested numbers of motions and replications, and
+            the options that were changed.
         path: path of the result file.
     """
 
@@ -100,8 +101,8 @@ class Plan:
     def _motions_folder(self, request: EvaluationRequest, file: Path, protocol: Protocol) -> Path:
         """Returns the folder for the motions of a checkpoint with these options.
 
-        The folder is in the run directory of the checkpoint, or next to the checkpoint. Motions
-        of models in this package or on the hub go to runs/NAME in the working directory.
+        The folder is in the run directory of the checkpoint, or next to a checkpoint without one.
+        Motions of models in this package or on the hub go to runs/NAME in the working directory.
         """
         if not Path(str(request.ckpt)).exists():
             run = Path("runs") / str(request.ckpt)
@@ -122,7 +123,7 @@ class Plan:
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
     """Returns the prepared data with the representation of its store.
 
-    Raises `UserError` if no data set is given, the data set is not prepared, or the model
+    Raises `UserError` if no data set is specified, if the data set is not prepared, or if the model
     generates a different representation.
     """
     module, encoding, root = request.data, request.representation, "data"
@@ -167,7 +168,10 @@ def sampling_options(
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:
-    """Returns the options of the sampler and of `Edit`: the requested values or, by default, the recipe's values."""
+    """Returns the options of the sampler and of `Edit`.
+
+    Options that are not requested have the values in the recipe.
+    """
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
     if protocol.edit is not None:

@@ -29,7 +29,7 @@ from flame_mdm.seeds import key
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
-CONTEXT_STARTS = 5  # In DiP's code, the context begins at one of the first five frames of a clip
+CONTEXT_STARTS = 5  # in DiP's code, the context begins at one of the first five frames of a clip
 Count = Annotated[Int, Field(ge=1)]
 
 
@@ -39,7 +39,7 @@ class DrawnClip:
 
     #: Unique name of the motion.
     id: str
-    #: The real clip that the motion is compared with.
+    #: The real clip with which the motion is compared.
     clip: Entry
     #: Indices of the frames drawn from the clip.
     frames: np.ndarray
@@ -47,7 +47,7 @@ class DrawnClip:
     caption: int | None
     #: Name shared by all motions with the same caption and length.
     prompt: str
-    #: Indices of the frames that the model receives as context and continues. They are not measured.
+    #: Indices of the frames that the model receives as context. They are not measured.
     context: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
     @property
@@ -58,7 +58,7 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """The attributes of the clip that rules can read, or {} for clips with an attribute of `UNREAD`."""
+        """The clip's attributes that rules can read, or {} if it has an attribute in `UNREAD`."""
         return {
             name: value
             for name, value in self.clip.attributes.items()
@@ -76,7 +76,7 @@ class DrawnClip:
 
 
 class Multimodality(ClosedSchema):
-    """A second evaluation with several motions per prompt."""
+    """Settings of a second evaluation, with several motions per prompt."""
 
     #: Number of prompts; None = all prompts of the split.
     prompts: Int | None
@@ -92,21 +92,21 @@ class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
     The caption and crop of a clip, and the noise of the generated motion, are functions of (seed,
-    replication, id). Motions are as long as the real clip. Real motions are measured in the
-    same way, and compared with a second draw of real motions.
+    replication, id). Generated motions are as long as the real clips. Real motions are measured in
+    the same way, and compared with a second draw of real motions.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
 
     #: Name of the file and, for variants, the name of the variant.
     name: str
-    #: Number that increases with each change to the protocol. Values of different versions are
-    #: not comparable.
+    #: Number that is increased with each change to the protocol. Values measured with different
+    #: versions are not comparable.
     version: Int
     #: Condition of the generated motions.
     condition: Literal["text", "action", "none"]
-    #: Mapping with the `_target_` of an `Extractor`, and its `path`. The path is left out if the
-    #: user must provide it.
+    #: Mapping with the `_target_` of an `Extractor` and its `path`, which is left out if the user
+    #: must provide it.
     extractor: Config | None
     #: Mappings with the `_target_` of a metric, by name.
     metrics: dict[str, Config]
@@ -118,19 +118,19 @@ class Protocol(ClosedSchema):
     real_samples: Count | None = None
     #: A second evaluation with several motions per prompt.
     multimodality: Multimodality | None = None
-    #: If given, motions are edits of real motions. The mapping contains the arguments `region` and
-    #: `joints` of `kept_parts`.
+    #: Arguments `region` and `joints` of `kept_parts`. If not None, the generated motions are edits
+    #: of real motions.
     edit: dict[str, Any] | None = None
     #: Standard deviation, in frames, of the Gaussian filter that smooths generated features over
     #: time.
     smoothing: Number | None = None
     #: Motions per batch, if the protocol measures time. The first batch is not timed.
     batch_size: Count | None = None
-    #: Context frames for models that continue motions. "drawn": the first drawn frames, which are
-    #: then not measured. "start", as in DiP's code: frames that begin at one of the first five
-    #: frames of the clip. The motion that follows the context is as long as the drawn frames.
+    #: Context frames for models that continue motions. "drawn": the first of the drawn frames,
+    #: which are then not measured. "start", as in DiP's code: frames that begin at one of the first
+    #: five frames of the clip; the motion that follows them is as long as the drawn frames.
     context: Literal["drawn", "start"] = "drawn"
-    #: Number of context frames that the model receives. Set by `open_protocol`.
+    #: Number of context frames that the model receives, set by `open_protocol`.
     context_frames: Int = 0
     #: Attributes that evaluated clips must have. {} = all clips of the split.
     only: dict[str, Any] = Field({})
@@ -140,11 +140,11 @@ class Protocol(ClosedSchema):
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = (
         Field({})
     )
-    #: Whether this is a quick evaluation. Set by `resized`.
+    #: Whether this is a quick evaluation, set by `resized`.
     quick: bool = False
-    #: Whether the number of motions differs from the number in the file. Set by `resized`.
+    #: Whether the number of motions differs from the number in the file, set by `resized`.
     resized_samples: bool = False
-    #: Hash of the content of the file. Set by `load_protocol`.
+    #: Hash of the content of the file, set by `load_protocol`.
     sha256: str = ""
 
     def resized(
@@ -157,10 +157,10 @@ class Protocol(ClosedSchema):
         quick: bool = False,
         multimodality: bool = True,
     ) -> tuple[Protocol, dict[str, Any]]:
-        """Returns the protocol in a different size, and the options that changed.
+        """Returns the protocol with different numbers of motions, and the options that changed.
 
         `clips` is the number of clips in the split. A quick evaluation has few motions and
-        replications. `batch_size` only affects protocols that measure time.
+        replications. `batch_size` affects only protocols that measure time.
         """
         defaults = (
             {"replications": QUICK_REPLICATIONS, "samples": min(QUICK_SAMPLES, clips)}
@@ -193,11 +193,11 @@ class Protocol(ClosedSchema):
     def open_extractor(
         self, path: str | None, representation: Representation, dataset: str
     ) -> Extractor | None:
-        """Opens the extractor at `path`, by default the protocol's extractor.
+        """Opens the extractor at `path`. If `path` is None, the protocol's extractor is opened.
 
         Returns None if the protocol needs no extractor, or if `path` is "none". Raises `UserError`
-        or `FileNotFoundError` if the extractor is missing, or if it belongs to a
-        different representation or data set.
+        or `FileNotFoundError` if the extractor is missing, or if it is for a different
+        representation or data set.
         """
         if self.extractor is None or path == "none":
             return None
@@ -215,12 +215,12 @@ class Protocol(ClosedSchema):
 
     @property
     def cuts_motions(self) -> bool:
-        """Whether the first frames, which the model receives as context, are cut off before measuring."""
+        """Whether the context frames that the model receives are cut off before measuring."""
         return self.context_frames > 0 and self.context == "drawn"
 
     @property
     def title(self) -> str:
-        """The name and version, such as "text_to_motion-1"."""
+        """The name and the version, such as "text_to_motion-1"."""
         return f"{self.name}-{self.version}"
 
     def selected(self, clips: Clips) -> list[Entry]:
@@ -234,7 +234,7 @@ class Protocol(ClosedSchema):
     ) -> list[DrawnClip]:
         """Returns the motions of one replication.
 
-        Each `purpose` has its own draw of clips, captions and crops. Raises `UserError` if the
+        Clips, captions and crops are drawn separately for each `purpose`. Raises `UserError` if the
         split has no suitable clip.
         """
         drawn = () if purpose == "generated" else (purpose,)
@@ -274,7 +274,7 @@ class Protocol(ClosedSchema):
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
         """Returns the motions for one replication of multimodality.
 
-        There are several motions for each of the first prompts.
+        Each of the first prompts has several motions.
         """
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]
@@ -299,7 +299,7 @@ class Protocol(ClosedSchema):
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
         """Checks that the clips and the model fit the protocol.
 
-        Raises `UserError` if there is no clip, if a caption or label is missing, or if the model
+        Raises `UserError` if there are no clips, if a caption or label is missing, or if the model
         has a different condition.
         """
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
@@ -324,11 +324,11 @@ def protocol_names(folder: Path = FOLDER) -> list[str]:
 
 
 def protocol_config(name: str) -> Config:
-    """Returns the options of a protocol: a name in experiments/evaluation, or a .yaml file.
+    """Returns the options of a protocol, given a name in experiments/evaluation or a .yaml file.
 
-    A file may contain `variants`. For example, protocol `editing_in_between` is the variant
-    `in_between` of editing.yaml. The options of the variant replace options of the file. Raises
-    `UserError` if there is no such protocol.
+    A file may contain `variants`, whose options override the options of the file. For example, the
+    protocol `editing_in_between` is the variant `in_between` in editing.yaml. Raises `UserError` if
+    there is no such protocol.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     for file in [path] if path.is_file() else sorted(path.parent.glob("*.yaml")):
@@ -415,7 +415,10 @@ def open_protocol(
     model: MotionGenerator | None,
     **size: Any,
 ) -> tuple[Protocol, dict[str, Any]]:
-    """Returns a protocol that matches a split and a model, and the options that `Protocol.resized` changed."""
+    """Opens a protocol and checks that it fits a split and a model.
+
+    Returns the protocol, and the options that `Protocol.resized` changed.
+    """
     protocol = load_protocol(name, representation)
     if model is not None:
         protocol = protocol.model_copy(update={"context_frames": model.denoiser.context_frames})
@@ -427,7 +430,7 @@ def open_protocol(
 
 
 def default_protocol(model: MotionGenerator) -> str:
-    """Returns the name of the default protocol for the condition and the data set of a model."""
+    """Returns the name of the default protocol for a model's condition and data set."""
     condition, dataset = model.conditioned_on, model.facts.get("dataset", "")
     if condition == "none":
         return "unconditioned"

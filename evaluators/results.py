@@ -32,7 +32,7 @@ from flame_mdm.training.start import recipe_changes
 class Scores:
     """Values of all metrics in one replication."""
 
-    # Values by name, `metric` or `metric/part`; None = the value cannot be computed
+    # Values by name (`metric` or `metric/part`); None = the value cannot be computed
     values: Mapping[str, float | None]
     # Reasons for missing values, by metric
     reasons: Mapping[str, str]
@@ -45,7 +45,10 @@ class Scores:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Scores of one part of an evaluation: real motions, generated motions, or several motions per prompt."""
+    """Scores of one part of an evaluation.
+
+    The parts are: real motions, generated motions, and several motions per prompt.
+    """
 
     # Scores by replication
     scores: Sequence[Scores] = ()
@@ -87,18 +90,18 @@ class Outcome:
 
 
 def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
-    """Returns the mean of R >= 1 replications, and the half width of its 95 % confidence interval.
+    """Returns the mean over R >= 1 replications and the half width of its 95 % confidence interval.
 
     The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code
-    of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead. With a
-    single replication, there is no interval.
+    of Guo et al. 2022, MDM and MFM. ACTOR's tables show 1.96 times the variance instead. For a
+    single replication, the half width is None.
     """
     half = float(1.96 * np.std(values) / len(values) ** 0.5) if len(values) > 1 else None
     return float(np.mean(values)), half
 
 
 def mean_cost(costs: Sequence[Cost]) -> Cost:
-    """Returns the mean cost over replications. Numbers are None if a replication used no model."""
+    """Returns the mean cost over replications, with None if a replication used no model."""
     values = {name: [getattr(cost, name) for cost in costs] for name in Cost.model_fields}
     return Cost(
         **{
@@ -109,7 +112,7 @@ def mean_cost(costs: Sequence[Cost]) -> Cost:
 
 
 def make_result(request: EvaluationRequest, plan: Plan) -> Result:
-    """Returns a result with its provenance; its values are measured later."""
+    """Returns a result with its provenance, but still without values."""
     info, extractor, protocol = plan.data.store.info, plan.extractor, plan.protocol
     device, crop, short = plan.representation.mean.device, plan.data.crop, plan.clips.too_short
     reason = f"{request.split} clips shorter than {crop.min_frames} frames"
@@ -153,14 +156,14 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
 
 
 def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
-    """Returns the extractor in the request or, if it has none, the path in the protocol."""
+    """Returns the extractor named in the request or, if there is none, the path in the protocol."""
     return request.extractor or str((plan.protocol.extractor or {}).get("path", ""))
 
 
 def _checkpoint(plan: Plan) -> Checkpoint | None:
-    """Describes the checkpoint.
+    """Describes the checkpoint, including how it was selected from its run.
 
-    The file name shows how the checkpoint was selected from its run.
+    This selection is read from the file name.
     """
     model, file = plan.model, plan.file
     if model is None or file is None:
@@ -185,9 +188,9 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
 
 
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
-    """Returns the reasons why values are not valid.
+    """Returns the reasons why the values are not valid.
 
-    Values are not valid if evaluated clips may be in the training data of the model or the
+    They are not valid if evaluated clips may be in the training data of the model or of the
     extractor.
     """
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
@@ -249,7 +252,7 @@ def show(result: Result, path: Path) -> None:
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns the explanation of the intervals at the end of a line, or "" if there are no intervals."""
+    """Returns the end of a line that explains the intervals, or "" if there are no intervals."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""
@@ -259,7 +262,7 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
 
 
 def _cell(value: Value | None, usual: str) -> str:
-    """Formats a value with its interval, if it has one.
+    """Formats a value, followed by its interval if it has one.
 
     The numbers of motions are added if they differ from the numbers for most values.
     """

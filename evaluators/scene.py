@@ -28,13 +28,13 @@ class Text(NamedTuple):
 
 
 def text_of(row: DrawnClip, caption: str) -> Text:
-    """Returns a caption of a drawn clip with its tagged words and attributes."""
+    """Returns a caption of a drawn clip, with its tagged words and attributes."""
     return Text(caption, row.tokens(caption), row.requested)
 
 
 @dataclass
 class Scene:
-    """Real motions from a split: the clips, the features (F, D) of each clip, and the seed of all draws."""
+    """Real motions from a split: drawn clips, their features (F, D), and the seed of all draws."""
 
     data: MotionDataModule
     rows: list[DrawnClip]
@@ -68,10 +68,10 @@ class Scene:
 
     @cached_property
     def wrong(self) -> dict[str, list[Text | None]]:
-        """A wrong text for each motion, or None for motions without such a text, by kind of error.
+        """For each kind of error, a wrong text per motion, or None for motions without one.
 
-        The kinds are `RANDOM` and `NEAR`. If near misses differ in several attributes, there is
-        also a kind "near misses: ATTRIBUTE" for each attribute.
+        The kinds are `RANDOM` and `NEAR`. If there are near misses in several attributes, there is
+        also a kind "near misses: ATTRIBUTE" for each of these attributes.
         """
         texts = {
             caption: text_of(row, caption) for row in self.rows for caption in row.clip.captions

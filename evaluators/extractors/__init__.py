@@ -32,10 +32,10 @@ from flame_mdm.seeds import key
 
 
 class Extractor(ABC):
-    """A network that computes features of motions, and of texts if it supports them."""
+    """A network that computes features of motions and, if it reads text, of captions."""
 
-    # Hash of the weights or files. Values from extractors with different hashes are not
-    # comparable.
+    # Hash of the weights or files. Values computed with extractors that have different hashes are
+    # not comparable.
     sha256: str
     # Fingerprint of the training data, if known
     fingerprint: str | None = None
@@ -46,23 +46,23 @@ class Extractor(ABC):
 
     @abstractmethod
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) of motions; classifiers also return "logits" (B, A).
+        """Returns the "features" (B, E) of motions and, for classifiers, their "logits" (B, A).
 
-        Motions are passed as `features` (B, F, D) in the data's units, and as joint positions
-        `joints` (B, F, J, 3) in meters, y up, both with mask (B, F).
+        Motions are passed both as `features` (B, F, D) in the data's units and as joint positions
+        `joints` (B, F, J, 3) in meters, y up, with the mask (B, F).
         """
 
     def texts(
         self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]
     ) -> Tensor | None:
-        """Returns features (B, E) of captions. Their "word/PART" tokens are passed if known.
+        """Returns the features (B, E) of captions, or None if the extractor does not read text.
 
-        Returns None if the extractor does not read text.
+        `tokens` contains the "word/PART" tokens of each caption, or None if they are unknown.
         """
         return None
 
     def reference(self) -> Tensor | None:
-        """Features (N, E) of the network's own real motions, for comparisons of sets.
+        """Features (N, E) of the network's own real motions, with which sets are compared.
 
         None = sets are compared with motions of the data set.
         """
@@ -99,7 +99,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
             )
 
     def reads(self, other: Representation) -> bool:
-        """Whether the network reads motions in this representation."""
+        """Returns whether the network reads motions in this representation."""
         trained = self.task.representation
         return (trained.name, trained.fps, trained.features) == (
             other.name,
@@ -122,7 +122,7 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
         self.encoded: dict[str, Tensor] = {}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of captions. Each distinct caption is encoded once."""
+        """Returns the features (B, E) of captions. Each distinct caption is encoded only once."""
         new = sorted(set(captions) - self.encoded.keys())
         if new:
             self.encoded |= dict(zip(new, self.task.text(new), strict=True))
@@ -130,10 +130,10 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
 
     @torch.no_grad()
     def fit(self, motions: Sequence[Motion]) -> list[float]:
-        """Returns how well motions fit their texts: the mean cosine similarity over the parts of a motion.
+        """Returns how well motions fit their texts: the mean cosine over the parts of a motion.
 
-        A motion-CLIP overrates motions that it has selected. Evaluate such motions with another
-        motion-CLIP.
+        Because a motion-CLIP overrates motions that it has selected, evaluate such motions with
+        another motion-CLIP.
         """
         scores = []
         for motion in motions:
@@ -153,14 +153,14 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
     trained, recipes = T2MTask, "t2m"
 
     def reads(self, other: Representation) -> bool:
-        """Whether the network reads motions in this representation, or at least the features that both share."""
+        """Returns whether the network reads the representation, or at least the shared features."""
         trained = self.task.representation
         is_part = (other.part_of, other.fps) == (trained.name, trained.fps)
         reads_part = is_part and self.task.network.used <= other.features
         return reads_part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of captions.
+        """Returns the features (B, E) of captions.
 
         They are computed from the words or, if the extractor reads tags, from the tagged words.
         """
@@ -192,11 +192,11 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 
 
 class ReleasedExtractor(Extractor, Generic[Network]):
-    """A network with its authors' released weights, loaded from one file or from a folder of `FILES`."""
+    """A network with its authors' released weights, loaded from a file or a folder of `FILES`."""
 
     FILES: tuple[str, ...] = ()
     network: Network
-    # Names of the representation and the data set that the network was trained on
+    # Names of the representation and the data set on which the network was trained
     made_for: tuple[str, str]
     # The network reads only this many features, starting with the first
     used = 0
@@ -231,11 +231,11 @@ class ReleasedExtractor(Extractor, Generic[Network]):
 
 
 class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
-    """The released evaluator of Guo et al. 2022, or MARDM's first evaluator, from a folder with five files.
+    """The released evaluator of Guo et al. 2022, or MARDM's first evaluator.
 
-    The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_... in MDM,
-    kit_... for KIT, eval_... in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe). `full_length`
-    is a legacy option; see `WordVectors`.
+    It is loaded from a folder with five files: finest.tar (from text_mot_match/model), mean.npy and
+    std.npy (t2m_... in MDM, kit_... for KIT, eval_... in MARDM), our_vab_data.npy and
+    our_vab_idx.pkl (GloVe). `full_length` is a legacy option; see `WordVectors`.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -262,9 +262,10 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
 
 
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
-    """The second evaluator that MARDM released. Its CLIP-score is the `MotionCLIPScore` on its features.
+    """The second evaluator that MARDM released.
 
-    The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
+    MARDM's CLIP-score is the `MotionCLIPScore` computed from the features of this evaluator. The
+    files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
     eval_std).
     """
 
@@ -288,7 +289,7 @@ CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None
     "humanact12_unconstrained": (Unconstrained, None, "humanact12"),
     "uestc": (UESTC, None, "uestc"),
 }
-"""Released action classifiers: the network, the key of the weights in its file, and the data set.
+"""Released action classifiers: the network, the key of the weights in the file, and the data set.
 
 The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
 humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar.
@@ -298,9 +299,9 @@ humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_
 class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
     """A released action classifier (one of `CLASSIFIERS`) that reads 24 SMPL joints or their rotations.
 
-    `random_start` is a legacy option, as in Guo et al. 2020 and all later work: the initial state
-    of the humanact12 GRU is drawn from a normal distribution, separately for features and scores.
-    In this implementation, the draw is a function of the motion.
+    `random_start` is a legacy option that follows Guo et al. 2020 and all later work: the initial
+    state of the humanact12 GRU is drawn from a normal distribution, separately for features and
+    scores. In this implementation, the draw is a function of the motion.
     """
 
     def __init__(

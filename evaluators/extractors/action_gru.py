@@ -12,10 +12,10 @@ NUM_ACTIONS = 12
 class ActionGRU(nn.Module):
     """Action classifier with two GRU layers over joint positions.
 
-    It classifies the state at the last real frame. The released weights provide the features and
-    the accuracy in every HumanAct12 table. The authors draw the initial state from a normal
-    distribution on every call. In this implementation, the initial `state` (layers, B, hidden) is
-    zero by default.
+    The class is predicted from the state at the last real frame. The features and accuracies in all
+    published HumanAct12 tables are computed with the released weights. The authors draw the initial
+    state from a normal distribution on every call, whereas here the initial `state` (layers, B,
+    hidden) is zero by default.
     """
 
     features = 30
@@ -34,12 +34,15 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) in (-1, 1) of joint positions (B, F, J, 3) in meters, y up, with mask (B, F)."""
+        """Returns features (B, 30) in (-1, 1) of joint positions (B, F, J, 3) with mask (B, F).
+
+        The positions are in meters, y up.
+        """
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) of joint positions, y down, relative to the first position of the pelvis."""
+        """Returns features (B, 30) of joint positions, y down, relative to the initial pelvis."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
@@ -49,7 +52,10 @@ class ActionGRU(nn.Module):
         return self.linear2(self(joints, mask, state))
 
     def random_state(self, seeds: Sequence[int]) -> Tensor:
-        """Draws initial states (layers, B, hidden) from a standard normal distribution, as the authors do."""
+        """Draws initial states (layers, B, hidden) from a standard normal distribution.
+
+        The authors' code does the same.
+        """
         shape = (self.recurrent.num_layers, 1, self.recurrent.hidden_size)
         states = [
             torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds

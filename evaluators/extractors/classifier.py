@@ -1,5 +1,5 @@
 # pyright: standard
-"""Training of action classifiers, to evaluate action-to-motion on data sets without a released classifier."""
+"""Training of action classifiers, for evaluations on data sets without a released classifier."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +23,10 @@ from flame_mdm.representations import Representation
 
 
 class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
-    """Trains an action classifier on the joints of any representation (`make train EXP=classifier/...`)."""
+    """Trains an action classifier on the joints of any representation.
+
+    Command: `make train EXP=classifier/...`.
+    """
 
     noun = "an action classifier"
 
@@ -31,7 +34,10 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     def parts(
         cls, config: Config, representation: Representation, actions: Sequence[str]
     ) -> dict[str, Any]:
-        """Returns the network that a recipe describes. Raises `UserError` if the data has fewer than two actions."""
+        """Returns the network that a recipe describes.
+
+        Raises `UserError` if the data has fewer than two actions.
+        """
         if len(actions) < 2:
             raise UserError(
                 f"a classifier needs a data set with at least two actions, but this one has {len(actions)}"
@@ -66,11 +72,11 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
     def _classified(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
         assert batch.action is not None
         joints = self.representation.to_joints(batch.x)
-        past_end = ~batch.mask[..., None, None]  # zeros in the padding may not decode to a pose
+        past_end = ~batch.mask[..., None, None]  # the zeros in the padding may not decode to a pose
         return self.network.logits(joints.masked_fill(past_end, 0), batch.mask), batch.action
 
     def on_validation_epoch_start(self) -> None:
-        """Copies the running statistics of rank 0, which checkpoints contain, to all ranks."""
+        """Copies the running statistics of rank 0, which are saved in checkpoints, to all ranks."""
         if world_size() > 1:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, 0)

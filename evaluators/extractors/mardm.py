@@ -1,7 +1,7 @@
 # pyright: standard
 """The CLIP-score evaluator of MARDM (Meng et al. 2025, "Rethinking Diffusion for Text-Driven Human Motion Generation").
 
-MARDM's other evaluator is `evaluators.extractors.t2m` for 67 features.
+MARDM's other evaluator is the one in `evaluators.extractors.t2m`, with 67 features.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.Transfo
 
 
 class _MotionEncoder(nn.Module):
-    """A transformer with a learned first token, whose output is the embedding of the motion."""
+    """A transformer with a learned first token. Its output is the embedding of the motion."""
 
     def __init__(self, features: int, width: int, transformer: nn.TransformerEncoder):
         super().__init__()
@@ -42,7 +42,7 @@ class _MotionEncoder(nn.Module):
 class MARDMClip(nn.Module):
     """Embeds captions, and the essential features of motions, as vectors of norm 1.
 
-    `mean` and `std` (67,) normalize the features.
+    `mean` and `std` (67,) are used to normalize the features.
     """
 
     mean: Tensor
@@ -78,9 +78,9 @@ class MARDMClip(nn.Module):
         return F.normalize(self.motion_encoder(x, mask), dim=-1)
 
     def text(self, tokens: Tensor) -> Tensor:
-        """Returns vectors (B, 512) of captions.
+        """Returns vectors (B, 512) of captions, which are passed as CLIP tokens (B, S).
 
-        The captions are given as CLIP's tokens (B, S), with 0 after the end.
+        The tokens after the end of a caption are 0.
         """
         hidden = self.text_ln(
             self.textTransEncoder(self.token_embedding(tokens) + self.positional_embedding)
@@ -89,7 +89,7 @@ class MARDMClip(nn.Module):
 
 
 def clip_tokens(captions: Sequence[str]) -> Tensor:
-    """Returns CLIP's tokens (B, 77) of captions, with 0 after the end. Longer captions are truncated."""
+    """Returns CLIP's tokens (B, 77) of captions, padded with 0. Long captions are truncated."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
     encoded = tokenizer(
         list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt"

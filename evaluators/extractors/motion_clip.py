@@ -1,5 +1,8 @@
 # pyright: standard
-"""Motion-CLIP (Kim et al. 2023, "FLAME", table 8): a joint embedding of motions and texts, trained contrastively."""
+"""Motion-CLIP: a contrastively trained joint embedding of motions and texts.
+
+Source: Kim et al. 2023, "FLAME", table 8.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -35,19 +38,19 @@ POOL = 32  # number of pairs in a pool, as in R-precision
 
 
 class MotionCLIP(nn.Module):
-    """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear layer for the pooled text vector.
+    """A transformer over [CLS, length, frame 1, ...], and a linear layer for the pooled text.
 
     The features are not scaled to norm 1, because Fréchet distance and MID use unscaled features.
     The temperature is learned, with an initial value of 0.07.
 
     Args:
-        in_features: number D of features per frame of the motions.
-        text_features: number C of features of the pooled condition.
-        embedding_dim: number E of features in the joint space.
+        in_features: D, the number of features per frame of the motions.
+        text_features: C, the number of features of the pooled condition.
+        embedding_dim: E, the number of features in the joint space.
         blind_features: number of features at the beginning of each frame that are set to 0.
-            FLAME's code sets 3: each frame begins with the root's translation, so scores do not
+            FLAME's code sets the first 3, the translation of the root, to 0, so that scores do not
             depend on position and height.
-        roughness: whether absolute second differences over time, which show noise, are used as
+        roughness: whether absolute second differences over time, which reveal noise, are used as
             additional inputs.
     """
 
@@ -79,7 +82,10 @@ class MotionCLIP(nn.Module):
         self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of normalized motions (B, F, D), F <= `max_frames`, with mask (B, F)."""
+        """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F).
+
+        F must not exceed `max_frames`.
+        """
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
             longest = int(lengths.max())
@@ -111,10 +117,10 @@ def info_nce(
 ) -> Tensor:
     """Contrastive loss over the pairs of all ranks: the mean of both cross-entropies.
 
-    See Oord et al. 2018, eq. 4. The loss is symmetric, as in Radford et al. 2021. Each rank compares its own pairs
-    (B, E) with the motions and texts of all ranks. DDP averages gradients over ranks. If all ranks
-    have the same number of pairs, the averages of losses and gradients equal the loss and gradient
-    of a single rank with all pairs.
+    See Oord et al. 2018, eq. 4. The loss is symmetric, as in Radford et al. 2021. Each rank
+    compares its own pairs (B, E) with the motions and texts of all ranks, and DDP averages
+    gradients over ranks. If all ranks have the same number of pairs, the averages of losses and
+    gradients equal the loss and gradient of a single rank with all pairs.
 
     Args:
         motion: (B, E) features of the motions on this rank.
@@ -122,7 +128,7 @@ def info_nce(
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
-        wrong_text: (B, K, E) features of texts, each a negative for a single motion.
+        wrong_text: (B, K, E) features of texts, each of which is a negative for one motion only.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)
@@ -150,16 +156,16 @@ def _of_all_processes(x: Tensor) -> Tensor:
 
 
 class PooledLoss(SampleMetric):
-    """InfoNCE in pools of 32 pairs, sorted by key.
+    """InfoNCE in pools of 32 pairs, which are sorted by key.
 
-    The pairs of an incomplete last pool are compared with the last 32 pairs.
+    If the last pool is incomplete, its pairs are compared with the last 32 pairs.
     """
 
     higher_is_better = False
     states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
-        """Adds features of norm 1 and the inverse temperature `scale`, a scalar tensor."""
+        """Adds features of norm 1, and the inverse temperature `scale` as a scalar tensor."""
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
@@ -174,7 +180,7 @@ class PooledLoss(SampleMetric):
 
 
 class MotionCLIPTask(ExtractorTask[MotionCLIP]):
-    """Trains motion-CLIP (`make train EXP=motion_clip/...`). FLAME's text encoder is frozen."""
+    """Trains a motion-CLIP (`make train EXP=motion_clip/...`). FLAME's text encoder is frozen."""
 
     noun = "a motion-CLIP"
 
@@ -197,11 +203,11 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
 
     @classmethod
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
-        """Imports the weights of FLAME's released motion-CLIP into a task whose recipe has the same sizes.
+        """Imports the weights of FLAME's released motion-CLIP into a task with the same sizes.
 
-        The weights have the authors' names. The pooler of the text encoder is also imported,
-        because it has random weights from the authors' training. Raises `ValueError` if weights or
-        sizes do not match.
+        The weights have the authors' names. They include the pooler of the text encoder, because it
+        was initialized at random in the authors' training. Raises `ValueError` if weights or sizes
+        do not match.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
@@ -229,7 +235,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def text_features(self, batch: MotionBatch) -> Tensor:
         """Returns features (B, E) of the captions of a batch."""
         cond = self.condition(batch)
-        # A learned null condition is not used here, but DDP requires a gradient for it
+        # A learned null condition is not used here, but DDP requires a gradient for it.
         if cond.null is not None:
             cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
         return self.network.text(cond.pooled)
@@ -262,7 +268,7 @@ _MCLIP = {
 
 
 def our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Renames the weights of FLAME's released network to this project's names, without its RoBERTa.
+    """Renames the weights of FLAME's released network to this project's names, leaving out RoBERTa.
 
     Raises `ValueError` for unexpected weights.
     """

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Motion-CLIP calibrated with near-miss captions and with noisy copies of motions."""
+"""A motion-CLIP that is calibrated with near-miss captions and noisy copies of motions."""
 
 import json
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-# Near-miss captions per motion and step. If possible, each differs in a different attribute.
+# Near-miss captions per motion and step. If possible, each one is wrong in a different attribute.
 NEAR_MISSES = 2
 # Standard deviation, in meters, of noise on the joints at strength 1
 JITTER = 0.02
@@ -36,18 +36,18 @@ LENGTH = 10.0
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
-    """Trains motion-CLIP with distances of a known scale, and with texts that differ in details.
+    """Trains a motion-CLIP whose distances have a known scale, with texts that differ in details.
 
     - Texts: motions of clips with the same captions or attributes are not negatives of each other's
       captions. Near-miss captions (see `near_misses`) are additional negatives.
-    - Motions: half of them have a noisy copy. The strength of its noise is drawn from [0, 1], with
-      small values more often. The distance between a motion and its copy, both scaled to norm 1, is
-      trained to equal this strength. One half of the copies has white noise on the joints and is
-      encoded again, like motions from files. The other half has noise on normalized features, like
-      generated motions.
+    - Motions: half of them are accompanied by a noisy copy. The strength of the noise is drawn from
+      [0, 1], with small values more often, and the distance between a motion and its copy, both
+      scaled to norm 1, is trained to equal this strength. Half of the copies have white noise on
+      the joints and are encoded again, like motions from files. The other half have noise on
+      normalized features, like generated motions.
 
-    All features have the same length. Cosines leave lengths undetermined, which would disturb
-    Euclidean distances.
+    All features have the same length, because cosines leave the length undetermined, which would
+    distort Euclidean distances.
     """
 
     representation: HumanML
@@ -69,7 +69,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns the features (B, E) of motions, scaled to the norm `LENGTH`.
 
-        The motions (B, F, D) are in the data's units and have the mask (B, F).
+        The motions (B, F, D) with mask (B, F) are in the data's units.
         """
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
@@ -128,7 +128,10 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return loss
 
     def near_miss(self, name: str, number: int, step: int) -> str:
-        """Returns a near miss for a clip, or "" if it has none, as a function of (seed, step, clip, number)."""
+        """Returns a near miss for a clip, or "" if it has none.
+
+        The choice is a function of (seed, step, clip, number).
+        """
         attributes = self.near_misses[name] or [[""]]
         draw = key("near miss", self.seed, step, name)
         texts = attributes[(draw + number) % len(attributes)]
@@ -136,9 +139,10 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
 
 def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
-    """Returns the mean absolute difference between the distance of two features (B, E) and `strength` (B,).
+    """Returns the mean absolute difference between the distances of features and `strength` (B,).
 
-    Features are scaled to norm 1 before their distance is computed.
+    The distance between a motion's features (B, E) and its copy's features (B, E) is computed after
+    both are scaled to norm 1.
     """
     distance = torch.linalg.vector_norm(
         F.normalize(motion, dim=-1) - F.normalize(copy, dim=-1), dim=-1
@@ -149,8 +153,9 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
     """Returns noisy copies (B, F, D) of normalized motions.
 
-    Noise is added to the joints in the first half of the motions, and to the features in the second
-    half. `strength` (B,) is the strength of the noise. The noise is drawn from torch's CPU generator.
+    In the first half of the batch, noise is added to the joints; in the second half, to the
+    features. `strength` (B,) is the strength of the noise, which is drawn from torch's CPU
+    generator.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

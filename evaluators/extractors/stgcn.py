@@ -10,17 +10,17 @@ from flame_mdm.representations.skeleton import SMPL24
 
 UNCONSTRAINED_JOINTS = (15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8)
 UNCONSTRAINED_PARENTS = (1, -1, 1, 2, 3, 1, 5, 6, 1, 8, 9, 10, 8, 12, 13)
-"""The 15 (of 24) SMPL joints in MDM's unconstrained evaluation, and their parents, with the neck as root."""
+"""The 15 SMPL joints in MDM's unconstrained evaluation, and their parents. The neck is the root."""
 TEMPORAL_KERNEL = 9
 
 
 def adjacency(parents: Sequence[int]) -> Tensor:
     """Returns matrices (3, V, V) that gather from a vertex, its neighbors, and its neighbors nearer the root.
 
-    Entry (v, w) is the weight of vertex v in vertex w, divided by the number of vertices that
-    contribute to w. In the authors' code, all vertices beyond distance 1 from the root count as
-    equally far from it. The spatial partition of Yan et al. 2018 (section 3.3) therefore affects
-    only the vertices next to the root.
+    Entry (v, w) is the weight of vertex v in the sum for vertex w, divided by the number of
+    vertices that contribute to w. In the authors' code, all vertices beyond distance 1 from the
+    root count as equally far from it. Therefore, the spatial partition of Yan et al. 2018 (section
+    3.3) affects only the vertices next to the root.
     """
     size, root = len(parents), parents.index(-1)
     linked = torch.eye(size)
@@ -40,8 +40,9 @@ class STGCN(nn.Module):
 
     The output is averaged over frames and joints. The dropout of the published training code is
     omitted. Past the end of a motion, the convolutions read zeros, so that features do not depend
-    on the other motions of a batch. In the published evaluations, all motions have 60 frames; short
-    clips repeat their last frame. `widths` and `strides` contain one number per block.
+    on the other motions in a batch. In the published evaluations, all motions have 60 frames, and
+    the last frame of shorter clips is repeated. `widths` and `strides` contain one number per
+    block.
     """
 
     def __init__(
@@ -105,14 +106,17 @@ class _Block(nn.Module):
 
 
 class UESTC(STGCN):
-    """The classifier for UESTC's 40 actions in the tables of ACTOR, MDM and MFM. It reads joint rotations."""
+    """The classifier for UESTC's 40 actions in the tables of ACTOR, MDM and MFM.
+
+    It reads joint rotations.
+    """
 
     def __init__(self):
         widths = (64,) * 4 + (128,) * 3 + (256,) * 3
         super().__init__(SMPL24.parents, 40, widths, (1, 1, 1, 1, 2, 1, 1, 2, 1, 1), channels=6)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of motions (B, F, 150), 25 x 6 features. The root trajectory is ignored."""
+        """Returns features (B, 256) of motions (B, F, 25 x 6). The root trajectory is ignored."""
         return super().forward(x.unflatten(-1, (25, 6))[:, :, :24], mask)
 
 
@@ -123,21 +127,27 @@ class Unconstrained(STGCN):
         super().__init__(UNCONSTRAINED_PARENTS, 12, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joint positions (B, F, 24, 3) in meters, y up. The network expects y down."""
+        """Returns features (B, 256) of joint positions (B, F, 24, 3) in meters, y up.
+
+        The network itself expects y down.
+        """
         return self.published(
             x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask
         )
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joint positions (B, F, 15, 3) as in the reference motions.
+        """Returns features (B, 256) of joint positions (B, F, 15, 3).
 
-        The y axis points down, and the pelvis has index 8.
+        As in the reference motions, the y axis points down, and the pelvis has index 8.
         """
         return super().forward(x - x[:, :, 8:9], mask)
 
 
 class JointSTGCN(STGCN):
-    """A trainable classifier for any skeleton. It reads joint positions relative to the first position of the root."""
+    """A trainable classifier for any skeleton.
+
+    It reads joint positions relative to the root in the first frame.
+    """
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, 256) of joint positions (B, F, J, 3) in meters, with mask (B, F)."""

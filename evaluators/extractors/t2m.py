@@ -2,7 +2,8 @@
 """The evaluator for HumanML3D and KIT-ML.
 
 Source: Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text". The authors'
-code returns embeddings in the order of descending length. This code keeps the order of the input.
+code returns embeddings in descending order of length, whereas this code keeps the order of the
+input.
 """
 
 import itertools
@@ -43,7 +44,7 @@ _SPECIAL_WORDS = {
     "Desc_VIP": "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly",
 }
 SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in words.split()}
-"""Words with a special part of speech, which overrides the tagger's tag."""
+"""Words with a special part of speech, which takes precedence over the tagger's."""
 
 
 class Words(NamedTuple):
@@ -89,8 +90,8 @@ class WordVectors:
 
         Captions are lists of "word/PART" tokens, without start and end marks. Tokens after the 20th
         are dropped. If a word has no vector, both the word and its part of speech are encoded as
-        unknown. `full_length` is a legacy option, as in MFM's code and in MDM's code before January
-        2024: every caption is treated as if it filled all 22 slots, which lowers R-precision.
+        unknown. `full_length` is a legacy option: as in MFM's code and in MDM's code before January
+        2024, every caption is treated as if it filled all 22 slots, which lowers R-precision.
         """
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows, parts = [], []
@@ -105,9 +106,9 @@ class WordVectors:
 
 
 class LearnedWords(nn.Module):
-    """Word vectors learned with the evaluator, for data sets without tagged words.
+    """Word vectors that are learned with the evaluator, for data sets without tagged words.
 
-    The vectors of parts of speech are 0.
+    The vectors for the parts of speech are 0.
     """
 
     def __init__(self):
@@ -116,7 +117,7 @@ class LearnedWords(nn.Module):
         nn.init.normal_(self.table.weight, std=0.3)  # similar to the scale of GloVe vectors
 
     def forward(self, captions: Sequence[Sequence[str]]) -> Words:
-        """Returns the text encoder's input for the words of captions. Words after the 20th are dropped."""
+        """Returns the text encoder's input for lists of words. Words after the 20th are dropped."""
         framed, lengths = zip(*map(frame_tokens, captions), strict=True)
         rows = [
             [hashed(token.partition("/")[0], self.table.num_embeddings) for token in tokens]
@@ -135,9 +136,9 @@ class T2MEvaluator(nn.Module):
 
     The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units, and
     are normalized with the `mean` and `std` (D,) of the released weights. After normalization,
-    motions are padded with zeros to `max_frames`, as in the authors' code for real motions. The
-    convolutions therefore read 3 frames past the end. The network reads the first `used_features`
-    features (67 for MARDM, 64 for KIT); None = all features except the contacts.
+    motions are padded with zeros to `max_frames`, as in the authors' code for real motions, so the
+    convolutions read 3 frames past the end. The network reads the first `used_features` features
+    (67 for MARDM, 64 for KIT); None = all features except the contacts.
     """
 
     mean: Tensor
@@ -166,7 +167,10 @@ class T2MEvaluator(nn.Module):
         self.motion_encoder = _MotionEncoder(movement_latent, motion_hidden, embedding)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns embeddings (B, E) of motions (B, F, D) of 4 to `max_frames` frames, with mask (B, F)."""
+        """Returns embeddings (B, E) of motions (B, F, D) with mask (B, F).
+
+        The motions must have 4 to `max_frames` frames.
+        """
         lengths = mask.sum(1)
         shortest, longest = int(lengths.min()), int(lengths.max())
         if shortest < UNIT or longest > self.max_frames:
@@ -186,7 +190,7 @@ class T2MEvaluator(nn.Module):
 
 
 class _MovementEncoder(nn.Module):
-    """Two convolutions over time, which encode 4 frames as one vector."""
+    """Two convolutions over time, which encode every 4 frames as one vector."""
 
     def __init__(self, in_features: int, hidden: int, latent: int):
         super().__init__()
@@ -202,7 +206,7 @@ class _MovementEncoder(nn.Module):
 
 
 class _Recurrent(nn.Module):
-    """A bidirectional GRU with a learned initial state, whose two final states are mapped to the embedding."""
+    """A bidirectional GRU with learned initial states, whose final states form the embedding."""
 
     def __init__(self, in_features: int, hidden: int, embedding: int):
         super().__init__()
@@ -226,7 +230,7 @@ class _Recurrent(nn.Module):
 
 
 class _MotionEncoder(_Recurrent):
-    """Encodes the features of a motion's movements."""
+    """Encodes a sequence of movement vectors as the embedding of a motion."""
 
     def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
         return self.encode(x, lengths)

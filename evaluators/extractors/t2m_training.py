@@ -1,5 +1,8 @@
 # pyright: standard
-"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`), for data that its released weights do not fit."""
+"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`).
+
+This is for data that the released weights do not fit.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +26,7 @@ from flame_mdm.representations import Representation
 
 
 class _MovementDecoder(nn.Module):
-    """The decoder for the movement encoder: two transposed convolutions decode one vector into 4 frames."""
+    """Inverse of the movement encoder: two transposed convolutions decode a vector to 4 frames."""
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -60,12 +63,13 @@ def reconstruction_terms(
 def matching_loss(
     motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None
 ) -> Tensor:
-    """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
+    """Computes the contrastive loss of Guo et al. 2022 for B pairs, a scalar.
 
-    Returns a scalar for B pairs. Each text is compared with its own motion, and with a wrong
-    motion: the motion of the nearest previous pair that the text does not describe. The wrong
-    motion adds no loss if its distance is larger than `margin`. The authors shift the motions by a
-    random number of rows instead, which also pushes matching pairs apart.
+    The formula is eq. 4 of Hadsell et al. 2006, without its factor 1/2. Each text is compared with
+    its own motion and with a wrong motion: the motion of the nearest previous pair that the text
+    does not describe. The wrong motion adds no loss if its distance is larger than `margin`. The
+    authors shift the motions by a random number of rows instead, which also pushes matching pairs
+    apart.
 
     Args:
         motion: (B, E) features of the motions.
@@ -87,7 +91,7 @@ def matching_loss(
 
 
 class MatchingLoss(SampleMetric):
-    """The `matching_loss` of all pairs, sorted by key."""
+    """The `matching_loss` over all pairs, sorted by key."""
 
     higher_is_better = False
     states = ("generated", "text")
@@ -105,16 +109,18 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
     """Trains the evaluator (`make train EXP=t2m/...`).
 
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct
-    motions. Then the movement encoder is frozen, and the encoders of text and motion are trained
-    to match. A motion counts as wrong for a text only if the text is not among its captions.
-    Checkpoints contain the word vectors.
+    motions. Then the movement encoder is frozen, and the text and motion encoders are trained so
+    that the embeddings of matching pairs are close. A motion counts as wrong for a text only if the
+    text is not among its captions. Checkpoints contain the word vectors.
 
     Args:
         words: folder with our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is read
-            only for training. "learned" = learn the vectors, for data sets whose words are not
-            tagged; see `LearnedWords`.
-        sparsity, smoothness: weights of two losses, the mean magnitude of movement vectors and
-            the mean magnitude of differences between successive vectors.
+            only for training. "learned" = the vectors are learned, for data sets whose words are
+            not tagged; see `LearnedWords`.
+        movement_steps: number of steps for which the movement encoder is trained.
+        sparsity: weight of the mean magnitude of movement vectors in the loss.
+        smoothness: weight of the mean magnitude of differences between successive movement vectors.
+        margin: distance beyond which a wrong motion adds no loss.
     """
 
     noun = "a trained evaluator of Guo et al."
@@ -179,7 +185,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
                 if self.learns_words
                 else clip.attributes.get("tokens", ())
             )
-            # If captions are equal, only the first one counts.
+            # If a clip has equal captions, only the first one counts.
             self.tokens[clip.id] = dict(reversed(list(zip(clip.captions, tagged, strict=False))))
         bare = [name for name, tokens in self.tokens.items() if not tokens]
         if bare:
@@ -192,7 +198,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
 
     @property
     def learns_words(self) -> bool:
-        """Whether the word vectors are trained instead of being read from a file."""
+        """Whether the word vectors are learned instead of read from a file."""
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
@@ -200,7 +206,10 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the word vectors of a checkpoint. Raises `UserError` if a resumed run reads different vectors."""
+        """Restores the word vectors of a checkpoint.
+
+        Raises `UserError` if a resumed run reads different vectors.
+        """
         if self.learns_words:
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):
@@ -210,15 +219,15 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.words = WordVectors(self.facts["words"], state.cpu())
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """Returns features (B, E) of captions.
+        """Returns the features (B, E) of captions.
 
-        The captions are "word/PART" tokens or, if the vectors are learned, words.
+        A caption is a list of "word/PART" tokens or, if the vectors are learned, of words.
         """
         assert self.words is not None
         return self.network.text(self.words(tokens))
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of a batch: first the reconstruction loss, later the motion-text matching loss."""
+        """Returns the loss of a batch: first the reconstruction loss, later the matching loss."""
         self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:
@@ -235,11 +244,14 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
                 *self._embed(batch), self.margin, torch.tensor(fits, device=self.device)
             )
         self.report({"train/loss": loss})
-        # Gives all parameters a gradient, as DDP requires
+        # The second term gives all parameters a gradient, as DDP requires.
         return loss + 0 * sum(parameter.sum() for parameter in self._idle())
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Removes the gradients of idle parameters, which momentum would change even with a gradient of 0."""
+        """Removes the gradients of idle parameters.
+
+        Even with a gradient of 0, momentum would change these parameters.
+        """
         for parameter in self._idle():
             parameter.grad = None
 

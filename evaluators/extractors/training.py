@@ -36,7 +36,7 @@ class ExtractorTask(Task, Generic[Network]):
         seed: int = 0,
     ):
         super().__init__(optimizer=optimizer, seed=seed)
-        # The order of the parts determines the numbering of parameters in saved optimizer states
+        # The order of the parts determines the numbering of parameters in saved optimizer states.
         self.condition, self.representation = condition, representation
         self.network, self.val_metrics = network, nn.ModuleDict()
 
@@ -62,7 +62,7 @@ class ExtractorTask(Task, Generic[Network]):
         return task
 
     def encoder(self) -> ConditionEncoder:
-        """Returns the encoder for the data set's captions."""
+        """Returns the encoder for the captions of the data set."""
         return self.condition
 
     @classmethod
@@ -92,7 +92,7 @@ class ExtractorTask(Task, Generic[Network]):
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
         """Adds a batch to the validation metrics.
 
-        If there are fewer clips than ranks, each rank has all clips, and only rank 0 counts.
+        If there are fewer clips than ranks, each rank has all clips, so only those of rank 0 count.
         """
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return

@@ -1,7 +1,7 @@
 # pyright: standard
 """Metrics for generated motions, as torchmetrics classes.
 
-Every `update` takes some of these inputs by name, for B generated and R real motions.
+Every `update` takes some of these inputs by name. There are B generated and R real motions.
 
 | name | shape | content |
 |---|---|---|
@@ -26,14 +26,14 @@ Every `update` takes some of these inputs by name, for B generated and R real mo
 | nearest, real_nearest | (B, 1 or 2) | distances to the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
-A key is the `flame_mdm.seeds.key` of an id. With several samples per id, the sample index is
-part of the key. Metrics that compare motions one by one (MID, position and displacement errors)
-require real motions in the order of the generated motions.
+A key is the `flame_mdm.seeds.key` of an id. If there are several samples per id, the key also
+depends on the sample index. Metrics that compare motions one by one (MID, position and displacement
+errors) require real motions in the order of the generated motions.
 
-`compute()` returns a number, or a dict of numbers by name. Without samples, it returns None. It
-raises `UserError` if a number would be meaningless, for example if there are too few samples. For
-the same features, values are bit-identical for any batch size, order and number of processes.
-Random draws depend only on `seed`.
+`compute()` returns a number, or a dict of numbers by name. If there are no samples, it returns
+None. It raises `UserError` if a number would be meaningless, for example because there are too few
+samples. For the same features, values are bit-identical for any batch size, order and number of
+processes. Random draws depend only on `seed`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,10 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
-    """Creates metrics by name from mappings with a `_target_`. Each metric receives the `options` that it accepts."""
+    """Creates metrics, by name, from mappings with a `_target_`.
+
+    Each metric receives those `options` that it accepts.
+    """
     metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():
         legal = parameters(config["_target_"]) if "_target_" in config else ()
@@ -87,7 +90,7 @@ def update_metrics(metrics: Mapping[str, Metric], **inputs: Any) -> None:
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> UserError:
-    """Returns the error for a metric whose input `needed` is missing."""
+    """Returns the error to raise for a metric whose input `needed` is missing."""
     return UserError(
         f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
         "choose data, an extractor or a protocol with this input"

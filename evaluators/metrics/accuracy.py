@@ -9,8 +9,8 @@ from evaluators.metrics.samples import SampleMetric
 class ActionAccuracy(SampleMetric):
     """Accuracy: the fraction of motions whose largest logit belongs to their label, in [0, 1].
 
-    Guo et al. 2020 ("Action2Motion"), reported by MDM. Higher is better. `update` takes `logits`
-    (B, A), `labels` (B,) and `keys` (B,).
+    Source: Guo et al. 2020 ("Action2Motion"). MDM reports this metric. Higher is better. `update`
+    takes `logits` (B, A), `labels` (B,) and `keys` (B,).
 
     Example:
         >>> import torch

@@ -16,7 +16,7 @@ TOP = (1, 2, 3)
 
 
 def equally_weighted(values: Tensor) -> Tensor:
-    """Returns (N, 2): the values (N,) in one column, and weights of 1 in the other."""
+    """Returns values (N,) and weights of 1 as two columns, (N, 2)."""
     return torch.stack([values, torch.ones(len(values), dtype=values.dtype)], 1)
 
 
@@ -24,8 +24,9 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct:
     """Returns the rank (N,) of the correct candidate of each query, 0 = first.
 
     The rank is the number of candidates that are closer than the correct candidate, or equally
-    close and earlier in the pool. `pools` (N, P) contains the indices of the candidates (M, E) of
-    each query (N, E). `correct` (N,) is the position of the correct candidate in each pool.
+    close but earlier in the pool. `pools` (N, P) contains, for each query (N, E), the indices of
+    its candidates among the rows of `candidates` (M, E). `correct` (N,) is the position of the
+    correct candidate in each pool.
     """
     pools, correct = pools.to(queries.device), correct.to(queries.device)
     ranks = []
@@ -71,7 +72,9 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns, for each query, the probability that its correct candidate is among the k nearest in a random pool.
+        """Returns, for each query, the probability of a hit at rank k in a random pool, by k.
+
+        A hit means that the correct candidate of the query is among the k nearest candidates.
 
         Args:
             distance: (N, M) distances from queries to candidates.
@@ -97,10 +100,10 @@ class TextsForMotion(RPrecision):
     """R-precision, texts for a motion: is the motion's text among the k nearest of 32 texts?
 
     This is the definition in the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and in
-    FLAME's code. A motion ranks 32 texts by Euclidean distance: its own text, and 31 texts drawn
-    without replacement from other captions. In FLAME's code, a pool is a batch, so the last pool
-    may be smaller. The motion's own text is at a random position, so that an extractor that cannot
-    tell texts apart scores k / 32.
+    FLAME's code. For each motion, 32 texts are ranked by Euclidean distance: its own text, and 31
+    texts drawn without replacement from other captions. In FLAME's code, a pool is a batch, so the
+    last pool may be smaller. The motion's own text is at a random position, so that an extractor
+    that cannot tell texts apart scores k / 32.
 
     Args:
         pool: number of texts in a pool, including the motion's own text.
@@ -115,9 +118,9 @@ class TextsForMotion(RPrecision):
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
         """Returns the rank (N,) of each motion's own text in its pool, 0 = first."""
-        # Each motion draws its other texts from all captions except its own. Drawn indices at or
-        # above its own caption are increased by one. Then its own caption, which is last, swaps
-        # places with a random text.
+        # The other texts of a motion are drawn from all captions except its own: drawn indices at
+        # or above its own caption are increased by one. Then its own caption, which is last, is
+        # swapped with a random text.
         generator = np.random.default_rng(self.seed)
         _, first, correct = np.unique(
             text_keys.cpu().numpy(), return_index=True, return_inverse=True
@@ -145,22 +148,22 @@ class TextsForMotion(RPrecision):
 class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32 motions?
 
-    This is the definition in the code of Guo et al. 2022, which the tables of MDM and MFM use.
-    Test pairs in random order are split into pools of 32. In a pool, each text ranks the motions
-    by Euclidean distance; equal captions may be in the same pool.
+    This is the definition in the code of Guo et al. 2022, which the tables of MDM and MFM use. Test
+    pairs in random order are split into pools of 32, which may contain equal captions. In each
+    pool, the motions are ranked by their Euclidean distance from each text.
 
-    The authors' code drops an incomplete last pool. In this implementation, the texts of an
-    incomplete last pool rank the last 32 motions, so that every text counts once. The authors' code
-    also computes distances in float32. If a motion and its text have the same features, this motion
-    may therefore rank last (square root of a negative number).
+    The authors' code drops an incomplete last pool. In this implementation, the last 32 motions are
+    ranked for the texts of an incomplete last pool, so that every text counts once. The authors'
+    code also computes distances in float32. Therefore, a motion with the same features as its text
+    may rank last (square root of a negative number).
 
     Args:
         pool: number of motions in a pool, including the text's own motion.
         seed: seed of the pools.
         normalize: whether to first scale features to norm 1, so that motions are ranked by cosine.
-            An extractor trained with cosines, such as motion-CLIP, does not constrain the lengths
-            of features. Without normalization, the motions with the shortest features would be
-            nearest to every text.
+            An extractor that was trained with cosines, such as motion-CLIP, does not constrain the
+            lengths of features, so without normalization, the motions with the shortest features
+            would be nearest to every text.
 
     Example:
         >>> metric, features, keys = MotionsForText(pool=3), torch.eye(3), torch.arange(3)
@@ -207,11 +210,11 @@ class MultimodalDistance(SampleMetric):
     """MM-Dist (MFM, eq. 10), the mean Euclidean distance between motions and their texts.
 
     Guo et al. 2022 call it "matching score". Their code computes in float32 and drops an incomplete
-    last batch. In this implementation, every motion counts. Lower is better. `update` takes
+    last batch, whereas in this implementation, every motion counts. Lower is better. `update` takes
     `generated` (B, E), `text` (B, E) and `keys` (B,).
 
     Args:
-        normalize: whether to first scale features to norm 1, for extractors trained with
+        normalize: whether to first scale features to norm 1, for extractors that were trained with
             cosines. The value is then in [0, 2].
 
     Example:
@@ -273,16 +276,16 @@ def pointwise_mutual_information(
 ) -> Tensor:
     """Computes the terms (M,) whose mean is MID, for motions (M, E) generated for texts (M, T).
 
-    Kim et al. 2022, "Mutual Information Divergence". MID is the mean pointwise mutual information
-    of generated motions and their texts, under a normal distribution fitted to real motions (N,
-    E) and their texts (N, T). In float64:
+    Source: Kim et al. 2022, "Mutual Information Divergence". MID is the mean pointwise mutual
+    information of generated motions and their texts, under a normal distribution fitted to real
+    motions (N, E) and their texts (N, T). It is computed in float64:
 
         (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr
         S_z^-1 S_z') / 2
 
-    where x is the motion, y is the text, and z is both. Covariances of generated motions (') are
-    about the means of the real motions. S + eps I is inverted instead of S. The denominators are
-    N - 1 and M - 1.
+    where x is the motion, y is the text, and z is both. The covariances of generated motions,
+    marked by ', are about the means of the real motions. S + eps I is inverted instead of S. The
+    denominators are N - 1 and M - 1.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
     value = real.new_zeros(len(generated))
@@ -299,13 +302,13 @@ def pointwise_mutual_information(
 class MutualInformationDivergence(SampleMetric):
     """MID in nats: the mean of `pointwise_mutual_information` over generated motions.
 
-    Kim et al. 2022. Higher is better. The number of samples must exceed the total number of motion
-    and text features, because otherwise the joint covariance is singular. The authors' code
-    requires only half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B, E) and `keys`
-    (B,); row i of `real` is the real motion of text i.
+    Source: Kim et al. 2022. Higher is better. The number of samples must exceed the total number of
+    motion and text features, because otherwise the joint covariance is singular. The authors' code
+    requires only half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B,
+    E) and `keys` (B,), where row i of `real` is the real motion for text i.
 
     Args:
-        eps: value added to the diagonals of covariances before they are inverted: 5e-4 in FLAME,
+        eps: value added to the diagonals of covariances before they are inverted: 5e-4 in FLAME and
             0 in the authors' release.
 
     Example:
@@ -334,7 +337,10 @@ class MutualInformationDivergence(SampleMetric):
         return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the pointwise mutual information of each motion. Raises `UserError` if there are too few motions."""
+        """Returns the pointwise mutual information of each motion.
+
+        Raises `UserError` if there are too few motions.
+        """
         real, real_text = rows["paired"], rows["paired_text"]
         if len(real) <= real.shape[1] + real_text.shape[1]:
             raise UserError(f"{len(real)} motions are too few to estimate the covariances")

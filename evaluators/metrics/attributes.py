@@ -3,7 +3,7 @@
 
 The attributes are action, side, count, direction, speed and amount. The rules detect what a person
 would see in a clip of a few seconds that shows one action of the synthetic set. Each threshold is
-stated next to its rule. The joints are SMPL's 22 joints.
+explained next to its rule. The joints are SMPL's 22 joints.
 """
 
 import json
@@ -48,20 +48,20 @@ BONES = [
     (19, 21),
 ]
 ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
-# No rule reads these attributes of synthetic clips, so clips with them are not scored
+# No rule reads these attributes of synthetic clips, so clips that have them are not scored.
 UNREAD = (
     "while",
     "ends",
 )
-# No rule reads these actions, so clips with them are not scored
+# No rule reads these actions, so clips that show them are not scored.
 UNDECIDED = MORE.keys() - CHECKED.keys()
 
 
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads the attributes of one clip.
 
-    The rules are tried in order: motions that lower the body, jumps, walks and runs, whole-body
-    actions, then gestures of the arms and the head.
+    The rules are tried in this order: motions that lower the body, jumps, walks and runs,
+    whole-body actions, and gestures of the arms and the head.
 
     Args:
         joints: (F, 22, 3) positions of SMPL's joints in meters, y up. The body may have any
@@ -70,7 +70,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
     Returns:
         "action" and the other `ATTRIBUTES` of the motion, or {} if no action of the set is
-        recognized (for example, in noise) or the joints do not form a body.
+        recognized (for example, in noise) or if the joints do not form a body.
 
     Example:
         >>> read_attributes(np.random.default_rng(0).normal(size=(40, 22, 3)), fps=20)  # noise
@@ -133,7 +133,10 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
 
 def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
-    """Returns the attributes of one clip (F, 22, 3) and, as "checks", the results of the checks in `CHECKED`."""
+    """Returns the attributes of one clip (F, 22, 3) and, under "checks", the results of all checks.
+
+    `CHECKED` lists the checks.
+    """
     seen: dict[str, Any] = dict(read_attributes(joints, fps))
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -146,9 +149,10 @@ def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Whether the joints form a body: limbs are 15 to 60 cm long and vary by less than 25 %, and joints move smoothly.
+    """Returns whether the joints form a body, that is, whether limbs and movements are plausible.
 
-    A joint moves smoothly if it stays within 2 cm of a curve.
+    Limbs must be 15 to 60 cm long and vary by less than 25 %. Joints must move smoothly, within 2
+    cm of a smooth curve.
     """
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
@@ -162,9 +166,9 @@ def _lowered(
 ) -> dict[str, str | int]:
     """Detects crawling, lying down, sitting down and standing up.
 
-    The pelvis is higher than 78 cm if a person is standing, between 35 and 72 cm if a person is
-    sitting, and below 35 cm if a person is lying. The trunk of a person who is lying or crawling is
-    tilted by more than 55 degrees.
+    The pelvis of a standing person is higher than 78 cm, of a sitting person between 35 and 72 cm,
+    and of a lying person below 35 cm. The trunk of a lying or crawling person is tilted by more
+    than 55 degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
@@ -193,7 +197,7 @@ def _locomotion(
     if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
-    # The speed in the middle counts, because walks start and end in a standing pose
+    # The speed in the middle counts, because walks start and end in a standing pose.
     speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)
     ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
     if abs(turned) > 90:
@@ -209,7 +213,11 @@ def _locomotion(
 
 
 def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, str | int]:
-    """Detects kicks: a foot more than 35 cm in front of the pelvis and more than 25 cm above its standing height."""
+    """Detects kicks.
+
+    In a kick, a foot is more than 35 cm in front of the pelvis and more than 25 cm above its height
+    when standing.
+    """
     out = smooth[:, ANKLES] - smooth[:, [PELVIS]]
     ahead = (out[..., [0, 2]] * forward[:, None]).sum(-1)
     high = smooth[:, ANKLES, 1] - floor - 0.06
@@ -224,7 +232,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Detects throws, salutes, raised arms, waves, claps and punches, or standing if none of them is found."""
+    """Detects throws, salutes, raised arms, waves, claps and punches, or else standing."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -272,7 +280,10 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
 
 def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
-    """Counts how often the head pitches forward by more than 32 degrees relative to the shoulders, and back."""
+    """Counts how often the head pitches forward by more than 32 degrees, and back.
+
+    The angle is relative to the shoulders.
+    """
     base = smooth[:, [NECK, *COLLARS, *SHOULDERS]].mean(1)
     head = smooth[:, HEAD] - base - (smooth[:, NECK] - base).mean(0)
     nod = np.degrees(np.arctan2((head[:, [0, 2]] * forward).sum(-1), head[:, 1]))
@@ -280,18 +291,18 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns whether each requested attribute, and each combination of attributes, was read from a motion.
+    """Returns whether each requested attribute or combination of attributes was read from a motion.
 
-    Each action in `CHECKED` is read by its own check. Returns {} for actions without a rule.
+    Actions in `CHECKED` are read by their own checks. Returns {} for actions without a rule.
 
     Args:
         seen: the attributes that `read_all` or `read_attributes` returned.
         requested: the attributes of the request.
 
     Returns:
-        Whether each attribute is right, by name. `action_and_side`: whether both are right or, if
-        no side was requested, whether the action is right. `all`: whether every requested
-        attribute is right.
+        Whether each attribute is right, by name. `action_and_side` states whether both are right
+        or, if no side was requested, whether the action is right. `all` states whether every
+        requested attribute is right.
     """
     if requested["action"] in UNDECIDED or requested.keys() & set(UNREAD):
         return {}
@@ -307,9 +318,9 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 class AttributeAccuracy(Timed, MotionMean):
     """Fraction of motions that show the requested value, by attribute.
 
-    This metric was introduced in this project. There is one value in [0, 1] for each of
-    `ATTRIBUTES`, for `action_and_side` and for `all`. Higher is better. Rules read the attributes
-    from the joints, without a network; see `right_attributes`.
+    This metric was introduced in this project. It has one value in [0, 1] for each of the
+    `ATTRIBUTES`, for `action_and_side` and for `all`. Higher is better. The attributes are read
+    from the joints by rules, without a network; see `right_attributes`.
 
     Args:
         fps: frames per second of the motions.
@@ -332,7 +343,10 @@ class AttributeAccuracy(Timed, MotionMean):
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns, by attribute, whether each motion shows the requested value, and whether one was requested."""
+        """Returns, by attribute, whether motions show the requested value, and whether they count.
+
+        A motion counts if a value was requested.
+        """
         pairs = zip(rows["seen"], rows["requested"], strict=True)
         shown = [right_attributes(json.loads(str(seen)), requested) for seen, requested in pairs]
         weighted: dict[str, Tensor] = {}
@@ -365,10 +379,10 @@ class AttributeAccuracy(Timed, MotionMean):
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     """Determines which side, left or right, a motion from the Bandai set shows.
 
-    For walk-turn-left and walk-turn-right, the side is read from the turn of the body; for
+    For walk-turn-left and walk-turn-right, the side is read from the turn of the body, and for
     walk-left and walk-right, from the direction of travel. For all other contents, it is the side
-    of the hand that rises higher above its shoulder. The side in the name of the content is not
-    used.
+    of the hand that rises higher above its shoulder. The side that is part of the content's name is
+    not used.
 
     Args:
         joints: (F, 22, 3) positions of SMPL's joints in meters, y up.
@@ -390,8 +404,8 @@ class SideAccuracy(Timed, MotionMean):
     """Fraction of motions from the Bandai set that show the requested side, left or right.
 
     This metric was introduced in this project. `hand` covers gestures, `path` covers turns and
-    sideways walks, and `hand_or_path` covers both. Chance level is 0.5; higher is better. Rules
-    read the sides from the joints, without a network; see `read_side`.
+    sideways walks, and `hand_or_path` covers both. Chance level is 0.5; higher is better. The sides
+    are read from the joints by rules, without a network; see `read_side`.
 
     Args:
         fps: frames per second of the motions.

@@ -1,8 +1,8 @@
-"""Checks for individual actions: whether a motion shows an action, and with which side, count or direction.
+"""Checks for individual actions: whether a motion shows one, and its side, count or direction.
 
 `evaluators.metrics.attributes` recognizes 22 actions. Rules cannot tell the other actions apart: a
-hand at the head for half a second may be a drink, a phone call or a scratch. A check therefore only
-verifies that a motion shows the requested action. Thresholds are stated next to the rules.
+hand at the head for half a second may mean a drink, a phone call or a scratch. Therefore, a check
+only verifies that a motion shows the requested action. Thresholds are stated next to the rules.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the forward and left directions (F, 2) on the ground, and the turn to the left in degrees."""
+    """Returns the forward and left directions (F, 2) on the ground, and the left turn (degrees)."""
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]
@@ -34,7 +34,7 @@ def tilt_of(smooth: np.ndarray) -> np.ndarray:
 
 
 def count_rises(signal: np.ndarray, high: float, low: float) -> int:
-    """Counts how often a signal rises above `high` after it was below `low`."""
+    """Counts how often a signal rises above `high` after having been below `low`."""
     count, armed = 0, False
     for value in signal:
         if armed and value > high:
@@ -79,9 +79,9 @@ class View:
         return ((joints - origin)[..., [0, 2]] * self.left[:, None]).sum(-1)
 
     def path(self) -> np.ndarray:
-        """Returns how far the pelvis is to the left and in front of its start, (F, 2).
+        """Returns how far (F, 2) the pelvis is to the left and in front of its starting point.
 
-        Left and front are relative to the heading in the first frame.
+        The directions are relative to the heading in the first frame.
         """
         moved = (self.smooth[:, PELVIS] - self.smooth[0, PELVIS])[:, [0, 2]]
         return np.stack([moved @ self.left[0], moved @ self.forward[0]], -1)
@@ -105,7 +105,7 @@ def _to_head(view: View) -> Shown:
 def _to_front(view: View) -> Shown:
     """Detects a hand that is more than 15 cm in front of its shoulder for 0.4 seconds.
 
-    The hand must also be higher than the elbow of a hanging arm.
+    The hand must also be higher than the elbow would be if the arm were hanging.
     """
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
@@ -114,7 +114,10 @@ def _to_front(view: View) -> Shown:
 
 
 def _point(view: View) -> Shown:
-    """Detects an arm that is stretched to 90 % of its length and within 35 degrees of level for 0.4 seconds."""
+    """Detects an arm that points for 0.4 seconds.
+
+    The arm must be stretched to 90 % of its length and within 35 degrees of the horizontal.
+    """
     side = _raised_hand(view)
     shoulder, elbow, wrist = (view.smooth[:, joint[side]] for joint in (SHOULDERS, ELBOWS, WRISTS))
     length = np.median(
@@ -138,7 +141,10 @@ def _knock(view: View) -> Shown:
 
 
 def _slash(view: View) -> Shown:
-    """Detects a hand that moves from 20 cm above to below the shoulder, and 15 cm inward, within 0.5 seconds."""
+    """Detects a hand that moves downward past the shoulder, and inward, within 0.5 seconds.
+
+    The hand must move from 20 cm above the shoulder to below it, and 15 cm inward.
+    """
     side = _raised_hand(view)
     hand, shoulder = view.smooth[:, [WRISTS[side]]], view.smooth[:, [SHOULDERS[side]]]
     above = (hand - shoulder)[:, 0, 1]
@@ -152,7 +158,10 @@ def _slash(view: View) -> Shown:
 
 
 def _hop(view: View) -> Shown:
-    """Detects hops on one foot and counts the flights. The other foot is 12 cm higher in half of the frames."""
+    """Detects hops on one foot and counts the flights.
+
+    The other foot must be 12 cm higher for 0.4 seconds.
+    """
     toes = view.smooth[:, TOES, 1] - view.floor
     side = int(toes.mean(0).argmin())
     if (toes[:, 1 - side] - toes[:, side] > 0.12).sum() < 0.4 * view.fps:
@@ -197,7 +206,7 @@ def _spin(view: View) -> Shown:
 
 
 def _dodge(view: View) -> Shown:
-    """Detects a path of more than 25 cm sideways or backward, with one quick movement (above 0.6 m/s)."""
+    """Detects a path of more than 25 cm sideways or backward with a peak speed above 0.6 m/s."""
     path = view.path()
     speed = np.linalg.norm(np.gradient(path, 1 / view.fps, axis=0), axis=-1)
     aside, ahead = path[-3:].mean(0)
@@ -209,7 +218,7 @@ def _dodge(view: View) -> Shown:
 
 
 def _strafe(view: View) -> Shown:
-    """Detects a path of more than 33 cm sideways, at least twice as long as its forward or backward part."""
+    """Detects a path of more than 33 cm sideways, at least twice as far as forward or backward."""
     aside, ahead = view.path()[-3:].mean(0)
     if abs(aside) < max(0.33, 2 * abs(ahead)):
         return {}
@@ -217,10 +226,10 @@ def _strafe(view: View) -> Shown:
 
 
 def _limp(view: View) -> Shown:
-    """Determines the leg on which the pelvis sinks while the other foot is in the air, during a walk.
+    """Determines the leg on which a walking person sinks while the other foot is in the air.
 
     The correlation between the height of the pelvis and the difference between the feet's heights
-    exceeds 0.35. In an even walk, it is about 0.
+    must exceed 0.35. In an even walk, it is about 0.
     """
     right_up = view.smooth[:, ANKLES[1], 1] - view.smooth[:, ANKLES[0], 1]
     low = -view.smooth[:, PELVIS, 1]
@@ -253,6 +262,6 @@ CHECKED: dict[str, Callable[[View], Shown]] = {
 
 
 def check(action: str, view: View) -> Shown:
-    """Returns the attributes of a motion if it shows the action (one of `CHECKED`), or {} if it does not."""
+    """Returns the attributes of a motion if it shows an action (one of `CHECKED`), or else {}."""
     shown = CHECKED[action](view)
     return {"action": action, **shown} if shown else {}

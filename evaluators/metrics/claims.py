@@ -1,5 +1,5 @@
 # pyright: standard
-"""Accuracy of the claims in captions, judged by the referee."""
+"""Accuracy with which motions fulfill the claims in their captions, judged by the referee."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -15,7 +15,7 @@ from flame_mdm.sampling.referee.judging import SHORTEST, Verdict, verdicts
 from flame_mdm.sampling.referee.kinds import GROUPS
 from flame_mdm.sampling.referee.sentences import read_claims
 
-# An audit keeps this many seconds of each motion, so that all sets of motions have the same size
+# An audit keeps this many seconds of each motion, so that all sets of motions have the same size.
 KEPT_SECONDS = 10.0
 STEP = 0.0005  # meters per unit of the kept positions
 
@@ -30,12 +30,12 @@ class ClaimAccuracy(Timed, MotionMean):
     """Fraction of decided claims that are true.
 
     This metric was introduced in this project. The referee (`flame_mdm.sampling.referee`) reads the
-    claims in the caption of each motion, and measures each claim on the joints of the motion. The
-    values are fractions in [0, 1] for each group of claims, such as "side" and "count", and for
-    "all" claims; higher is better. "decided" is the fraction of all claims that are decided. "captions" is the
-    fraction of captions with at least one decided claim.
-    Motions that are shorter than 0.5 seconds, or have a skeleton other than SMPL's 22 joints, are
-    not judged.
+    claims in the caption of each motion, and checks each claim by measuring the joints of the
+    motion. The values are fractions in [0, 1] for each group of claims, such as "side" and "count",
+    and for "all" claims; higher is better. "decided" is the fraction of claims that the referee can
+    decide, and "captions" is the fraction of captions with at least one decided claim. Motions that
+    are shorter than 0.5 seconds, or that have a skeleton other than SMPL's 22 joints, are not
+    judged.
 
     Args:
         fps: frames per second of the motions.

@@ -16,7 +16,8 @@ NEIGHBORS = 3
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
     """Computes the Fréchet distance between normal distributions fitted to the rows of a (N, E) and b (M, E).
 
-    In float64: |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982).
+    It is computed in float64 as |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and
+    Landau 1982).
 
     Example:
         >>> a = torch.randn(50, 2, dtype=torch.float64)
@@ -36,12 +37,12 @@ class FrechetMotionDistance(TwoSets):
     """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
     Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
-    means in float32, and uses scipy's `sqrtm` for the product. If `sqrtm` fails, it adds 1e-6 to
-    the diagonals. The relative difference from the values of the authors' code is 1e-8.
+    means in float32 and uses scipy's `sqrtm` for the product; if `sqrtm` fails, 1e-6 is added to
+    the diagonals. The values differ from those of the authors' code by a relative error of 1e-8.
 
-    Lower is better. The value is biased upward, especially with few samples, so compare only values
-    with equal N. `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with
-    `real_keys` (R,).
+    Lower is better. The value is biased upward, especially for few samples, so compare only values
+    for the same number of samples. `update` takes `generated` (B, E) with `keys` (B,), and `real`
+    (R, E) with `real_keys` (R,).
 
     Example:
         >>> metric, real = FrechetMotionDistance(), torch.randn(50, 2)
@@ -56,11 +57,11 @@ class FrechetMotionDistance(TwoSets):
         """Returns the distance between features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
-        # Rounding errors may make the value slightly negative
+        # Rounding errors may make the value slightly negative.
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the distance between two sets in which each motion is repeated as often as it was drawn."""
+        """Computes the distance between sets in which each motion is repeated as often as drawn."""
         generated, real = rows["generated"], rows["real"]
         values = []
         for times in map(torch.from_numpy, weights):
@@ -72,8 +73,8 @@ class FrechetMotionDistance(TwoSets):
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
     """Computes the unbiased squared MMD of a (n, E) and b (n, E) with the kernel (x . y / E + 1)^3.
 
-    Bińkowski et al. 2018, eq. 4. The pairs (i, i) across the sets are included, as in the
-    authors' code.
+    Source: Bińkowski et al. 2018, eq. 4. As in the authors' code, the pairs (i, i) across the sets
+    are included.
 
     Example:
         >>> polynomial_mmd2(torch.ones(4, 1), torch.ones(4, 1)).item()
@@ -94,9 +95,9 @@ class KernelMotionDistance(TwoSets):
 
     Args:
         subsets: number of random subsets.
-        subset_size: number of samples that a subset takes from each set. Neither set may be
-            smaller.
-        replace: whether to draw with replacement. The code of MoDi and MDM does so if there are
+        subset_size: number of samples that a subset takes from each set. Each set must contain at
+            least as many.
+        replace: whether to draw with replacement, as the code of MoDi and MDM does if there are
             more real motions than `subset_size`. Samples that are drawn twice increase the value.
         seed: seed of the draws.
 
@@ -166,10 +167,10 @@ class PrecisionRecall(TwoSets):
     """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
 
     `precision` is the fraction of generated motions in the manifold of the real motions. `recall`
-    is the fraction of real motions in the manifold of the generated motions. Higher is better; see
-    `manifold_coverage`. Neighbor distances shrink with the number of samples, so both sets are
-    truncated to the size of the smaller set, in the order of the keys. The authors' code truncates
-    them in the order of the files.
+    is the fraction of real motions in the manifold of the generated motions; see
+    `manifold_coverage`. Higher is better. Distances between neighbors shrink as the number of
+    samples grows, so both sets are truncated to the size of the smaller set, in the order of the
+    keys. The authors' code truncates them in the order of the files.
 
     `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
 

@@ -16,15 +16,15 @@ def pair_distance(a: Tensor, b: Tensor) -> float:
 def distances(a: Tensor, b: Tensor) -> Tensor:
     """Returns the Euclidean distances (N, M) between features a (N, E) and b (M, E).
 
-    Each distance is computed from the difference of the features, not from products.
+    Each distance is computed from the difference of the features, not from a matrix product.
     """
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
-    """Draws the first and second motions (pairs,) of random pairs of `count` motions.
+    """Draws random pairs of `count` motions. Returns their first and second motions, (pairs,) each.
 
-    The two sides are drawn with or without replacement.
+    Both sides are drawn with or without replacement.
     """
     draw = np.random.default_rng(seed).choice
     return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(
@@ -35,10 +35,10 @@ def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Ten
 class Diversity(SampleMetric):
     """Diversity: mean distance between random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
-    The best value is the diversity of real motions. Published values for text-to-motion use 300
-    pairs, drawn as two sets without replacement. Published values for action-to-motion and
-    unconstrained synthesis use 200 pairs with replacement. In both cases, a motion may be paired
-    with itself. `update` takes `generated` (B, E) and `keys` (B,).
+    The best value is the diversity of real motions. Published values for text-to-motion are
+    computed from 300 pairs, drawn as two sets without replacement; for action-to-motion and
+    unconstrained synthesis, from 200 pairs drawn with replacement. In both cases, a motion may be
+    paired with itself. `update` takes `generated` (B, E) and `keys` (B,).
 
     Args:
         pairs: number of pairs.
@@ -60,7 +60,10 @@ class Diversity(SampleMetric):
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def value(self, features: Tensor) -> float:
-        """Returns the diversity of features (N, E). Raises `UserError` if there are too few motions for the pairs."""
+        """Returns the diversity of features (N, E).
+
+        Raises `UserError` if there are too few motions for the pairs.
+        """
         self.need(
             len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs"
         )
@@ -78,11 +81,11 @@ class Diversity(SampleMetric):
 class TextMultimodality(SampleMetric):
     """Multimodality as in Guo et al. 2022: mean distance between random pairs of motions for each text.
 
-    Source: MDM, B.2; MFM, eq. 12. By default, 10 pairs are drawn from 30 motions for each text.
-    As in the authors' code, two sets of 10 motions are drawn without replacement, with the same
+    Sources: MDM, B.2; MFM, eq. 12. By default, 10 pairs are drawn from 30 motions for each text. As
+    in the authors' code, two sets of 10 motions are drawn without replacement, with the same
     indices for all texts. A motion that is in both sets may be paired with itself. Published values
-    are for 100 texts. The code of MDM and MFM uses whole batches, that is, 128 texts. `update`
-    takes `generated` (B, E), `groups` (B,) and `keys` (B,).
+    are for 100 texts, although the code of MDM and MFM uses whole batches, that is, 128 texts.
+    `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
 
     Args:
         samples: number of motions per text.
@@ -107,7 +110,8 @@ class TextMultimodality(SampleMetric):
     def value(self, features: Tensor, groups: Tensor) -> float:
         """Returns the multimodality of features (N, E).
 
-        Raises `UserError` if a text of `groups` does not have `samples` motions.
+        `groups` (N,) contains the keys of the texts. Raises `UserError` if a text does not have
+        `samples` motions.
         """
         features = features[self.by_group(groups, self.samples)]
         first, second = _random_pairs(self.samples, self.pairs, False, self.seed)
@@ -117,8 +121,9 @@ class TextMultimodality(SampleMetric):
 class PairedMultimodality(SampleMetric):
     """Multimodality as in FLAME (eq. 19): two sets of `samples` motions per text, compared one by one.
 
-    FLAME published no code for this metric. FLAME's Table 3 states 10 motions per text, but eq. 19
-    uses two sets of 10. `update` takes `generated` (B, E), `groups` (B,) and `keys` (B,).
+    FLAME's authors published no code for this metric. According to FLAME's Table 3, there are 10
+    motions per text, but eq. 19 uses two sets of 10. `update` takes `generated` (B, E), `groups`
+    (B,) and `keys` (B,).
 
     Args:
         samples: number of motions per text in each of the two sets.
@@ -141,7 +146,8 @@ class PairedMultimodality(SampleMetric):
     def value(self, features: Tensor, groups: Tensor) -> float:
         """Returns the multimodality of features (N, E).
 
-        Raises `UserError` if a text of `groups` (N,) does not have 2 `samples` motions.
+        `groups` (N,) contains the keys of the texts. Raises `UserError` if a text does not have
+        2 * `samples` motions.
         """
         first, second = features[self.by_group(groups, 2 * self.samples)].chunk(2, dim=1)
         return pair_distance(first, second)
@@ -151,8 +157,9 @@ class ActionMultimodality(SampleMetric):
     """Multimodality as in Guo et al. 2020 (MDM, eq. 7): mean distance between 20 random pairs per class.
 
     As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors
-    divide the sum by the total number of classes. In this implementation, it is divided by the
-    number of classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys` (B,).
+    divide the sum by the total number of classes, whereas this implementation divides it by the
+    number of classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys`
+    (B,).
 
     Args:
         pairs: number of pairs per class.
@@ -194,9 +201,9 @@ class JointVariance(SampleMetric):
 
     For each text, the variance is computed over `samples` motions of equal length, with n - 1 in
     the denominator. It is summed over x, y and z, and averaged over joints, frames and texts. The
-    value is not comparable with FLAME's numbers. FLAME's Table 3 averages "the variance of joints
-    for the 10 generated motions", but eq. 18 defines a variance over the frames of one motion. No
-    code was published.
+    value is not comparable with FLAME's numbers: Table 3 averages "the variance of joints for the
+    10 generated motions", but eq. 18 defines a variance over the frames of one motion, and no code
+    was published.
 
     Args:
         samples: number of motions per text.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Memorization: whether generated motions are closer to training motions than held-out real motions are."""
+"""Memorization: are generated motions closer to training motions than held-out real motions are?"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 from evaluators.metrics.samples import SampleMetric
 
 # Only every fourth frame of a motion is compared, which takes a quarter of the time. The distance
-# of a copy is still 0.
+# between a motion and its copy is still 0.
 STEP = 4
 # A motion counts as a copy if it is closer to a training motion than all but this share of the
 # held-out real motions.
@@ -20,8 +20,8 @@ CLOSE = 0.01
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
     """Returns poses (F, 3J) that do not depend on position and heading, from joint positions (F, J, 3).
 
-    Joints are relative to the pelvis on the ground, and turned so that the body faces +z in every
-    frame.
+    In every frame, joints are relative to the ground point below the pelvis, and the body is turned
+    so that it faces +z.
     """
     right_hip, left_hip, right_shoulder, left_shoulder = facing
     left = (
@@ -39,7 +39,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 
 @dataclass
 class TrainingMotions:
-    """The training motions, which are searched for the nearest neighbor of a motion."""
+    """The training motions, in which `nearest` searches for the nearest neighbors of motions."""
 
     #: (N, 3J) poses of all frames of all motions, concatenated; see `poses`.
     poses: Tensor
@@ -58,10 +58,10 @@ class TrainingMotions:
             features: (B, E) features of the motions, or None.
 
         Returns:
-            (B, 2), or (B, 1) without features. The first column is the root mean square distance
-            (in meters) between the joints of the motion and of the best window of the same length,
-            in every fourth frame. It is infinite if no training motion is long enough. The second
-            column is the distance between the features.
+            (B, 2), or (B, 1) without features. The first column is the root mean square distance,
+            in meters, between the joints of the motion and of the best window of the same length,
+            computed from every fourth frame. It is infinite if no training motion is long enough.
+            The second column is the distance between the features.
         """
         squares = self.poses.square().sum(-1)
         # Number of frames from each frame to the end of its motion
@@ -71,7 +71,7 @@ class TrainingMotions:
         )
         if features is None or self.features is None:
             return of_joints[:, None]
-        # With matrix products, the distance of a copy would consist mainly of rounding errors.
+        # With matrix products, the distance to a copy would consist mainly of rounding errors.
         exact = "donot_use_mm_for_euclid_dist"
         return torch.stack(
             [of_joints, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1
@@ -102,12 +102,12 @@ class NearestTraining(SampleMetric):
     """Distance to the nearest training motion, and the share of copies.
 
     This metric was introduced in this project. A motion counts as a copy if its joints are closer
-    to a training motion than the joints of 99 % of the held-out real motions (all but `CLOSE`). By
-    this definition, about 1 % of real motions are copies, and all motions of a model that repeats
-    the training set are copies.
+    to a training motion than the joints of 99 % of the held-out real motions (all but the share
+    `CLOSE`). By this definition, about 1 % of real motions are copies, whereas all motions are
+    copies if a model repeats the training set.
 
     The values `joints`, in meters, and `features` are the medians of the distances. `copies` is
-    the share of copies, in [0, 1]. `update` takes `nearest` (B, 1 or 2), `real_nearest` (B, 1 or
+    the share of copies, in [0, 1]. `update` takes `nearest` (B, 1 or 2) and `real_nearest` (B, 1 or
     2), both from `TrainingMotions.nearest`, and `keys` (B,).
 
     Example:

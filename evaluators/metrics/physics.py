@@ -20,14 +20,15 @@ class FootSkating(Timed, JointMean):
 
     A toe joint touches the floor if it is below 5 cm in two adjacent frames. It slides if it moves
     more than 2.5 cm over the ground between these frames (Karunratanakul et al. 2023, "Guided
-    Motion Diffusion"). The limit of 2.5 cm applies to 20 frames per second. At other frame rates,
-    the limit corresponds to the same speed, 0.5 m/s. The code released with the paper also requires this
-    speed in the mean of five frames, and averages the ratios of the motions. This metric follows
-    the paper: two frames decide, and every frame transition has the same weight. Lower is better.
+    Motion Diffusion"). This limit applies to 20 frames per second; at other frame rates, the limit
+    corresponds to the same speed, 0.5 m/s. The code released with the paper also requires that the
+    mean speed over five frames exceeds the limit, and it averages the ratios of the motions. This
+    metric follows the paper: only two frames are considered, and every frame transition has the
+    same weight. Lower is better.
 
     Args:
         fps: frames per second of the motions.
-        toes: indices of the toe joints; default: the toes of the 22 SMPL joints.
+        toes: indices of the toe joints. Default: the toes of the 22 SMPL joints.
 
     Example:
         >>> metric, joints = FootSkating(fps=20), torch.zeros(1, 3, 22, 3)
@@ -54,8 +55,8 @@ class FootSkating(Timed, JointMean):
 class Penetration(JointMean):
     """Mean depth of the lowest joint below the floor, y = 0, in meters.
 
-    The mean is over frames; depths up to 5 mm count as 0. Yuan et al. 2023 (PhysDiff) measure the
-    lowest vertex of a mesh instead. Lower is better.
+    The mean is over all frames; depths up to 5 mm count as 0. Yuan et al. 2023 (PhysDiff) measure
+    the lowest vertex of a mesh instead. Lower is better.
 
     Example:
         >>> metric, joints = Penetration(), torch.full((1, 3, 22, 3), -0.25)
@@ -78,8 +79,8 @@ class Penetration(JointMean):
 class Floating(Penetration):
     """Mean height of the lowest joint above the floor, y = 0, in meters.
 
-    The mean is over frames; heights up to 5 mm count as 0. Jumps also count as floating. Lower is
-    better.
+    The mean is over all frames; heights up to 5 mm count as 0. Jumps also count as floating. Lower
+    is better.
 
     Example:
         >>> metric, joints = Floating(), torch.full((1, 3, 22, 3), 0.25)
@@ -95,7 +96,7 @@ class Jitter(Timed, JointMean):
     """Mean jerk of the joints in m/s^3, as in Yi et al. 2022 (PIP).
 
     The jerk is computed from the third difference of the positions. It grows with the frame rate,
-    so compare only values for equal frame rates. Lower is better.
+    so compare only values for the same frame rate. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -118,8 +119,8 @@ class Jitter(Timed, JointMean):
 class StaticShare(Timed, JointMean):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
-    Real data sets also contain static motions of standing people, so compare the value with the
-    value of real motions. Lower is better.
+    Real data sets also contain static motions of standing people, so compare the value for
+    generated motions with the value for real motions. Lower is better.
 
     Args:
         fps: frames per second of the motions.
@@ -134,7 +135,10 @@ class StaticShare(Timed, JointMean):
     higher_is_better = False
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns whether a motion (F, J, 3) is static, as (1,) bool, or an empty tensor for a single frame."""
+        """Returns whether a motion (F, J, 3) is static, (1,) bool.
+
+        The tensor is empty for a single frame.
+        """
         moved = motion.double().diff(dim=0).norm(dim=-1)
-        # The speed is undefined for a single frame
+        # The speed is undefined for a single frame.
         return (moved.mean() * self.fps < STANDING)[None][: len(moved)]

@@ -1,8 +1,8 @@
 # pyright: standard
 """Physics metrics of published benchmarks. The floor is y = 0.
 
-Each benchmark has its own units, thresholds and frame rate. The values are not comparable between
-benchmarks, nor with values from `evaluators.metrics.physics`.
+Each benchmark has its own units, thresholds and frame rate. The values are comparable neither
+between benchmarks nor with values from `evaluators.metrics.physics`.
 """
 
 import math
@@ -23,7 +23,7 @@ FEET = (
     11,
 )
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
-"""FlowMDM's mean jerk of HumanML3D (20 frames per second) and BABEL (30 frames per second), by frame rate."""
+"""FlowMDM's mean jerk of real motions, by frame rate: HumanML3D (20) and BABEL (30 per second)."""
 Values = dict[str, Tensor | float]
 
 
@@ -65,24 +65,24 @@ class PublishedPhysics(Timed, JointMean):
 
 
 class MBenchQuality(PublishedPhysics):
-    """Motion quality of MBench (ViMoGen, bf891de), in meters per frame. Only defined at 20 frames per second.
+    """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, at 20 frames per second.
 
     - `jitter_degree`: mean norm of the second difference of the joint positions, plus the same
       mean for positions relative to the root.
     - `dynamic_degree`: mean norm of the first difference of the joint positions, plus the same mean
-      for relative positions; higher = more motion.
-    - `ground_penetration`: mean depth of the toes that are deeper than 5 mm, or 0 if there are
-      none.
-    - `foot_sliding`: mean horizontal step of toes in contact.
+      for relative positions. A higher value means more motion.
+    - `ground_penetration`: mean depth of the toes that are deeper than 5 mm below the floor, or 0
+      if there are none.
+    - `foot_sliding`: mean horizontal step of the toes in contact.
     - `foot_floating`: number of frames in which the body moves without the support of a foot,
-      divided by the number of all frames. The value can exceed 1.
+      divided by the total number of frames. The value can exceed 1.
 
     A toe is in contact if it moves less than 1 cm per frame, even in the air, or if it is lower
     than 2 cm. The published code uses z as the height, although y is the height in its pipeline.
-    In this implementation, the height is y.
+    This implementation uses y.
 
     Args:
-        fps: frames per second of the motions; at rates other than 20, `compute` raises
+        fps: frames per second of the motions. For rates other than 20, `compute` raises
             `UserError`.
         toes: indices of the left and the right toe.
 
@@ -129,18 +129,18 @@ class MBenchQuality(PublishedPhysics):
 
 
 def mbench_contact(feet: Tensor) -> Tensor:
-    """Returns whether feet (F, 2, 3) are in contact, (F, 2) bool.
+    """Returns whether feet (F, 2, 3) are in contact, as (F, 2) bool.
 
-    The shape is (0, 2) for a single frame.
+    For a single frame, the result has the shape (0, 2).
     """
     speed = _speed(feet)
     return (speed < 0.01) | (feet[: len(speed), :, 1] < 0.02)
 
 
 def _speed(points: Tensor) -> Tensor:
-    """Returns the distances (F, ...) of positions (F, ..., 3) to the next frame, in meters.
+    """Returns the distances (F, ...) that points at (F, ..., 3) move to the next frame, in meters.
 
-    The last distance is repeated. A single frame has no distances.
+    The last distance is repeated. For a single frame, the result is empty.
     """
     speed = points.diff(dim=0).norm(dim=-1)
     return torch.cat([speed, speed[-1:]])
@@ -149,12 +149,13 @@ def _speed(points: Tensor) -> Tensor:
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
     """Counts the frames of `foot_floating` in a motion (F, J, 3).
 
-    The positions of the two feet are (F, 2, 3), and their contacts are (F, 2) bool.
+    `feet` (F, 2, 3) contains the positions of the two feet, and `contact` (F, 2) bool contains
+    their contacts.
 
-    Returns three numbers of frames, one per kind. In frames of the first kind, the feet on the
-    ground do not move like the body. In the second kind, a foot in the air moves much less than the
-    body; these frames count half in the score. In the third kind, both feet swing to and fro in the
-    air.
+    Returns the numbers of frames of three kinds. In the first kind, the feet on the ground do not
+    move in accordance with the body. In the second kind, a foot in the air moves much less than the
+    body; these frames have half the weight in the score. In the third kind, both feet swing to and
+    fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
@@ -175,24 +176,24 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
 
 def _runs(aloft: Tensor) -> list[tuple[int, int]]:
-    """Returns the start and end (exclusive) of each run of at least four True values in a mask (F,)."""
+    """Returns the start and the exclusive end of each run of at least four True values (F,)."""
     runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
     return [(begin, end) for begin, end in runs if end - begin >= 4]
 
 
 class KimodoQuality(PublishedPhysics):
-    """Foot skating of Kimodo (7330e7e), in m/s, from joints and from the contacts that the model predicts.
+    """Foot skating of Kimodo (7330e7e), in m/s, from joints and from predicted contacts.
 
     - `skate_from_height`: mean speed of toes that are lower than 5 cm.
     - `skate_ratio`: fraction of the toes' steps that are faster than 0.2 m/s, among steps that
       begin and end lower than 5 cm.
     - `low`: mean fraction of steps that begin lower than 5 cm. If it is 0, the first two values are
       also 0.
-    - `skate_from_contacts`, `skate_max`: mean and largest speed of heels and toes in contact.
-    - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15
-      m/s and lower than 10 cm); higher is better.
+    - `skate_from_contacts`, `skate_max`: mean and maximum speeds of heels and toes in contact.
+    - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15 m/s
+      and lower than 10 cm). Higher is better.
 
-    Speeds are in three dimensions. A motion of one frame has no speed.
+    Speeds are computed in three dimensions. A motion with a single frame has no speed.
 
     Args:
         fps: frames per second of the motions.
@@ -232,8 +233,8 @@ class KimodoQuality(PublishedPhysics):
             joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
             mask: (B, F) bool, True = real frame.
             keys: (B,) int64, unique keys of the motions.
-            contacts: (B, F, 4) bool, predicted contacts of the feet. If None, values that need
-                contacts are not computed.
+            contacts: (B, F, 4) bool, predicted contacts of the feet. If None, the values that
+                require contacts are not computed.
 
         Raises:
             UserError: If a motion is not finite.
@@ -251,7 +252,7 @@ class KimodoQuality(PublishedPhysics):
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values of a motion (F, J, 3) and, if given, of the contacts (F, 4) bool of its feet."""
+        """Computes the values of a motion (F, J, 3) and, if any, its contacts (F, 4) bool."""
         if len(motion) < 2:
             return {}
         feet = motion[:, self.feet]
@@ -275,16 +276,16 @@ class KimodoQuality(PublishedPhysics):
 class KimodoConstraints(MotionMean):
     """Constraint errors of Kimodo (7330e7e) for edits: distances between kept parts and the real motion.
 
-    Distances are in meters.
+    Distances are in meters and are averaged over motions.
 
-    - `root2d_err`: horizontal distance of the root, in frames that keep the root.
+    - `root2d_err`: horizontal distance between the roots, in frames that keep the root.
     - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
-    - `root2d_acc`: fraction of the frames that keep the root in which this distance is at most
+    - `root2d_acc`: of the frames that keep the root, the fraction in which this distance is at most
       10 cm.
-    - `fullbody_keyframe`: distance of all joints, in frames that keep all joints.
-    - `end_effector`: distance of the kept joints in the other frames.
+    - `fullbody_keyframe`: distance between all joints, in frames that keep all joints.
+    - `end_effector`: distance between the kept joints, in the other frames.
 
-    In Kimodo's code, the user draws the root trajectory. In this implementation, the root
+    In Kimodo's code, the user draws the root trajectory; in this implementation, the root
     trajectory of the real motion is used.
 
     Example:
@@ -343,7 +344,7 @@ class KimodoConstraints(MotionMean):
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
     """Computes the values of `KimodoConstraints` from the offsets (N, 2) or (..., 3) between two motions.
 
-    Values without offsets are NaN.
+    A value is NaN if there are no offsets for it.
     """
     root, full, parts = (offset.norm(dim=-1) for offset in (root, full, parts))
     near = (root <= 0.1).double()
@@ -354,14 +355,14 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
 class PhysicalFootContact(PublishedPhysics):
     """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration without a planted foot.
 
-    The score is the mean over frames of a product of three factors: the horizontal step of each
-    foot in meters per frame (two factors), and the acceleration of the root divided by its largest
-    value. Downward accelerations count as 0. The step of a foot is the smaller step of its ankle
-    and its toe. Motions without acceleration have no value; EDGE's code includes their NaN in the
-    mean. Lower is better.
+    The score is the mean over frames of a product of three factors: the horizontal steps of both
+    feet, in meters per frame, and the acceleration of the root divided by its largest value.
+    Downward accelerations count as 0. The step of a foot is the smaller of the steps of its ankle
+    and its toe. Motions without acceleration have no value, whereas EDGE's code includes their NaN
+    in the mean. Lower is better.
 
     Args:
-        fps: frames per second of the motions; at rates other than 30, `compute` raises
+        fps: frames per second of the motions. For rates other than 30, `compute` raises
             `UserError`.
         feet: indices of the left ankle, left toe, right ankle and right toe.
 
@@ -400,11 +401,11 @@ class TransitionJerk(SampleMetric):
 
     The computation follows FlowMDM's code (e81c67f). The jerk of a frame is the largest L1 norm,
     over joints, of the third difference of the position, in meters per frame^3. A window is
-    centered at the first frame after each change between kept and generated frames, if the motion
-    contains the whole window. The jerk is averaged over windows, frame by frame. `peak` is the
-    maximum of this mean curve. `area` is the sum of its absolute differences from
-    `JERK_OF_REAL_MOTIONS`, and grows with the size of the window. `windows` is the number of
-    windows. At frame rates without an entry in `JERK_OF_REAL_MOTIONS`, there is no area.
+    centered at the first frame after each change between kept and generated frames, provided that
+    the motion contains the whole window. The jerk is averaged over windows, frame by frame. `peak`
+    is the maximum of this mean curve. `area` is the sum of its absolute differences from
+    `JERK_OF_REAL_MOTIONS` and grows with the size of the window; it does not exist at frame rates
+    without an entry there. `windows` is the number of windows.
 
     Args:
         fps: frames per second of the motions.
@@ -466,10 +467,14 @@ class TransitionJerk(SampleMetric):
 
 
 def transition_jerk(window: Tensor) -> Tensor:
-    """Returns the jerk (F - 3,) of the frames of positions (F, J, 3), in meters per frame^3."""
+    """Returns the jerk (F - 3,) of positions (F, J, 3), frame by frame, in meters per frame^3."""
     return window.double().diff(n=3, dim=0).abs().sum(-1).amax(-1)
 
 
 def peak_and_area(curve: Tensor, real: float | None) -> tuple[float, float | None]:
-    """Returns the maximum of a jerk curve, and the sum of its absolute differences from the jerk of real motions."""
+    """Returns the maximum of a jerk curve, and its area.
+
+    The area is the sum of the absolute differences from the jerk of real motions, or None if this
+    jerk is None.
+    """
     return curve.max().item(), None if real is None else (curve - real).abs().sum().item()

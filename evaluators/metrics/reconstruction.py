@@ -1,5 +1,5 @@
 # pyright: standard
-"""Errors of motions relative to the real motion for the same text, or to the motion before an edit."""
+"""Errors relative to the real motion for the same text, or to the motion before an edit."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,10 +18,10 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
     """Returns the positions that TEMOS compares.
 
     The positions are root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3). The
-    motion (F, 21, 3), in KIT units, is placed on the floor. Its root starts at x = z = 0 with a
-    heading along +z. The local positions are the positions of all joints except the root, with each
-    frame moved and turned so that the root is at x = z = 0 and the heading is along +z. `Rifke`
-    defines floor and heading, with the peculiarities of the published code.
+    motion (F, 21, 3), in KIT units, is placed on the floor, and its root starts at x = z = 0 with a
+    heading along +z. The local positions are those of all joints except the root after each frame
+    has been moved and turned so that the root is at x = z = 0 and the heading is along +z. `Rifke`
+    defines the floor and the heading, with the peculiarities of the published code.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -43,7 +43,7 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
     Args:
         joints: (F, J, 3) joint positions in meters.
         root: (F, 3) root positions in meters.
-        parents: parent of each joint, -1 for the root.
+        parents: index of each joint's parent, -1 for the root.
     """
     bones = joints[:, 1:] - joints[:, list(parents[1:])]
     return {"root": root, "trajectory": root[:, [0, 2]], "mean_local": bones, "mean_global": joints}
@@ -53,10 +53,10 @@ class PositionErrors(MotionMean):
     """Base class for position errors: APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
 
     Args:
-        samples: number of motions per text. If there are several motions, as in TEMOS,
-            `best_ape_root`, ... are the errors of the motion with the smallest APE of the root, and
-            `worst_ape_root`, ... are the errors of the motion with the largest APE of the root.
-        upsampling: number of recorded frames per frame of a motion. If it is above 1, motions are
+        samples: number of motions per text. If there are several, as in TEMOS, `best_ape_root` and
+            so on are the errors of the motion with the smallest root APE, and `worst_ape_root` and
+            so on are the errors of the motion with the largest root APE.
+        upsampling: number of recorded frames per frame of a motion. If this is above 1, motions are
             interpolated and compared with the recordings.
     """
 
@@ -89,9 +89,9 @@ class PositionErrors(MotionMean):
             real_joints: (B, F', J, 3) real motions for the same texts, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the generated motions.
-            groups: (B,) int64, keys of the texts; only needed if `samples` is greater than 1.
-            references: B real motions (F'', J, 3) at the frame rate of their recording; only
-                needed for `upsampling`.
+            groups: (B,) int64, keys of the texts. Only required if `samples` is greater than 1.
+            references: B real motions (F'', J, 3) at the frame rate of their recording. Only
+                required if `upsampling` is greater than 1.
 
         Raises:
             UserError: If a motion is not finite or has fewer than two frames, or if required
@@ -135,13 +135,14 @@ class PositionErrors(MotionMean):
         return dict(zip(self.names, values, strict=True))
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns the compared positions of a motion (F, J, 3), by the names of `PARTS`."""
+        """Returns the positions of a motion (F, J, 3) to compare, by the names in `PARTS`."""
         raise NotImplementedError
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Returns the errors of a clip by name.
 
-        "ape" has one value per frame (F,) or, if all clips have equal weight, is the mean over frames.
+        An "ape" error has one value per frame (F,). If all clips have equal weight, it is the mean
+        over frames.
         """
         raise NotImplementedError
 
@@ -150,10 +151,10 @@ class TemosPositionErrors(PositionErrors):
     """APE and AVE of TEMOS (Petrovich et al. 2022), used by FLAME on KIT (eq. 16 to 18, Table 2).
 
     APE is the distance between `temos_parts`, averaged over joints and over all frames of all
-    clips. AVE is the distance between the variances of each coordinate over time (n - 1 in the
-    denominator), averaged over joints, then over clips. The unit of both is 1000 KIT units, which
-    are 1.56 m; the tables call this unit meters. TEMOS compares motions at 100 frames per second,
-    which corresponds to `upsampling=8`.
+    clips. AVE is the distance between the variances of the coordinates over time (n - 1 in the
+    denominator), averaged over joints and then over clips. The unit of both is 1,000 KIT units,
+    that is, 1.56 m, although the tables state meters. TEMOS compares motions at 100 frames per
+    second, which corresponds to `upsampling=8`.
 
     Args:
         samples: number of motions per text; see `PositionErrors`.
@@ -172,7 +173,7 @@ class TemosPositionErrors(PositionErrors):
     units_per_meter = 640.0
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns `temos_parts` of a motion (F, 21, 3), in 1000 KIT units.
+        """Returns the `temos_parts` of a motion (F, 21, 3), in thousands of KIT units.
 
         Raises `UserError` for other skeletons.
         """
@@ -195,14 +196,14 @@ class TemosPositionErrors(PositionErrors):
 class FlamePositionErrors(PositionErrors):
     """APE (in meters) and AVE (in square meters) as in FLAME's code. FLAME's tables do not use them.
 
-    The compared positions are `flame_parts`. The error of the trajectory is the sum of the
+    The positions to compare are `flame_parts`. The error of the trajectory is the sum of the
     distances along its two axes. The local error is the error of the bones. Variances of global
-    positions are averaged over joints before they are compared. Each clip has the same weight.
-    FLAME's joints lack the orientation of the root and start from its translation. In this
-    implementation, `joints` are compared unchanged, and the first joint is the root.
+    positions are averaged over joints before they are compared. Each clip has the same weight. In
+    FLAME's code, joint positions lack the orientation of the root and start from its translation.
+    In this implementation, `joints` are compared unchanged, and the first joint is the root.
 
     Args:
-        parents: parent of each joint of the skeleton, -1 for the root.
+        parents: index of each joint's parent in the skeleton, -1 for the root.
         samples: number of motions per text; see `PositionErrors`.
 
     Example:
@@ -256,7 +257,7 @@ class EditErrors(MotionMean):
         keys: Tensor,
         kept: Tensor | None,
     ) -> None:
-        """Adds the errors of B pairs of motions. The arguments are described in `update`.
+        """Adds the errors of B pairs of motions; see `update` for the arguments.
 
         Two motions are compared up to the end of the shorter one.
         """
@@ -276,7 +277,10 @@ class EditErrors(MotionMean):
         self.add(keys, errors)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool, or {} if there are none."""
+        """Returns the errors of a motion, or {} if there are none.
+
+        `distance` (F, J) contains distances in meters, and `kept` (F, J) bool marks kept joints.
+        """
         raise NotImplementedError
 
 
@@ -284,8 +288,8 @@ class DisplacementErrors(EditErrors):
     """ADE and FDE: mean joint distance in all predicted frames, and in the last one, in meters.
 
     As is usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints
-    and frames of a clip, then over clips. The part that an edit kept is ignored. MFM (Table 3)
-    gives no formula, code or unit for its numbers, which are too large to be in meters. They are
+    and frames of a clip, and then over clips. The part that an edit kept is ignored. MFM (Table 3)
+    states no formula, code or unit for its numbers, which are too large to be in meters and
     therefore not comparable.
 
     Example:
@@ -336,10 +340,10 @@ class DisplacementErrors(EditErrors):
 class KeptDrift(EditErrors):
     """Distance in world coordinates, in meters, by which the kept part of an edit has moved.
 
-    This metric was introduced in this project. `mean` is averaged over the kept joints and frames
-    of a motion, then over motions. `largest` is the maximum over all of them. If features are
-    relative to the root, an edit can keep steps and poses exactly and still move a kept ending,
-    because the ending begins where the new part ends.
+    This metric was introduced in this project. `mean` is the distance averaged over the kept joints
+    and frames of a motion, and then over motions. `largest` is the maximum over all of them. If
+    features are relative to the root, an edit can keep steps and poses exactly and still move a
+    kept ending, because the ending begins where the new part ends.
 
     Example:
         >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)
@@ -377,13 +381,19 @@ class KeptDrift(EditErrors):
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
     def errors_of(self, distance: Tensor, kept: Tensor) -> dict[str, Tensor]:
-        """Returns the mean and the largest distance of the kept joints of a motion, or {} if no joints were kept."""
+        """Returns the mean and the maximum distance of the kept joints of a motion.
+
+        Returns {} if no joints were kept.
+        """
         return (
             {"mean": distance[kept].mean(), "largest": distance[kept].max()} if kept.any() else {}
         )
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `largest` over the motions with kept joints. They are None without such motions."""
+        """Returns `mean` and `largest` over the motions with kept joints.
+
+        Both are None if there are no such motions.
+        """
         drift = sums[counts[:, 0] > 0]
         values = (
             (drift[:, 0].mean().item(), drift[:, 1].max().item()) if len(drift) else (None, None)

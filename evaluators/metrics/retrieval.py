@@ -20,12 +20,12 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.seeds import key
 
-# Captions with a larger cosine count as the same. TMR's threshold of 0.95 applies to (cosine + 1) /
-# 2.
+# Captions whose cosine is larger count as the same. TMR's threshold of 0.95 applies to
+# (cosine + 1) / 2.
 SAME = 0.9
 # Values of k for recall
 TMR_TOP = (1, 2, 3, 5, 10)
-# TMR's number of motions in a batch, and maximum number of dissimilar motions
+# TMR's batch size, and the maximum number of dissimilar motions
 BATCH, DISSIMILAR = 32, 100
 
 
@@ -36,9 +36,9 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of a caption, scaled to norm 1. `config` is an encoder's mapping as JSON.
+    """Returns the vector (C,) of a caption, scaled to norm 1.
 
-    The caption is encoded alone, not in a batch.
+    `config` is an encoder's mapping as JSON. The caption is encoded alone, not in a batch.
     """
     empty = torch.zeros(1, 1, 1)
     with torch.no_grad():
@@ -58,11 +58,13 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 
     Args:
         similarity: (N, N) similarities between texts (rows) and motions (columns).
-        correct: (N, N) bool, symmetric, True = correct pair. The best correct candidate counts.
-            None = only the diagonal is correct.
+        correct: (N, N) bool, symmetric, True = correct pair. If there are several correct
+            candidates, the best one counts. None = only the diagonal is correct.
 
-    Returns recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of motions for
-    texts. The names of the values for the reverse direction, texts for motions, begin with `m2t_`.
+    Returns:
+        When retrieving motions for texts, the recall at several ranks (`t2m_top1` etc., in [0, 1])
+        and the median rank (`t2m_median`, 1 = best). For the reverse direction, the names begin
+        with `m2t_`.
 
     Example:
         >>> values = whole_set_retrieval(torch.eye(4))
@@ -140,8 +142,8 @@ class MultiPositiveRPrecision(CaptionMetric):
 
     This metric was introduced in this project.
 
-    - `topK`: the fraction of texts with a correct motion among the K nearest motions. Ties share
-      their mean rank.
+    - `topK`: the fraction of texts with a correct motion among the K nearest motions. Tied motions
+      share their mean rank.
     - `proper`: R-precision as in information retrieval. A text with R correct motions contributes
       the fraction of them that are among its R nearest motions.
     - `single_topK`: like `topK`, but only the text's own motion counts as correct. Except for ties,
@@ -185,7 +187,14 @@ class MultiPositiveRPrecision(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
-        """Returns the values for features (N, E), keys (N,) of plain captions, and caption embeddings (N, C)."""
+        """Returns the values by name.
+
+        Args:
+            motion: (N, E) features of the motions.
+            text: (N, E) features of the captions.
+            caption_keys: (N,) int64, keys of the plain captions.
+            meaning: (N, C) embeddings of the captions.
+        """
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -205,7 +214,10 @@ class MultiPositiveRPrecision(CaptionMetric):
 
 
 def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | None]:
-    """Computes hit rates, R-precision and chance levels from similarities (N, M) and correctness (N, M)."""
+    """Computes hit rates, R-precision and chance levels.
+
+    `similarity` (N, M) contains similarities, and `correct` (N, M) bool marks the correct pairs.
+    """
     rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
     values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in TOP}
     # In a random order, the first k candidates are k draws without replacement. The probability
@@ -227,20 +239,22 @@ def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | Non
 class TMRRetrieval(CaptionMetric):
     """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), in both directions.
 
-    - `all`: retrieval among all motions. Only the text's own motion counts as correct.
-    - `threshold`: retrieval among all motions. Motions with the same caption also count as correct.
-    - `dissimilar`: retrieval among 100 motions with different captions, or half of all motions if
-      this is less. Without an encoder, there is no value.
-    - `batches`: retrieval in batches of 32. An incomplete last batch is left out. The medians of
-      the batches are averaged.
+    - `all`: retrieval among all motions, where only the text's own motion counts as correct.
+    - `threshold`: retrieval among all motions, where motions with the same caption also count as
+      correct.
+    - `dissimilar`: retrieval among 100 motions with different captions, or among half of all
+      motions if these are fewer. Without an encoder, there is no value.
+    - `batches`: retrieval in batches of 32. An incomplete last batch is left out, and the medians
+      of the batches are averaged.
 
-    Each protocol has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best) of
-    motions for texts. The names of the values for the reverse direction begin with `m2t_`.
+    For each protocol, the values for retrieving motions for texts are the recall (`t2m_top1` etc.,
+    in [0, 1]) and the median rank (`t2m_median`, 1 = best). For the reverse direction, the names
+    begin with `m2t_`.
 
     TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
-    HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the dissimilar
-    subset starts with the first motion by key. The motion whose caption is least similar to the
-    captions already chosen is added next, until the subset is complete.
+    HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the
+    dissimilar subset starts with the first motion by key; the motion whose caption is least similar
+    to the captions chosen so far is added next, until the subset is complete.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
@@ -282,7 +296,14 @@ class TMRRetrieval(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
-        """Returns the values for features (N, E), keys (N,) of plain captions, and caption embeddings (N, C)."""
+        """Returns the values by name.
+
+        Args:
+            motion: (N, E) features of the motions.
+            text: (N, E) features of the captions.
+            caption_keys: (N,) int64, keys of the plain captions.
+            meaning: (N, C) embeddings of the captions.
+        """
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
         same = (caption_keys[None] == caption_keys[:, None]) | (meaning @ meaning.T > SAME)
         values = {

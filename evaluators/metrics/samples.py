@@ -1,5 +1,5 @@
 # pyright: standard
-"""Base classes for metrics. A metric computes its values from all samples, sorted by key."""
+"""Base classes for metrics, which compute their values from all samples, sorted by key."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from torchmetrics.utilities import dim_zero_cat
 from flame_mdm.errors import UserError
 
 Value = float | dict[str, float | None] | None
-"""Result of `compute`: a number or numbers by name, or None if there are no samples."""
+"""Result of `compute`: a number, or numbers by name. None = there are no samples."""
 
 Rows = Mapping[str, Any]
 """Inputs for N motions by their names in `evaluators.metrics`, such as tensors with N rows."""
 
 
 class Declared:
-    """Base class that declares properties of a metric's values, and values for individual samples and resamples.
+    """Base class that declares properties of a metric, and its values for samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
-        units: by name, the units of the values whose unit differs from `unit`.
-        directions: by name, whether higher is better for the values to which `higher_is_better`
+        units: by name, the units of those values whose unit differs from `unit`.
+        directions: by name, whether higher is better for those values to which `higher_is_better`
             does not apply; None = neither direction is better.
         summary: name of the value that summarizes the other values, or None if there is no such
             value.
         audited: names of the values that audits show; None = all values.
         sees_meaning: whether the metric may detect that a motion does not show what was requested.
-        exact: name of the value that reads the requested attributes without a network, or None if
+        exact: name of the value that judges the requested attributes without a network, or None if
             there is no such value.
         depends_on_count: whether the bias of the value depends on the number of motions.
     """
@@ -49,18 +49,18 @@ class Declared:
     depends_on_count = False
 
     def unit_of(self, name: str) -> str:
-        """Returns the unit of the value with this name. The name of a single value is ""."""
+        """Returns the unit of a value. If a metric has only one value, its name is ""."""
         return self.units.get(name, self.unit)
 
     def direction_of(self, name: str) -> bool | None:
-        """Whether higher is better for the value with this name.
+        """Returns whether higher is better for the value with this name.
 
-        None = neither direction is better, or values closer to those of real motions are better.
+        None = neither direction is better, or the best value is the value of real motions.
         """
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns, by name, the metric's readings of motions, which do not depend on the conditions.
+        """Returns, by name, what the metric measures on motions, independently of their conditions.
 
         Each reading is an array with N rows. Metrics computed from features need no readings.
         """
@@ -69,17 +69,18 @@ class Declared:
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
         """Returns the value and the weight (N, 2) of each sample, by the name of the value.
 
-        The metric is the weighted mean. A metric with random pools is also averaged over all draws.
-        Returns {} for metrics without values for individual samples. `rows` contains the inputs of
-        the metric and its `readings`. Raises `UserError` if there are too few samples.
+        The metric is the weighted mean. If it uses random pools, the values are averaged over all
+        possible draws. Returns {} if the metric has no values for individual samples. `rows`
+        contains the inputs of the metric and its `readings`. Raises `UserError` if there are too
+        few samples.
         """
         return {}
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
         """Computes the values (R,) of R resamples of N samples, by name.
 
-        `weights` (R, N) is the number of times that each sample was drawn. `rows` are described
-        in `per_sample`. Returns {} if the metric cannot be resampled.
+        `weights` (R, N) is the number of times that each sample was drawn. See `per_sample` for
+        `rows`. Returns {} if the metric cannot be resampled.
         """
         values = {}
         for name, pairs in self.per_sample(rows).items():
@@ -92,11 +93,11 @@ class Declared:
 class SampleMetric(Declared, Metric):
     """Base class for metrics that compute their value from one row per sample, sorted by key.
 
-    Therefore, the value does not depend on the batches, their order or the number of ranks. A rank
-    may have no samples. `value` is the formula. If a metric draws at random, its argument `seed`
-    determines the draws.
+    Therefore, the value does not depend on the batches, their order or the number of ranks, and a
+    rank may have no samples. Subclasses implement the formula in `value`. If a metric draws at
+    random, its argument `seed` determines the draws.
 
-    A class also declares facts that are needed to interpret its values; see `Declared`.
+    A class also declares the properties that are needed to interpret its values; see `Declared`.
 
     Attributes:
         states: names of the tensors with one row per sample, in the order of the arguments of
@@ -126,15 +127,15 @@ class SampleMetric(Declared, Metric):
 
     @property
     def update_called(self) -> bool:
-        """Always True, so that torchmetrics does not warn about a metric without samples, which returns None."""
+        """Always True, so that torchmetrics does not warn about a metric without samples."""
         return True
 
     def update(self, *_: Any, **rows: Any) -> None:
         """Stores a batch of B samples.
 
         Args:
-            rows: one keyword argument per state, and `keys` (B,) int64, all with B rows.
-                `evaluators.metrics` lists shapes and units.
+            rows: one keyword argument per state, and `keys` (B,) int64, all with B rows. The
+                docstring of `evaluators.metrics` lists shapes and units.
 
         Raises:
             ValueError: If the arguments have different numbers of rows.
@@ -146,13 +147,16 @@ class SampleMetric(Declared, Metric):
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
-        """Returns the metric computed over all samples. Without samples, it (or each of its values) is None."""
+        """Returns the metric computed over all samples.
+
+        If there are no samples, the metric (or each of its values) is None.
+        """
         rows = self.rows("keys", *self.states)
         return self.value(*rows) if rows else self.nothing
 
     @property
     def nothing(self) -> Value:
-        """The value without samples: None, or a mapping from each name to None."""
+        """The value if there are no samples: None, or a mapping from each name to None."""
         return dict.fromkeys(self.names) if self.names else None
 
     def value(self, *rows: Any, **_: Any) -> Value:
@@ -160,7 +164,7 @@ class SampleMetric(Declared, Metric):
         raise NotImplementedError
 
     def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
-        """Computes the value of samples drawn with replacement, for a bootstrap.
+        """Computes the value for samples drawn with replacement (bootstrap).
 
         Args:
             drawn: (N,) indices of the drawn samples, in the order in which they were added.
@@ -173,9 +177,9 @@ class SampleMetric(Declared, Metric):
         return [values.double() if values.is_floating_point() else values for values in rows]
 
     def rows(self, keys: str, *names: str) -> list[Tensor]:
-        """Returns the rows, which must be finite, sorted by key, or [] if there are no rows.
+        """Returns the stored rows, sorted by key, or [] if there are no rows.
 
-        Floats are returned as float64.
+        The rows must be finite. Floating-point numbers are returned as float64.
         """
         if not getattr(self, keys):
             return []
@@ -193,7 +197,10 @@ class SampleMetric(Declared, Metric):
         return sorted_rows if len(order) else []
 
     def order(self, keys: str) -> Tensor:
-        """Returns the indices that sort samples by their keys. Raises `UserError` if two samples have the same key."""
+        """Returns the indices that sort samples by their keys.
+
+        Raises `UserError` if two samples have the same key.
+        """
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         if twice := int((values[1:] == values[:-1]).sum()):
             raise self.error(
@@ -232,7 +239,7 @@ class SampleMetric(Declared, Metric):
         """
         frames = joints.detach()[mask]
         motions = list(frames.split(mask.sum(1).tolist()))
-        # A sum is finite only if all numbers are finite, and is faster to check.
+        # The sum is finite only if all numbers are finite, and checking it is faster.
         if not frames.sum().isfinite():
             bad = sum(not bool(motion.isfinite().all()) for motion in motions)
             raise self.error(
@@ -243,7 +250,7 @@ class SampleMetric(Declared, Metric):
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
         """Gathers the rows of all ranks.
 
-        The default implementation of torchmetrics fails if a rank has no rows.
+        This replaces torchmetrics' implementation, which fails if a rank has no rows.
         """
         states = {name: [rows.cpu() for rows in getattr(self, name)] for name in self._reductions}
         group = process_group or self.process_group
@@ -276,8 +283,8 @@ class MotionMean(SampleMetric):
 
         Args:
             keys: (B,) int64, unique keys of the motions.
-            motions: B numbers or tensors, such as one number per frame. If the metric has
-                `names`, B mappings from names to numbers or tensors. NaN or missing values are
+            motions: B numbers or tensors, such as one number per frame. If the metric has `names`,
+                B mappings from names to numbers or tensors. Values that are NaN or missing are
                 undefined and are not counted.
             more: additional states with B rows each.
         """
@@ -296,7 +303,10 @@ class MotionMean(SampleMetric):
         return self.means(*rows)
 
     def means(self, sums: Tensor, counts: Tensor) -> Any:
-        """Returns the mean of all values, by name if the metric has `names`, or None if there are no values."""
+        """Returns the mean of all values, by name if the metric has `names`.
+
+        The mean is None if there are no values.
+        """
         totals = zip(sums.sum(0).tolist(), counts.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in totals]
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
@@ -328,7 +338,7 @@ class JointMean(MotionMean):
     def measure(self, motion: Tensor) -> Any:
         """Computes the values of a motion (F, J, 3), by name if the metric has `names`.
 
-        NaN or missing values are undefined.
+        Values that are NaN or missing are undefined.
         """
         raise NotImplementedError
 
@@ -367,7 +377,7 @@ class TwoSets(SampleMetric):
         real: Tensor | None = None,
         real_keys: Tensor | None = None,
     ) -> None:
-        """Adds features of generated and of real motions, together or separately.
+        """Adds features of generated motions and of real motions, together or separately.
 
         Args:
             generated: (B, E) features of generated motions.
@@ -392,5 +402,5 @@ class TwoSets(SampleMetric):
         return self.value(*generated, *real) if generated and real else self.nothing
 
     def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
-        """Computes the value of samples (N,) and real motions (M,) drawn with replacement, for a bootstrap."""
+        """Computes the value for samples (N,) and real motions (M,) drawn with replacement."""
         return self.value(*self._taken(drawn, "generated"), *self._taken(real_drawn, "real"))

@@ -266,7 +266,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
-    """Groups results with the same protocol, data and extractor. Returns run labels and results."""
+    """Groups results by protocol, data and extractor. Returns run labels and results by title."""
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, run in runs.items():
         for result in run.results.values():

@@ -72,7 +72,7 @@ def evaluate(request: EvaluationRequest) -> None:
 class Evaluation:
     """Evaluates a split of a data set under a protocol.
 
-    All ranks create and run it together.
+    All ranks must create and run it together.
     """
 
     # Protocol to follow
@@ -372,7 +372,7 @@ class Evaluation:
     ) -> Motions:
         """Returns motions with the conditions of their rows.
 
-        `captions`, if not None, replace the captions of the rows.
+        If `captions` is not None, it replaces the captions of the rows.
         """
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None

@@ -186,7 +186,10 @@ class Perturbation:
     grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation (or one per kind) with its possible grades, or [] without any."""
+        """Returns the perturbation (or one per kind) with all possible grades.
+
+        Returns [] if no grade is possible.
+        """
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:

@@ -101,7 +101,7 @@ def mean_ci(values: Sequence[float]) -> tuple[float, float | None]:
 
 
 def mean_cost(costs: Sequence[Cost]) -> Cost:
-    """Returns the mean cost over replications, with None if a replication used no model."""
+    """Returns the mean cost over replications. Values are None if a replication used no model."""
     values = {name: [getattr(cost, name) for cost in costs] for name in Cost.model_fields}
     return Cost(
         **{
@@ -163,7 +163,7 @@ def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
 def _checkpoint(plan: Plan) -> Checkpoint | None:
     """Describes the checkpoint, including how it was selected from its run.
 
-    This selection is read from the file name.
+    The selection is inferred from the file name.
     """
     model, file = plan.model, plan.file
     if model is None or file is None:

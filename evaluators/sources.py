@@ -194,7 +194,7 @@ class Generator:
     def _edit(self, rows: Sequence[DrawnClip], parts: Mapping[str, Any]) -> Edit:
         """Returns the edit: the real motions for the rows, and the parts of them to keep.
 
-        The padding is part of the kept parts, as zeros.
+        The padding is also kept, as zeros.
         """
         representation, longest = self.model.representation, max(len(row.frames) for row in rows)
         real, keep = [], []

@@ -206,7 +206,7 @@ class _MovementEncoder(nn.Module):
 
 
 class _Recurrent(nn.Module):
-    """A bidirectional GRU with learned initial states, whose final states form the embedding."""
+    """A bidirectional GRU with a learned initial state, and a network that embeds its end states."""
 
     def __init__(self, in_features: int, hidden: int, embedding: int):
         super().__init__()

@@ -1,8 +1,5 @@
 # pyright: standard
-"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`).
-
-This is for data that the released weights do not fit.
-"""
+"""Trains Guo et al.'s evaluator (see `t2m`) on data that its released weights do not fit."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,7 +60,7 @@ def reconstruction_terms(
 def matching_loss(
     motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None
 ) -> Tensor:
-    """Computes the contrastive loss of Guo et al. 2022 for B pairs, a scalar.
+    """Computes the contrastive loss of Guo et al. 2022 over B pairs. Returns a scalar.
 
     The formula is eq. 4 of Hadsell et al. 2006, without its factor 1/2. Each text is compared with
     its own motion and with a wrong motion: the motion of the nearest previous pair that the text

@@ -304,8 +304,8 @@ class MutualInformationDivergence(SampleMetric):
 
     Source: Kim et al. 2022. Higher is better. The number of samples must exceed the total number of
     motion and text features, because otherwise the joint covariance is singular. The authors' code
-    requires only half as many samples. `update` takes `generated` (B, E), `text` (B, E), `real` (B,
-    E) and `keys` (B,), where row i of `real` is the real motion for text i.
+    requires only half as many samples. `update` takes `generated` (B, E), `text` (B, E),
+    `real` (B, E) and `keys` (B,), where row i of `real` is the real motion for text i.
 
     Args:
         eps: value added to the diagonals of covariances before they are inverted: 5e-4 in FLAME and

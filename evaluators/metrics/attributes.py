@@ -48,7 +48,7 @@ BONES = [
     (19, 21),
 ]
 ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
-# No rule reads these attributes of synthetic clips, so clips that have them are not scored.
+# No rule reads these attributes of synthetic clips, so clips with such an attribute are not scored.
 UNREAD = (
     "while",
     "ends",
@@ -166,9 +166,9 @@ def _lowered(
 ) -> dict[str, str | int]:
     """Detects crawling, lying down, sitting down and standing up.
 
-    The pelvis of a standing person is higher than 78 cm, of a sitting person between 35 and 72 cm,
-    and of a lying person below 35 cm. The trunk of a lying or crawling person is tilted by more
-    than 55 degrees.
+    The pelvis of a standing person is above 78 cm, the pelvis of a sitting person is between 35 and
+    72 cm, and the pelvis of a lying person is below 35 cm. The trunk of a lying or crawling person
+    is tilted by more than 55 degrees.
     """
     pelvis, tilt = smooth[:, PELVIS, 1] - floor, tilt_of(smooth)
     first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
@@ -190,7 +190,7 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Detects walks and runs, which move more than 33 cm from their start and lift both ankles by 4 cm."""
+    """Detects walks and runs: the body moves by more than 33 cm, and both ankles rise by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Accuracy with which motions fulfill the claims in their captions, judged by the referee."""
+"""Share of the claims in captions that are true of the motions, as judged by the referee."""
 
 from collections.abc import Sequence
 from functools import lru_cache

@@ -22,9 +22,9 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
-    """Draws random pairs of `count` motions. Returns their first and second motions, (pairs,) each.
+    """Draws random pairs of `count` motions. Returns the indices (pairs,) of both sides.
 
-    Both sides are drawn with or without replacement.
+    Each side is drawn with or without replacement.
     """
     draw = np.random.default_rng(seed).choice
     return torch.from_numpy(draw(count, pairs, replace)), torch.from_numpy(

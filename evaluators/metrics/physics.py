@@ -135,9 +135,9 @@ class StaticShare(Timed, JointMean):
     higher_is_better = False
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns whether a motion (F, J, 3) is static, (1,) bool.
+        """Returns whether a motion (F, J, 3) is static, as (1,) bool.
 
-        The tensor is empty for a single frame.
+        For a single frame, the result is empty.
         """
         moved = motion.double().diff(dim=0).norm(dim=-1)
         # The speed is undefined for a single frame.

@@ -138,7 +138,7 @@ def mbench_contact(feet: Tensor) -> Tensor:
 
 
 def _speed(points: Tensor) -> Tensor:
-    """Returns the distances (F, ...) that points at (F, ..., 3) move to the next frame, in meters.
+    """Returns how far (F, ...) points at positions (F, ..., 3) move to the next frame, in meters.
 
     The last distance is repeated. For a single frame, the result is empty.
     """

@@ -62,7 +62,7 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
             candidates, the best one counts. None = only the diagonal is correct.
 
     Returns:
-        When retrieving motions for texts, the recall at several ranks (`t2m_top1` etc., in [0, 1])
+        For retrieval of motions by text: the recall at several ranks (`t2m_top1` etc., in [0, 1])
         and the median rank (`t2m_median`, 1 = best). For the reverse direction, the names begin
         with `m2t_`.
 
@@ -247,9 +247,9 @@ class TMRRetrieval(CaptionMetric):
     - `batches`: retrieval in batches of 32. An incomplete last batch is left out, and the medians
       of the batches are averaged.
 
-    For each protocol, the values for retrieving motions for texts are the recall (`t2m_top1` etc.,
-    in [0, 1]) and the median rank (`t2m_median`, 1 = best). For the reverse direction, the names
-    begin with `m2t_`.
+    For each protocol, the values are the recall (`t2m_top1` etc., in [0, 1]) and the median rank
+    (`t2m_median`, 1 = best) of the retrieval of motions by text. For the reverse direction, the
+    names begin with `m2t_`.
 
     TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
     HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the

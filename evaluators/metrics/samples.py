@@ -275,7 +275,7 @@ class MotionMean(SampleMetric):
     """
 
     states = ("sums", "counts")
-    #: Names of the values of a motion, if `names` contains additional names.
+    #: Names of the values measured on a motion, if `names` also contains other names.
     parts: Sequence[str] = ()
 
     def add(self, keys: Tensor, motions: Sequence[Any], **more: Tensor) -> None:

@@ -221,8 +221,8 @@ def _mdm_recipe(kind: str, released: Released, args: Options) -> tuple[Config, d
     }
     if kind == "mfm":
         solver = args.ode_kwargs
-        # All methods except dopri5 are Euler's method. "euler" uses torchdiffeq's float32 times,
-        # the others use i / N.
+        # All methods except dopri5 are Euler's method: "euler" with torchdiffeq's float32 times,
+        # and the others with the times i / N.
         process["odeint_grid"] = solver.method == "euler"
         config["task"]["sampler"] = "dopri5" if solver.method == "dopri5" else "euler"
         config["task"]["num_inference_steps"] = int(1 / solver.step_size)

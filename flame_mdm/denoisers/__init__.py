@@ -22,8 +22,8 @@ class Denoiser(nn.Module, ABC):
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
         num_heads: number of attention heads, which must divide `latent_dim`.
-        dropout: probability of dropout after the positional encoding and inside the layers, in [0,
-            1).
+        dropout: probability of dropout after the positional encoding and inside the layers, from 0
+            to 1 (exclusive).
         project_condition: False adds the condition to the time embedding without a projection, as
             MDM does with action embeddings. C must then equal `latent_dim`.
 

@@ -31,8 +31,8 @@ class FLAME(Denoiser):
         length_token: False omits ML (table 4, first row).
         cross_attention: False builds a transformer encoder over ML, TS, CLS and frames (table 4,
             first two rows).
-        condition_frames: also add TS and CLS to every frame. A small network then learns to
-            follow the text in fewer steps.
+        condition_frames: whether to also add TS and CLS to every frame. A small network then learns
+            to follow the text in fewer steps.
         length_unit: ML embeds the length rounded down to a multiple of this number of frames,
             because the lengths of training windows are such multiples.
 

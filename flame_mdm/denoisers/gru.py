@@ -22,9 +22,9 @@ class MDMGRU(Denoiser):
         num_layers: number of layers of the GRU.
         dropout: probability of dropout after the positional encoding.
         project_condition: False adds the condition to the time embedding without a projection.
-        recur_over_batch: recur from sample to sample instead of from frame to frame, as MDM's
-            released code does because its axes are swapped. This option is only for reproduction:
-            results then depend on the order of the samples in the batch.
+        recur_over_batch: whether to recur from sample to sample instead of from frame to frame, as
+            MDM's released code does because its axes are swapped. This option is only for
+            reproduction: results then depend on the order of the samples in the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

@@ -30,8 +30,8 @@ class MDMEncoder(Denoiser):
             positional encoding of the frames does not depend on the number of tokens.
         mask_padding: False lets frames attend to padding, as in the released models of MDM and
             MFM. Motions are then sampled with the padded length of training, and cropped.
-        condition_frames: also add time + condition to every frame or, with `max_tokens`, only the
-            time. A small network then learns to follow the text in fewer steps.
+        condition_frames: whether to also add time + condition (or, with `max_tokens`, only the
+            time) to every frame. A small network then learns to follow the text in fewer steps.
 
     Example:
         >>> denoiser = MDMEncoder(6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0)
@@ -119,8 +119,8 @@ class MDMDecoder(Denoiser):
         input_token: content of the token before the frames, if any. "condition" is time +
             condition, as in the paper's "+ input token" and in the released model. "time" is only
             the time, as in MDM's code since February 2025.
-        token_memory: use all condition tokens as memory, and add the time to each of them, as MDM
-            does with DistilBERT.
+        token_memory: whether to use all condition tokens as memory, with the time added to each of
+            them, as MDM does with DistilBERT.
         memory: how the time enters a memory of all tokens: "add" adds it to each token, and
             "concat" places it before them as a separate token.
         mask_padding: False lets frames attend to padding, as in the released models without
@@ -129,9 +129,9 @@ class MDMDecoder(Denoiser):
         target_encoder: network that embeds `Condition.target`. Its output is added to the time
             embedding. "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
-        condition_frames: also add time + condition to every noisy frame. A small network then
-            learns to follow the text in fewer steps, and noisy frames can be distinguished from
-            clean frames.
+        condition_frames: whether to also add time + condition to every noisy frame. A small network
+            then learns to follow the text in fewer steps and can distinguish noisy frames from
+            clean ones.
 
     Raises:
         UserError: If arguments contradict each other.

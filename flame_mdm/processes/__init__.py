@@ -178,14 +178,14 @@ class Process(nn.Module, ABC):
 
         Raises:
             UserError: If the process does not support the sampler, the number of steps or the
-                edit, or if the sampler lacks one of the options.
+                edit, or if the sampler does not have one of the options.
         """
 
     def find_sampler(self, options: SamplerOptions) -> Sampler:
         """Returns the requested sampler.
 
         Raises:
-            UserError: If there is no such sampler, or if it lacks one of the options.
+            UserError: If there is no such sampler, or if it does not have one of the options.
         """
         name = options.sampler
         if name is None or name not in self.samplers:
@@ -204,7 +204,7 @@ class Process(nn.Module, ABC):
     def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
         """Raises `UserError` if this process or the sampler does not support an edit.
 
-        An error is also raised if the shape of the edit differs from the shape of the motions.
+        The same error is raised if the shape of the edit differs from the shape of the motions.
         """
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)

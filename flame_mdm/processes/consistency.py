@@ -39,7 +39,7 @@ def consistency_terms(
             motion or the velocity.
         student: the network to train.
         follower: the network that computes the target (the estimate after the step), without
-            gradient. It is the student or an average of its weights.
+            gradient. It is the student itself, or a copy with the average of its weights.
         teacher: the guided teacher.
         x: (B, F, D) normalized clean motion.
         mask: (B, F) bool, True = real frame.
@@ -52,8 +52,8 @@ def consistency_terms(
     Returns:
         Per-sample losses (B,) by name: "consistency", the auxiliary losses, and their sum, "loss".
     """
-    # The step follows the teacher's path to the next time, from the teacher's clean estimate and
-    # the noise that this estimate implies.
+    # The step follows the teacher's path to the next time. It is computed from the teacher's clean
+    # estimate and the noise that this estimate implies.
     is_last = index == len(times) - 1
     t, end = times[index], times[(index + 1).clamp(max=len(times) - 1)]
     x_t = process.corrupt(x, noise, t)

@@ -38,19 +38,19 @@ class GaussianDiffusion(Process):
             the variance is learned. L_vlb is a sum over T steps, so it is computed as T times the
             term of one step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to 1 in
             FLAME's code.
-        average_padding: average losses over the padded length with zero noise in the padding, as
-            in FLAME's code. Short motions then have less weight. The denoiser must return 0 in
-            the padding.
-        clip_x0: clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
+        average_padding: whether to average losses over the padded length, with zero noise in the
+            padding, as in FLAME's code. Short motions then have less weight. The denoiser must
+            return 0 in the padding.
+        clip_x0: whether to clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
         timestep_sampling: distribution of the training steps (FLAME, tables 6 and 7).
-        skip: add a skip connection around the network; requires the prediction "epsilon". The
-            predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al. 2022, eq.
-            7, for data of variance 1). The output is then a velocity, but it is trained with the
-            error of the noise. The network need not pass its input through, and the clean estimate
-            is computed without division by the signal.
-        min_snr: weight the squared error of each step as if the clean motion were predicted with
-            weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None = weight 1,
-            regardless of the prediction.
+        skip: whether to add a skip connection around the network, which requires the prediction
+            "epsilon". The predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras
+            et al. 2022, eq. 7, for data of variance 1). The output is then a velocity, but it is
+            trained with the error of the noise. The network need not pass its input through, and
+            the clean estimate is computed without division by the signal.
+        min_snr: maximum weight of a step. The squared error is weighted as if the clean motion were
+            predicted with weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None =
+            every step has weight 1, regardless of the prediction.
         noise_scale: factor by which the noise-to-signal ratio of each step is multiplied. With 263
             features that depend on each other, the text is informative only at high noise. A factor
             above 1 assigns more steps to high noise (Hoogeboom et al. 2023, section 2.2).

@@ -28,11 +28,11 @@ class FlowMatching(Process):
         time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal",
             the logistic function of a normal variable, which favors the middle (Esser et al. 2024,
             eq. 19).
-        quantize_time: pass floor(1000 t) to the denoiser as a row index of the time table, as in
-            MFM's code.
-        odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in
-            MFM's code. For some N, the table row of a time is then one lower than with N equal
-            steps. This never happens for N = 10, 20 or 30.
+        quantize_time: whether to pass floor(1000 t) to the denoiser, as a row index of the time
+            table, as in MFM's code.
+        odeint_grid: whether to use float32 multiples of 1 / N as times, like torchdiffeq's Euler
+            steps in MFM's code. For some N, the table row of a time is then one lower than with N
+            equal steps. This never happens for N = 10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).

@@ -19,7 +19,7 @@ If the denoiser depends only weakly on x_t, longer steps make x_t unlike the noi
 training. In one experiment, arms became a third longer.
 """
 CLOSE, MOST_STEPS = 0.005, 8
-"""Limits for the search for a motion that reaches positions.
+"""Limits of the search for a motion that reaches the requested positions.
 
 The search ends when the error is below `CLOSE` meters, or after `MOST_STEPS` steps.
 """
@@ -113,8 +113,8 @@ def steer(
     Args:
         clean: function that returns the clean estimate (B, F, D) of a noisy motion.
         x_t: (B, F, D) noisy motions.
-        to_joints: function that converts normalized features (B, F, D) to joint positions (B, F, J,
-            3) in meters.
+        to_joints: function that converts normalized features (B, F, D) to joint positions
+            (B, F, J, 3) in meters.
         positions: the positions that the motions should approach.
 
     Returns:

@@ -210,7 +210,7 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
 def blended(
     sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor
 ) -> Tensor:
-    """Samples with an edit of mode "x_t".
+    """Samples with an edit whose mode is "x_t".
 
     At each step, the kept part is replaced by the known motion with the current amount of noise.
     With the blend "after", the kept part of the first x_t has the initial noise, as if a previous

@@ -35,9 +35,9 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns the noise variances (T,) float64 of the linear schedule (Ho et al. 2020, section 4).
 
-    For T = 1000, the variances increase from 1e-4 to 0.02. For other T, they are scaled by 1000 /
-    T, so that the final noise is the same, as in guided-diffusion. All variances are clipped at
-    0.999.
+    For T = 1000, the variances increase from 1e-4 to 0.02. For other T, they are multiplied by
+    1000 / T, so that the final noise is the same, as in guided-diffusion. All variances are clipped
+    at 0.999.
 
     Example:
         >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]
@@ -191,8 +191,8 @@ def timesteps(
         num_inference_steps: N, from 1 to T.
         spacing: "linspace" includes both ends and rounds half to even; the code of MDM and FLAME
             calls it "N", following Nichol and Dhariwal 2021. "stride" counts from 0 with the
-            smallest integer stride that gives N steps, so the noisiest step may be well below T -
-            1; their code calls it "ddimN", following Song et al. 2021.
+            smallest integer stride that gives N steps, so the noisiest step may be well below
+            T - 1; their code calls it "ddimN", following Song et al. 2021.
 
     Returns:
         N increasing steps in the range 0 ... T - 1.

@@ -37,8 +37,8 @@ def blended(denoise: Denoise, windows: Windows) -> Denoise:
         windows: the windows; see `cover`.
 
     Returns:
-        A function (x_t (B, F, D), t (B,), mask (B, F), cond of W windows) -> blended output (B,
-        F, out_features).
+        A function (x_t (B, F, D), t (B,), mask (B, F), cond of W windows) -> blended output
+        (B, F, out_features).
     """
 
     def blend(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:

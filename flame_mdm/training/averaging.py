@@ -49,7 +49,8 @@ class MovingAverage(WeightAveraging):
     def averaged(self) -> Any:
         """Returns the copy of the task that contains the averaged weights.
 
-        During validation, the two are swapped, and the copy contains the trained weights.
+        During validation, the copy contains the trained weights instead, because the task uses the
+        averaged ones.
         """
         assert self._average_model is not None
         return self._average_model.module

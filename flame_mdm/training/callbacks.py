@@ -44,7 +44,7 @@ from flame_mdm.training.provenance import device_name
 
 # Number of training clips whose metrics are compared with the metrics of samples
 REAL = 64
-# Number of motions without a prompt
+# Number of motions to sample if there are no prompts
 UNCONDITIONED = 4
 # Motions that differ by less than this number of meters count as the same. Even if a model has
 # learned little, its samples for different prompts differ by more.
@@ -322,7 +322,7 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Returns whether motions differ by less than `SAME`, so that the input is clearly ignored.
+    """Returns whether motions differ by less than `SAME`, that is, the network ignores its input.
 
     If the learning rate is too high, the network may learn to return the same pose for all prompts
     and noise. Its loss is finite and even decreases slightly, so curves do not show the failure.

@@ -35,7 +35,7 @@ class NoProfiler(PassThroughProfiler):
 
 
 def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
-    """Replaces the hooks of each step that do nothing with None, so that Lightning does not call them.
+    """Sets hooks that do nothing to None, so that Lightning does not call them in every step.
 
     There are six hooks per step, most of which callbacks do not override. Calling a hook takes
     longer than many of torch's operations.

@@ -22,7 +22,7 @@ PAD_MULTIPLE = 32
 
 The network is compiled once per padded length.
 """
-# Maximum number of lengths and modes for which the network is compiled. The default of torch is 8.
+# Maximum number of lengths and modes for which the network is compiled. Torch's default is 8.
 MOST_SHAPES = 64
 
 

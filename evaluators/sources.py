@@ -389,7 +389,7 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
     frames = {name: content[name] for name in ("features", "joints") if name in content}
     if not {"ids", "lengths"} <= content.keys() or not frames:
         raise UserError(
-            f"{path}: needs ids, lengths and features or joints, but contains {[*content]}"
+            f"{path}: must contain ids, lengths, and features or joints, but contains {[*content]}"
         )
     ids, lengths, captions = (
         content["ids"],

@@ -320,7 +320,7 @@ def test_bad_options_are_named(subtests) -> None:
         (lambda: MDMEncoder(D, D, C, **three_heads), r"latent_dim \(16\) .* num_heads \(3\)"),
         (
             lambda: MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False),
-            "needs latent_dim=12",
+            "requires latent_dim=12",
         ),
         (lambda: MDMUNet(D, D, C, **unet, num_groups=3), r"num_groups \(3\)"),
         (lambda: decoder(*batch(tokens=0)), "the condition encoder has none"),

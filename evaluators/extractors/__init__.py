@@ -198,7 +198,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
     network: Network
     # Names of the representation and the data set on which the network was trained
     made_for: tuple[str, str]
-    # The network reads only this many features, starting with the first
+    # Number of features that the network reads, starting with the first one
     used = 0
 
     def __init__(self, path: str):
@@ -358,7 +358,7 @@ class UnconstrainedExtractor(ClassifierExtractor):
         self.real = torch.from_numpy(read_unconstrained(self.path / self.FILES[1])).to(device)
 
     def reference(self) -> Tensor:
-        """(N, 256) features of the reference motions."""
+        """Features (N, 256) of the reference motions."""
         assert isinstance(self.network, Unconstrained)
         mask = torch.ones(self.real.shape[:2], dtype=torch.bool, device=self.real.device)
         pairs = zip(self.real.split(64), mask.split(64), strict=True)

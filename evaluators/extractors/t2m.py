@@ -201,7 +201,7 @@ class _MovementEncoder(nn.Module):
         self.out_net = nn.Linear(latent, latent)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, F, D) -> (B, F // 4, latent)."""
+        """Encodes motions (B, F, D) as vectors (B, F // 4, latent)."""
         return self.out_net(self.main(x.transpose(1, 2)).transpose(1, 2))
 
 

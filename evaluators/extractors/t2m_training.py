@@ -35,7 +35,7 @@ class _MovementDecoder(nn.Module):
         self.out_net = nn.Linear(out_features, out_features)
 
     def forward(self, latents: Tensor) -> Tensor:
-        """(B, N, latent) -> (B, 4 N, out_features)."""
+        """Decodes vectors (B, N, latent) to frames (B, 4 N, out_features)."""
         return self.out_net(self.main(self.in_net(latents).transpose(1, 2)).transpose(1, 2))
 
 

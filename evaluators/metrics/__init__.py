@@ -12,8 +12,8 @@ Every `update` takes some of these inputs by name. There are B generated and R r
 | logits | (B, A) | class scores of generated motions |
 | labels | (B,) int64 | requested classes |
 | groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
-| requested | B mappings | requested attributes, see `attributes` |
-| sides | B pairs of strings | requested content and side (Bandai set only), see `attributes` |
+| requested | B mappings | requested attributes; see `attributes` |
+| sides | B pairs of strings | requested content and side (Bandai set only); see `attributes` |
 | joints | (B, F, J, 3) | joint positions of generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
 | contacts | (B, F, 4) bool | generated contacts of `skeleton.feet`, if the features contain them |
@@ -23,7 +23,7 @@ Every `update` takes some of these inputs by name. There are B generated and R r
 | real_joints | (B, F, J, 3) | joint positions of real motions in meters, y up, floor at y = 0 |
 | real_mask | (B, F) bool | True = real frame of a real motion |
 | real_keys | (R,) int64 | unique keys of real motions |
-| nearest, real_nearest | (B, 1 or 2) | distances to the nearest training motion, see `memorization` |
+| nearest, real_nearest | (B, 1 or 2) | distances to the nearest training motion; see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
 A key is the `flame_mdm.seeds.key` of an id. If there are several samples per id, the key also

@@ -118,7 +118,7 @@ def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[st
             result[prefixes[theirs] + key.removeprefix(theirs)] = value
     if unknown:
         raise ValueError(
-            f"released weights: unknown keys {_listed(unknown)}: not a network of this kind"
+            f"released weights: not a network of this kind, because it has unknown keys {_listed(unknown)}"
         )
     return result
 
@@ -130,11 +130,11 @@ def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size
     """
     if key not in state:
         raise ValueError(
-            f"released weights: {key} is missing: not a network of this kind, or a damaged file"
+            f"released weights: {key} is missing, so the network is of another kind or the file is damaged"
         )
     if state[key].ndim != ndim:
         raise ValueError(
-            f"released weights: {key} has shape {tuple(state[key].shape)}, not {ndim} dimensions"
+            f"released weights: {key} has shape {tuple(state[key].shape)}, but expected {ndim} dimensions"
         )
     return state[key].shape
 

@@ -93,7 +93,7 @@ class GaussianDiffusion(Process):
     ):
         super().__init__()
         if prediction != "epsilon" and skip:
-            raise UserError("skip=true needs prediction=epsilon")
+            raise UserError("skip=true requires prediction=epsilon")
         if min_snr is not None and not 0 < min_snr < math.inf:
             raise UserError(f"min_snr={min_snr}: expected a number above 0, such as 5, or null")
         self.schedule = build_schedule(schedule, num_train_timesteps, noise_scale)

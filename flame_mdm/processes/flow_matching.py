@@ -74,7 +74,7 @@ class FlowMatching(Process):
         self.quantize_time, self.odeint_grid = quantize_time, odeint_grid
 
     def out_features(self, features: int) -> int:
-        """Returns D."""
+        """Returns D, because no variance is learned."""
         return features
 
     def training_times(self, u: Tensor) -> Tensor:
@@ -139,7 +139,7 @@ class FlowMatching(Process):
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
             raise UserError(
-                f"num_inference_steps={count}: a flow takes equal steps. Set it to a number of steps"
+                f"num_inference_steps={count}: a flow takes equal steps. Set it to one whole number"
             )
         if edit is not None:
             self.check_edit(edit, mask, options)

@@ -58,7 +58,10 @@ class DistillationTask(GeneratorTask):
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Loads the teacher and copies its weights. Raises `UserError` if it is missing or does not match."""
+        """Loads the teacher and copies its weights.
+
+        Raises `UserError` if the teacher is missing or does not match the student.
+        """
         options = self.config["distillation"]
         name = options["teacher"]
         try:

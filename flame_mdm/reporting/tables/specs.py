@@ -91,7 +91,7 @@ class RowSpec(Options):
     @model_validator(mode="after")
     def _source_and_options(self) -> Self:
         if len({"ckpt", "baseline", "from_samples"} & self.model_fields_set) != 1:
-            raise ValueError("a row needs one of ckpt, baseline and from_samples")
+            raise ValueError("a row must have one of ckpt, baseline and from_samples")
         for name in SWEPT:
             if [] in (getattr(self, name), *as_list(getattr(self, name))):
                 raise ValueError(f"{name} contains an empty list. Remove this list")
@@ -153,7 +153,7 @@ class Spec(ClosedSchema):
             part = self.parts.get(figure.part)
             if part is None or figure.x not in ABOUT:
                 raise ValueError(
-                    f"a figure needs a part of the table and an x, one of {', '.join(ABOUT)}"
+                    f"a figure must have a part of the table and an x, which is one of {', '.join(ABOUT)}"
                 )
             for column in figure.y:
                 if column not in part.columns:

@@ -118,7 +118,8 @@ def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[st
             result[prefixes[theirs] + key.removeprefix(theirs)] = value
     if unknown:
         raise ValueError(
-            f"released weights: not a network of this kind, because it has unknown keys {_listed(unknown)}"
+            "released weights: not a network of this kind, because it has unknown keys "
+            f"{_listed(unknown)}"
         )
     return result
 
@@ -130,11 +131,13 @@ def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size
     """
     if key not in state:
         raise ValueError(
-            f"released weights: {key} is missing, so the network is of another kind or the file is damaged"
+            f"released weights: {key} is missing, so the network is of another kind or the file is "
+            "damaged"
         )
     if state[key].ndim != ndim:
         raise ValueError(
-            f"released weights: {key} has shape {tuple(state[key].shape)}, but expected {ndim} dimensions"
+            f"released weights: {key} has shape {tuple(state[key].shape)}; expected {ndim} "
+            "dimensions"
         )
     return state[key].shape
 

@@ -171,7 +171,8 @@ class TimeAndCondition(nn.Module):
         super().__init__()
         if cond_features and not project_condition and cond_features != features:
             raise UserError(
-                f"project_condition=false requires latent_dim={cond_features}, the width of the condition"
+                f"project_condition=false requires latent_dim={cond_features}, the width of the "
+                "condition"
             )
         self.features, self.cond_features = features, cond_features
         self.time_embedding = nn.Sequential(

@@ -60,7 +60,8 @@ class SplitTarget(TargetEncoder):
         super().__init__()
         if features % SLOTS:
             raise UserError(
-                f"target_encoder=split requires a latent_dim that is a multiple of {SLOTS}, not {features}"
+                f"target_encoder=split requires a latent_dim that is a multiple of {SLOTS}, not "
+                f"{features}"
             )
         self.networks = nn.ModuleList(
             perceptron(4, features // SLOTS, layers) for _ in range(SLOTS)

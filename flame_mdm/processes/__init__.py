@@ -224,5 +224,6 @@ class Process(nn.Module, ABC):
         shapes = [tuple(x.shape) for x in (edit.known, edit.keep, mask)]
         if shapes[0] != shapes[1] or shapes[0][:2] != shapes[2]:
             raise UserError(
-                f"the shape of the edit does not match the motions: known, keep and mask have shapes {shapes}"
+                "the shape of the edit does not match the motions: known, keep and mask have shapes "
+                f"{shapes}"
             )

@@ -153,7 +153,8 @@ class Spec(ClosedSchema):
             part = self.parts.get(figure.part)
             if part is None or figure.x not in ABOUT:
                 raise ValueError(
-                    f"a figure must have a part of the table and an x, which is one of {', '.join(ABOUT)}"
+                    "a figure must have a part of the table and an x, which is one of "
+                    f"{', '.join(ABOUT)}"
                 )
             for column in figure.y:
                 if column not in part.columns:

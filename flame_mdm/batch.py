@@ -41,7 +41,7 @@ class MotionBatch:
 
     @property
     def lengths(self) -> Tensor:
-        """Number of real frames of each motion, (B,) int64."""
+        """Number of real frames in each motion, (B,) int64."""
         return self.mask.sum(1)
 
     def __len__(self) -> int:
@@ -73,8 +73,8 @@ class Condition:
         tokens: (B, S, C), one vector per word piece, or S = 0 if the encoder returns no tokens.
         token_mask: (B, S) bool, True = real token. If the null condition has no mask (None), a
             sample keeps its own mask when its condition is replaced by the null condition.
-        null: the null condition, which stands for "no condition" and has batch size 1, or None if
-            the encoder has no null condition.
+        null: the null condition ("no condition"), with batch size 1, or None if the encoder has
+            none.
         prefix: (B, P, D), normalized features of the P clean frames before the motion, or None if
             no frames precede it.
         target: (B, 8, 4), where the motion should end (see `flame_mdm.conditions.target`), or None
@@ -99,7 +99,7 @@ class Condition:
     def drop(self, drop: Tensor) -> Condition:
         """Replaces the conditions of some samples with the null condition.
 
-        Only the text or action is replaced, not the prefix and the target.
+        Only the text or action is replaced, not the prefix or the target.
 
         Args:
             drop: (B,) bool, True = replace the condition of this sample.
@@ -138,7 +138,7 @@ class Condition:
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
 
     def select(self, rows: Tensor) -> Condition:
-        """Returns the conditions of the N samples with the indices `rows` (N,), int64."""
+        """Returns the conditions of the samples whose indices are `rows` (N,), int64."""
 
         def selected(x: Tensor | None) -> Tensor | None:
             return None if x is None else x[rows]
@@ -181,9 +181,8 @@ class Edit:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature in this frame.
         mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t" replaces
-            the kept part of the noisy sample with the known motion, to which the same amount of
-            noise is added (FLAME, RePaint). "trajectory" overwrites the early part of the flow's
-            path (MFM).
+            the kept part of the noisy sample with the known motion at the same noise level (FLAME,
+            RePaint). "trajectory" overwrites the beginning of the flow's path (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
         blend: for "x_t", when the kept part is replaced: "after" each step (FLAME, eq. 6), so that
             the result contains the known motion itself, or "before" each call of the denoiser
@@ -191,9 +190,9 @@ class Edit:
         resample: for "x_t", how many times each step is repeated. Noise is added again before each
             repetition (RePaint, algorithm 1).
         guide: for "x0", a guide toward a goal, which changes the clean estimate at each step before
-            the kept part overwrites it. None = no goal.
-        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`
-            with the noise level of the first of these steps (SDEdit). MDM's code sets the number of
+            the kept part is imposed. None = no goal.
+        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`,
+            noised to the level of the first of these steps (SDEdit). MDM's code sets the number of
             skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. If `strength`
             is None, sampling starts from pure noise.
 
@@ -222,7 +221,7 @@ class Edit:
         return torch.where(self.keep, self.known, x0_hat)
 
     def steps(self, total: int) -> int:
-        """Returns how many of the `total` sampling steps are taken, which is at least one."""
+        """Returns how many of the `total` sampling steps to take (at least one)."""
         return total if self.strength is None else max(1, round(self.strength * total))
 
 
@@ -248,7 +247,7 @@ def pad_to(x: Tensor, size: int) -> Tensor:
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
     """Returns a bool mask (B, F) in which the first `lengths` (B,) frames of each motion are True.
 
-    `frames` is F, by default the maximum length.
+    `frames` is F; it defaults to the maximum length.
 
     Example:
         >>> length_mask(torch.tensor([1, 2])).tolist()
@@ -271,7 +270,7 @@ def padded_length(length: int, multiple: int, most: int) -> int:
 def sent(x: Tensor, device: torch.device) -> Tensor:
     """Moves a tensor to a device.
 
-    A copy to a GPU does not wait until the GPU has finished earlier work.
+    Copies to a GPU do not wait for earlier work on the GPU.
     """
     copied = device.type == "cuda" and x.device.type == "cpu"
     return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
@@ -280,8 +279,8 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 class Constant:
     """Constant numbers, stored in one tensor per device.
 
-    They are not registered as a buffer of a module, so that casting a model, or building it on the
-    meta device, does not change them.
+    They are not stored in a module's buffer, so they do not change when a model is cast or is built on the
+    meta device.
 
     Example:
         >>> table = Constant([1.0, 2.0])
@@ -296,7 +295,7 @@ class Constant:
     def on(self, device: torch.device) -> Tensor:
         """Returns the numbers as a tensor on a device.
 
-        Only the first call per device waits for a copy.
+        Only the first call for a device waits for a copy.
         """
         if device not in self.tensors:
             # The first call may happen during validation, but training cannot use inference
@@ -312,10 +311,10 @@ def collate(
     """Collates samples into a batch, padded with zeros.
 
     Args:
-        samples: (id, normalized features (F, D), caption, action) of each motion.
+        samples: (id, normalized features (F, D), caption, action) for each motion.
         multiple: the length of the longest sample is rounded up to a multiple of this number of
             frames.
-        most: maximum number of frames after rounding. Samples that are longer are not cut.
+        most: maximum number of frames after rounding. Longer samples are not cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])

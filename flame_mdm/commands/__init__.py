@@ -58,7 +58,7 @@ def motion_file(key: str, source: str) -> None:
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """Prints the errors of failed motions, if any, and then exits with code 1.
+    """If motions failed, prints their errors and exits with code 1.
 
     `done` is the participle in the error message, such as "converted".
     """
@@ -93,7 +93,7 @@ def device_name(key: str, device: str) -> None:
 
 
 def video(key: str, requested: bool) -> None:
-    """Checks that MP4 files can be written, if they are requested."""
+    """If MP4 files are requested, checks that they can be written."""
     if requested and find_spec("av") is None:
         raise UserError(
             f'{key}=true: MP4 requires the av package. Run pip install "flame-mdm[video]", or write a GIF'
@@ -161,7 +161,7 @@ def read_motions(
 ) -> tuple[str, int, Iterator[Motion]]:
     """Returns the name of a file or folder, its number of motions, and the motions themselves.
 
-    The errors of files in a folder that cannot be read are added to `failures`.
+    If a file in the folder cannot be read, its error is added to `failures`.
     """
     from flame_mdm.formats.readers import read
 
@@ -198,7 +198,7 @@ class BodySettings:
     )
 
     def read_body(self) -> Mesh | None:
-        """Reads `body`, and returns None for the mannequin, which is the default."""
+        """Returns the mesh of `body`, or None for the mannequin (the default)."""
         if self.body == "mannequin":
             return None
         from flame_mdm.formats.people import load_body
@@ -208,7 +208,7 @@ class BodySettings:
 
 @dataclass(frozen=True, kw_only=True)
 class WritingSettings:
-    """Keys for the motion files that are written."""
+    """Keys that control how motion files are written."""
 
     rig: str | None = option(
         None, "skeleton of OUT: mixamo, unreal, unity, rigify, lafan1, soma, cmu or 100style"
@@ -228,8 +228,7 @@ class WritingSettings:
     def read_character(self) -> Character | BvhCharacter | None:
         """Reads `character`.
 
-        If the names of some joints are unknown, prints the draft of a file for the user to
-        complete.
+        If the names of some joints are unknown, prints a draft file for the user to complete.
         """
         from flame_mdm.formats import characters
 
@@ -240,7 +239,7 @@ class WritingSettings:
             raise
 
     def at_rate(self, motion: Motion) -> Motion:
-        """Resamples a motion to the frame rate `resample`, if it is set."""
+        """Resamples a motion to the frame rate `resample`, if set."""
         from flame_mdm.formats.resampling import frame_rate
 
         return (
@@ -252,7 +251,7 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model for sampling, and the body to draw, which is None for the mannequin."""
+    """A model to sample from, and the body to draw (None = the mannequin)."""
 
     model: MotionGenerator
     body: Mesh | None
@@ -278,7 +277,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     device: str | None = option(None, "cpu or cuda; default: cuda if available", device_name)
 
     def conditions(self) -> list[str]:
-        """Returns the keys that have a value and determine the content of the motions."""
+        """Returns which of the keys `text`, `action` and `unconditioned` are set."""
         names = [name for name in ("text", "action") if getattr(self, name) is not None]
         return names + (["unconditioned"] if self.unconditioned else [])
 
@@ -314,7 +313,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     def load(self) -> LoadedModel:
         """Loads the model and the body.
 
-        If no key determines the content of the motions, raises a `UserError` that lists examples.
+        Raises a `UserError` that lists examples if no condition is requested.
         """
         file = find(self.ckpt, self.which)  # reports a missing file before PyTorch is imported
         import torch
@@ -372,7 +371,7 @@ class DataSettings:
         )
 
     def data_node(self, source: str | None = None) -> Config:
-        """Returns the configuration of the data set, in which `source` replaces the source path."""
+        """Returns the data set's configuration; `source`, if given, replaces its source path."""
         node = self.nodes["data"]
         if source is not None:
             if "path" not in node["source"]:

@@ -11,10 +11,10 @@ from flame_mdm.config.options import option, required
 class AdaptSettings(ModelSettings):
     """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
 
-    Teaches a trained model the motions in a folder, without losing its other abilities. Prompts
-    that end with "in limp style" then request motions in this style. Writes the adapter
-    OUT/limp.safetensors for `sample` and `load`, and a page that compares motions before and
-    after training. Run the same command again to resume. docs/own-motion.md explains the steps.
+    Teaches a trained model the motions in a folder, without losing its other abilities. After
+    training, prompts that end with "in limp style" produce motions in this style. Writes the
+    adapter OUT/limp.safetensors for `sample` and `load`, and a page that compares motions before
+    and after training. Run the same command again to resume. docs/own-motion.md explains the steps.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -40,7 +40,7 @@ class AdaptSettings(ModelSettings):
 
 
 def main(settings: AdaptSettings) -> None:
-    """Trains an adapter and writes it."""
+    """Trains and writes an adapter."""
     file = settings.model_file()
 
     from flame_mdm.training.adaptation import adapt

@@ -16,11 +16,11 @@ class AuditSettings(DataSettings):
     """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
            flame-mdm audit cards="A.json B.json"
 
-    Perturbs the real motions of a data set at graded strengths, measures them like generated
-    motions, and writes a card. For each metric, the card shows which perturbations it detects, at
+    Perturbs a data set's real motions at several strengths, evaluates them as if they had been
+    generated, and writes a card. The card shows which perturbations each metric detects, and at
     which strength, and which ones it misses. extractor=none audits the metrics that are computed
-    from joint positions. After an interruption, the same command continues where it stopped.
-    cards= renders one card again, or two cards side by side.
+    from joint positions. After an interruption, the same command continues where it stopped. cards=
+    renders one existing card again, or two of them side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")

@@ -1,4 +1,4 @@
-"""`flame-mdm benchmark NAME`: trains and evaluates a set of small models and writes their table."""
+"""`flame-mdm benchmark NAME`: trains and evaluates a set of small models and writes a table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class BenchmarkSettings:
     where it stopped.
 
     NAME is a file in experiments/benchmark: synthetic, synthetic_medium, bandai, few_steps or
-    bandai_full. The first two need no download, and bandai_full is for one GPU.
+    bandai_full. The first two require no download, and bandai_full is meant for one GPU.
     """
 
     OBJECTS: ClassVar = ("exp",)
@@ -76,7 +76,7 @@ def main(settings: BenchmarkSettings) -> None:
 def check(
     table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
 ) -> list[tuple[str, bool]]:
-    """Returns, for each expected range, a line and whether the value in the table is within it."""
+    """Returns a line for each expected range, and whether the value in the table is within it."""
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():

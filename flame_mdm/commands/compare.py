@@ -131,9 +131,9 @@ def _motions(
 ) -> list[dict[Prompt, Motion]]:
     """Returns the motions of each run and folder, by prompt.
 
-    The last checkpoint of each run is sampled for the requested prompts or, if there are none, for
-    the captions and lengths of the motions in the first folder. Without prompts and folders, the
-    newest samples of each run are returned.
+    Motions are sampled from each run's last checkpoint, for the requested prompts or, if there are
+    none, for the captions and lengths of the motions in the first folder. Without prompts or
+    folders, the newest samples of each run are returned.
     """
     from_files = {
         entry.label: read_motions(entry.folder) for entry in compared if entry.run is None
@@ -164,7 +164,7 @@ def _motions(
 def _texts(prompts: PromptFile) -> list[str]:
     """Returns the prompts in a file.
 
-    Raises the error of the first prompt that no model can sample.
+    Raises the error for the first prompt that no model can sample.
     """
     for number in sorted(prompts.refused):
         raise prompts.refused[number]
@@ -174,13 +174,13 @@ def _texts(prompts: PromptFile) -> list[str]:
 def _sampled(
     entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: int
 ) -> dict[Prompt, Motion]:
-    """Samples the last checkpoint of a run for texts or action labels.
+    """Samples motions from a run's last checkpoint for texts or action labels.
 
     Args:
         entry: the run.
         prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
-            numbers, or all of them are None, which stands for the default length. Lengths above the
-            model's maximum are reduced to it.
+            numbers, or all of them are None (the default length). Lengths above the model's maximum
+            are reduced to it.
         seed: seed of the noise, which differs between the motions of a prompt that is listed twice.
     """
     import torch

@@ -23,8 +23,8 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
            flame-mdm convert MOTION OUT character=hero.glb
            flame-mdm convert FOLDER OUT format=glb ...
 
-    Converts a motion file, or all motion files in a folder and its subfolders. The nearest
-    skeleton.yaml in the file's folder or a folder above it applies; see docs/own-data.md.
+    Converts a motion file, or all motion files in a folder and its subfolders. Uses the nearest
+    skeleton.yaml, in the file's folder or a folder above it; see docs/own-data.md.
 
     Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from
     `make sample` or AMASS; .json; and .npy with joint positions.
@@ -91,7 +91,7 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
     targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
     if double := [file for file in files if file not in targets.values()]:
         raise UserError(
-            f"{double[0]}: another motion has the same name, so that both would be written to "
+            f"{double[0]}: another motion has the same name, so both would be written to "
             f"the same file. Rename one of them"
         )
     return targets

@@ -12,8 +12,8 @@ from flame_mdm.errors import UserError
 class DemoSettings:
     """usage: flame-mdm demo [CKPT ...] [adapter=FILE] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
-    Serves a page on which you type a sentence, and watch, edit and download the motion. Without
-    CKPT, the demo uses the models in the package. It requires the demo extra: pip install
+    Serves a page on which you can type a sentence and then watch, edit and download the motion.
+    Without CKPT, the demo uses the models in the package. It requires the demo extra: pip install
     "flame-mdm[demo]". docs/demo.md explains the page.
     """
 

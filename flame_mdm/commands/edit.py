@@ -93,12 +93,12 @@ def main(settings: EditSettings) -> None:
     if moved > 0.01:
         say(
             "a kept part that follows a generated part begins where the generated part ends, so its "
-            "position in the world may differ"
+            "position in the world may differ from the original"
         )
 
 
 def origin(settings: EditSettings) -> tuple[object, ...]:
-    """Returns the values that, with the request, determine which model edits which motion.
+    """Returns the values that, together with the request, identify an edit.
 
     Edits that differ in these values are written to different folders.
     """

@@ -35,12 +35,11 @@ class InspectSettings(BodySettings, FileSettings, DataSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
     Finds physical faults, such as sliding feet and jumps, in a motion file, in all motion files in
-    a folder, or in a prepared data set. docs/motion-faults.md lists the limits beyond which
-    something is a fault.
+    a folder, or in a prepared data set. docs/motion-faults.md lists the faults and their limits.
 
     Prints the faults by frame and joint, and writes a player that marks them on its timeline. For a
-    data set or a large folder, the player shows only the worst motions (`clips`). Exits with code 3
-    if there are faults.
+    data set or a large folder, the player shows only the worst motions; `clips` sets their number.
+    Exits with code 3 if there are faults.
     """
 
     OBJECTS: ClassVar = ("motion", "out")

@@ -28,10 +28,10 @@ class JudgeSettings(BodySettings, FileSettings):
     """usage: flame-mdm judge MOTION text="a person waves with the left hand" [OUT.html] [fps=20] [unit=0.01] [up=z]
            flame-mdm judge FOLDER [OUT.html] [clips=24]
 
-    Reads the claims in a sentence, such as claims about side, count, direction, posture and order,
-    and measures each of them on the motion. A verdict is yes, no or cannot tell, with the joint,
-    the measured number and the time. Without text=, motions are judged by their own texts. Writes
-    a player whose timeline marks the evidence. Exits with code 3 if a claim is false. See
+    Reads the claims in a sentence, for example about side, count, direction, posture or order, and
+    checks each of them by measuring the motion. A verdict is yes, no or cannot tell, with the
+    joint, the measured number and the time. Without text=, motions are judged by their own texts.
+    Writes a player whose timeline marks the evidence. Exits with code 3 if a claim is false. See
     docs/referee.md.
     """
 

@@ -16,8 +16,8 @@ class ReportSettings(BodySettings):
     """usage: flame-mdm report RUN ...
 
     Writes report.html to each run directory: a single page with training curves, the newest
-    samples, evaluations and provenance, which needs neither a server nor a network connection. It
-    is also written at the end of training.
+    samples, evaluations and provenance. The page needs neither a server nor a network connection.
+    It is also written at the end of training.
     """
 
     OBJECTS: ClassVar = ("runs",)

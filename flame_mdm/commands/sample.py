@@ -33,7 +33,7 @@ CLAIMS = "claims"  # scorer that checks the claims in the text; see docs/referee
 
 
 def scorer_source(key: str, source: str) -> None:
-    """Checks that the scorer is `CLAIMS` or a model that exists."""
+    """Checks that the scorer is `CLAIMS` or an existing model."""
     if source != CLAIMS:
         model_source(key, source)
 
@@ -50,12 +50,11 @@ class SampleSettings(OutputSettings, WritingSettings):
            flame-mdm sample CKPT action=walk
            flame-mdm sample CKPT unconditioned=true
 
-    Writes motions (.npz), a GIF, and a player that opens in any browser. For a prompt file, which
-    contains one prompt per line, each prompt gets its own folder, and one page shows the first
-    motion of each prompt. Prompts that cannot be sampled are listed at the end, and the exit code
-    is then 1. A set is a folder of matching clips for game engines: loops, starts, stops and turns.
-    If OUT is a file (.fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif), only this
-    file is written.
+    Writes motions (.npz), a GIF, and a player that opens in any browser. A prompt file contains one
+    prompt per line. Each prompt gets its own folder, and one page shows the first motion of each
+    prompt. Prompts that cannot be sampled are listed at the end, and the exit code is then 1. A set
+    is a folder of matching clips for game engines: loops, starts, stops and turns. If OUT is a file
+    (.fbx, .glb, .bvh, .usdz, .vrma, .npz, .json, .npy, .mp4 or .gif), only this file is written.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -148,7 +147,7 @@ class SampleSettings(OutputSettings, WritingSettings):
                 )
 
     def set_content(self, source: str) -> MotionSet:
-        """Returns the description of a set, changed by the keys for the written files."""
+        """Returns the description of a set, adapted to `rig`, `format` and `resample`."""
         from flame_mdm.sampling.motion_sets import changed, read_set
 
         keys = {"rig": self.rig, "format": self.format, "fps": self.resample}
@@ -157,12 +156,12 @@ class SampleSettings(OutputSettings, WritingSettings):
         )
 
     def conditions(self) -> list[str]:
-        """Returns the keys that determine the motions, which include a prompt file and a set."""
+        """Returns the keys that determine the motions, including `prompts` and `set`."""
         sources = [key for key in ("prompts", "set") if getattr(self, key) is not None]
         return [*super().conditions(), *sources]
 
     def request_for(self, prompts: PromptFile | None) -> SamplingRequest:
-        """Returns the sampling request, with the accepted prompts if there is a prompt file."""
+        """Returns the sampling request, with the accepted prompts of a prompt file, if any."""
         default = 3 if self.file is None else 1
         samples = default if self.samples is None else self.samples
         if prompts is None:

@@ -1,4 +1,4 @@
-"""`flame-mdm tables [NAME ...]`: evaluates missing results and renders tables and figures."""
+"""`flame-mdm tables [NAME ...]`: runs missing evaluations and renders tables and figures."""
 
 import os
 from collections.abc import Mapping, Set
@@ -24,18 +24,18 @@ INVALID = 3  # exit code if a requested row is not valid
 class TablesSettings:
     """usage: flame-mdm tables [NAME ...] [evaluate=false] [out=FOLDER]
 
-    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A file in experiments/tables, or
-    your own file, describes a table by its checkpoints, protocol and columns. Checkpoints without a
-    result are evaluated first, unless evaluate=false. The same results always produce the same
-    bytes. Exit codes: 0 = success; 1 = invalid input, or an evaluation failed; 3 = the tables are
-    written, but a requested row is NOT VALID.
+    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A file in experiments/tables, or a
+    file of your own, lists the checkpoints, the protocol and the columns of a table. Checkpoints
+    without a result are evaluated first, unless evaluate=false. The same results always produce
+    identical files. Exit codes: 0 = success; 1 = invalid input, or an evaluation failed; 3 = the
+    tables are written, but a requested row is NOT VALID.
     """
 
     OBJECTS: ClassVar = ("table",)
     table: list[str] | None = option(
         None, "tables to render: names in experiments/tables, or paths to specs; default: all"
     )
-    evaluate: bool = option(True, "evaluate missing results; false = only render existing results")
+    evaluate: bool = option(True, "run missing evaluations; false = only render existing results")
     out: str = option("runs/tables", "folder for the tables")
     results: str = option("runs/results", "folder of the results")
     device: str | None = option(
@@ -53,7 +53,7 @@ class TablesSettings:
 
 
 def main(settings: TablesSettings) -> None:
-    """Evaluates missing rows of tables and writes the tables."""
+    """Runs missing evaluations and writes the tables."""
     names = settings.table or spec_names()
     specs = {Path(name).stem: load_spec(name) for name in names}
     results = Path(settings.results)
@@ -156,7 +156,7 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
     Args:
         path: path of the result file.
         evaluation: the evaluation that a table requires.
-        values: names of the values in the result that tables show.
+        values: names of the values that tables show.
     """
     from evaluators.sources import sample_files, sha256_of_samples
     from flame_mdm.checkpoints.model_files import weights_sha256
@@ -183,7 +183,7 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
 
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
-    """Writes the motion lengths of a data set to `results`, or reports that it is not prepared."""
+    """Writes the motion lengths of a data set to `results`, or reports that it must be prepared."""
     nodes = compose_data(
         dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data")
     )

@@ -1,4 +1,4 @@
-"""Training runs of a benchmark: each has its own process, and several can run in parallel."""
+"""Training runs of a benchmark, each in its own process; several can run in parallel."""
 
 import os
 import subprocess
@@ -36,14 +36,14 @@ class Training:
 
     @property
     def title(self) -> str:
-        """The arguments, joined to one line."""
+        """The arguments, joined into one line."""
         return " ".join(self.words)
 
 
 def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
     """Returns the training runs of a benchmark.
 
-    A run depends on an earlier one if its configuration contains a path in the latter's directory.
+    A run depends on an earlier run if its configuration contains a path in that run's directory.
     """
     root = [f"data_root={data_root}"] if data_root else []
     trainings: list[Training] = []
@@ -62,11 +62,11 @@ def plan(entries: Sequence[Sequence[str]], data_root: str) -> list[Training]:
 
 
 def run_trainings(trainings: Sequence[Training], jobs: int, logs: Path) -> None:
-    """Trains the models of a benchmark, at most `jobs` of them at the same time.
+    """Trains the models of a benchmark, at most `jobs` at a time.
 
     With several jobs, each run gets an equal share of the cores and writes its output to a file in
-    `logs`. A run starts in parallel with others only if `GIB_PER_JOB` GiB of memory are free. The
-    batches and random draws of a run do not depend on other runs.
+    `logs`. A run starts in parallel with others only if at least `GIB_PER_JOB` GiB of memory are
+    free. The batches and random draws of a run do not depend on other runs.
 
     Raises:
         UserError: If a run fails. The other runs are stopped and can be resumed.

@@ -56,7 +56,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
     Hydra and OmegaConf would resolve interpolations (`${...}`), which can run any code and read any
     environment variable. Only the interpolation `but` is allowed, at the start of a string. Raises
-    `UserError`, which names the file `where`, if the check fails or if the content is too large, is
+    a `UserError` that names the file `where` if the check fails or if the content is too large, is
     nested too deeply or contains itself.
     """
     count = 0
@@ -87,7 +87,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def renamed(config: Config) -> Config:
-    """Replaces the class names of earlier versions in a configuration with the current ones."""
+    """Replaces class names from earlier versions in a configuration with the current ones."""
     task = config.get("task")
     if not isinstance(task, Mapping):
         return config
@@ -110,7 +110,7 @@ def read_saved(path: Path) -> Config:
 def movable(config: Config) -> Config:
     """Returns a configuration in which `RUN_DIR` stands for the run directory.
 
-    `run.dir` then changes all paths inside the run directory.
+    Changing `run.dir` then also changes all paths inside the run directory.
     """
     folders = {str(config["run"]["dir"]): RUN_DIR}
     return {
@@ -137,13 +137,12 @@ def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **der
 
     Args:
         node: the mapping.
-        offered: additional arguments, of which only those that the class or function accepts are
-            passed.
-        derived: additional arguments, all of which are passed.
+        offered: additional arguments, which are passed only if the class or function accepts them.
+        derived: additional arguments that are always passed.
     """
     name = node.get("_target_") if isinstance(node, Mapping) else None
     if not isinstance(name, str):
-        raise UserError(f"_target_, the name of a class, is missing in {str(node)[:80]}")
+        raise UserError(f"_target_ (the name of a class) is missing from {str(node)[:80]}")
     if offered:
         legal = parameters(name)
         derived |= {key: value for key, value in offered.items() if key in legal or "**" in legal}
@@ -170,7 +169,7 @@ def _instances(node: Any) -> Any:
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Flattens nested mappings to a mapping with dotted keys. Lists are not flattened."""
+    """Flattens nested mappings into one mapping with dotted keys. Lists are not flattened."""
     if not isinstance(config, Mapping) or not config:
         return {prefix: config}
     flat: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Command lines: keys, declared by one dataclass per command, signals, errors and exit codes."""
+"""Command lines: keys (declared by one dataclass per command), signals, errors and exit codes."""
 
 import os
 import re
@@ -140,12 +140,12 @@ def _value(key: str, text: str, annotation: str, sweeps: bool) -> Any:
 
 
 def is_text(kind: type[Any], key: str) -> bool:
-    """Returns whether a key of a command takes any text, and takes it literally."""
+    """Returns whether a key of a command accepts arbitrary text, which is taken literally."""
     return _annotations(kind).get(key) in TEXT
 
 
 def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
-    """Adds the keys of a command's objects to the leading words, which have no keys."""
+    """Adds keys to the leading words, which specify a command's objects without a key."""
     objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])
@@ -158,7 +158,7 @@ def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
     for key in objects[: len(leading)]:
         if any(word.startswith(f"{key}=") for word in rest):
             raise UserError(
-                f"{key} is given twice: once without a key, and as {key}=. Remove one of them"
+                f"{key} is given twice: once without a key and once as {key}=. Remove one of them"
             )
     # Additional words stay unchanged and are rejected later, because they have no key
     keyed = [f"{key}={word}" for key, word in zip(objects, leading, strict=False)]
@@ -256,7 +256,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 def explanation(error: Exception) -> str | None:
     """Returns the line to print for an error that the user can fix, or None for a bug.
 
-    Users can fix a `UserError`, a file error and a lack of memory.
+    The user can fix a `UserError`, a file error or a lack of memory.
     """
     if isinstance(error, UserError):
         return first_line(error)

@@ -40,7 +40,7 @@ def groups() -> list[str]:
 
 
 def recipes() -> list[str]:
-    """Returns the names of all experiments, as they are used in `EXP=`."""
+    """Returns the names of all experiments, as used in `EXP=`."""
     files = (p for p in EXPERIMENTS.rglob("*.yaml") if "@package _global_" in p.read_text()[:200])
     return sorted(p.relative_to(EXPERIMENTS).with_suffix("").as_posix() for p in files)
 

@@ -23,7 +23,7 @@ Config = dict[str, Any]
 def check(config: Config) -> None:
     """Raises `UserError` if a `_target_` does not exist or does not accept one of its arguments.
 
-    The message suggests the permitted keys that are most similar.
+    The message suggests the most similar permitted keys.
     """
     for path, node in walk(config):
         if "_target_" not in node:
@@ -101,7 +101,7 @@ def check_top_level(config: Config) -> None:
 def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if the annotation of a parameter does not permit a value.
 
-    Annotations that are not understood permit any value.
+    Unsupported annotations permit any value.
     """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
@@ -131,7 +131,7 @@ def _alternatives(annotation: ast.expr) -> list[ast.expr]:
 
 
 def _mismatch(value: Any, kind: ast.expr) -> str:
-    """Returns what an annotation without unions requires, or "" if the value meets it."""
+    """Returns what an annotation without unions requires, or "" if the value satisfies it."""
     name = _name(kind)
     if name in KINDS:
         types, description = KINDS[name]
@@ -174,7 +174,7 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
 def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
     """Returns what the annotation of a tuple, such as `tuple[float, float]`, requires.
 
-    Returns "" if the items meet it.
+    Returns "" if the items satisfy the annotation.
     """
     if isinstance(kinds[-1], ast.Constant) and kinds[-1].value is ...:
         kinds = [kinds[0]] * len(items)

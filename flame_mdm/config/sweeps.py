@@ -146,7 +146,7 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe is incomplete or has a value that would only fail later."""
+    """Raises `UserError` if a recipe is incomplete or has a value that would fail only later."""
     plain(config, name)  # otherwise, the run's checkpoints would be rejected
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]
@@ -160,8 +160,8 @@ def _check_whole(config: Config, name: str) -> None:
         lacking += ["trainer.max_steps"] * ("max_steps" not in config["trainer"])
     if lacking:
         raise UserError(
-            f"{name}: {lacking[0]} is missing. Set it, or start with a `defaults:` list that "
-            f"names another recipe or /base"
+            f"{name}: {lacking[0]} is missing. Set it, or start the recipe with a `defaults:` "
+            f"list that names another recipe or /base"
         )
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:

@@ -85,15 +85,15 @@ def serve(
 def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
     """Returns the connection limits for a server.
 
-    If `hosts` is not empty, the demo runs behind a web server with these names, so that all
-    visitors have the same address.
+    If `hosts` is not empty, the demo runs behind a web server with these names, so all visitors
+    seem to have the same address.
     """
     limits = ConnectionLimits()
     return replace(limits, per_address=limits.total) if hosts else limits
 
 
 class Server(uvicorn.Server):
-    """A server that, when it stops, ends the streams of open pages before it waits for requests."""
+    """A server that, on shutdown, ends the streams of open pages before it waits for requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]
@@ -110,7 +110,7 @@ class Writers:
 
     Attributes:
         turns: semaphore that is held while a file is written.
-        waiting: number of requests that wait for a file, including those whose file is being
+        waiting: number of requests that are waiting for a file, including a file that is being
             written.
     """
 

@@ -51,7 +51,7 @@ def _step(
             continue
 
         def text(changed: Mention, position: int = position) -> str:
-            """Returns the text for the form in which `changed` replaces this action."""
+            """Returns the form's text with `changed` in place of this action."""
             words = caption((*step[:position], changed, *step[position + 1 :]))
             rows = [
                 (words if row == number else phrase, seconds)

@@ -1,4 +1,4 @@
-"""Connections to the demo's server, with deadlines and maximum numbers in total and per address."""
+"""Connections to the demo's server, with deadlines and limits in total and per address."""
 
 import asyncio
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class ConnectionLimits:
         header_seconds: maximum waiting time of a connection, regardless of how many bytes of the
             headers arrive.
         idle_seconds: maximum waiting time after a response if no data arrives.
-        stall_seconds: maximum time during which a client does not read its response.
+        stall_seconds: maximum time for which a client may stop reading its response.
     """
 
     total: int = 256
@@ -109,7 +109,7 @@ class Connection(H11Protocol):
         self.transport.close()
 
     def _watch(self) -> None:
-        """Starts the deadline when the connection begins to wait, and stops it upon a request."""
+        """Starts the timer when the connection begins to wait, and stops it when a request arrives."""
         if self.transport.is_closing():
             return
 
@@ -121,7 +121,7 @@ class Connection(H11Protocol):
             self.deadline = None
 
     def _make_room(self, group: "list[Connection]", limit: int) -> None:
-        """Closes the longest-waiting connections in a group until it is within the limit."""
+        """Closes the longest-waiting connections in a group until the group is within the limit."""
         excess = len(group) - limit
         if excess <= 0:
             return

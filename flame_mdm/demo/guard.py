@@ -1,4 +1,4 @@
-"""The guard of the demo's server, which refuses all requests that do not come from the page."""
+"""A guard for the demo's server that refuses all requests that do not come from the page."""
 
 import asyncio
 import ipaddress
@@ -66,7 +66,7 @@ class Call(Post):
 
 
 class Reset(Post):
-    """A message that the page no longer waits for the result of a call."""
+    """A message that the page is no longer waiting for the result of a call."""
 
     event_id: Id
 
@@ -82,7 +82,7 @@ Meters = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)]
 
 
 class LiveCall(Post):
-    """A request for frames of a stream from `begin` on; `stream` is "" for a new stream."""
+    """A request for a stream's frames from index `begin` on; `stream` is "" for a new stream."""
 
     stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
     text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]
@@ -105,9 +105,10 @@ class Guard:
 
     It checks the host, origin, path, size and content of the request. `hosts` contains the names of
     this server, in addition to localhost and numeric addresses. A request with any other host name
-    may come from a page whose name somebody pointed at this computer (DNS rebinding). `calls` maps
-    the index of each function that the page can call to its path and a check of its arguments.
-    `is_open` returns whether a session has called a function, so that its results can be read.
+    may come from a page whose domain name was made to resolve to this computer (DNS rebinding).
+    `calls` maps the index of each function that the page can call to its path and a check of its
+    arguments. `is_open` returns whether a session has called a function and may therefore read
+    results.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Motion streams for visitors.
 
-Their number is limited, and their blocks are computed one at a time.
+The number of streams is limited, and blocks are computed one at a time.
 """
 
 import secrets
@@ -43,7 +43,7 @@ class LiveStream:
 
     Attributes:
         stream: the stream.
-        used: time in seconds of the last request.
+        used: time of the last request, in seconds.
         joints: (F, J, 3) joint positions in the last minute of the stream.
         text: the current text.
         allowance: number of blocks that the stream may compute now.
@@ -148,7 +148,7 @@ class LiveStreams:
             return path.read_bytes()
 
     def _opened(self, name: str, text: str) -> tuple[str, LiveStream]:
-        """Returns a stream and its name, after ending the streams that are no longer requested."""
+        """Returns a stream and its name, after ending the streams that are no longer in use."""
         now = self.clock()
         self._streams = {
             other: live for other, live in self._streams.items() if now - live.used <= IDLE

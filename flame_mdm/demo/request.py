@@ -107,7 +107,7 @@ class DemoRequest(BaseModel):
         return path_targets(self.path, self.total_seconds(parts))
 
     def total_seconds(self, parts: Sequence[tuple[str, float | None]]) -> float:
-        """Returns the duration of all parts.
+        """Returns the total duration of the parts.
 
         A part without a duration is as long as `seconds` or, if that is None, `USUAL_SECONDS`.
         """
@@ -200,7 +200,7 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
 def checked(values: dict[str, Any]) -> DemoRequest:
     """Builds a request, in which empty values are replaced by the defaults.
 
-    Raises a `UserError` that quotes the value if one is invalid.
+    If a value is invalid, raises a `UserError` that quotes it.
     """
     try:
         return DemoRequest(

@@ -19,8 +19,8 @@ def still(action: str, side: Value | None = None) -> bytes | None:
 
     Args:
         action: name of the action in `actions.yaml`.
-        side: side of the body, for actions in the synthetic set that have a side. Default: any
-            side.
+        side: side of the body, for actions in the synthetic data set that can be done on either
+            side. Default: any side.
     """
     names = [name for name in actions()[action].names if name in ACTIONS]
     if names:

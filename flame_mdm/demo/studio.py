@@ -60,7 +60,7 @@ class Studio:
     def model(self, name: str) -> MotionGenerator:
         """Returns a model by its name on the page. Raises `UserError` if the name is unknown.
 
-        A model with an adapter is only loaded when it is first used.
+        A model with an adapter is loaded only when it is first used.
         """
         if name not in self.files:
             near = did_you_mean(name, self.files)
@@ -90,7 +90,7 @@ class Studio:
         report: Callable[[int], None] = lambda calls: None,
         stop: Event | None = None,
     ) -> Sequence[Motion]:
-        """Returns the motions for a request, which are taken from memory if possible.
+        """Returns the motions for a request, from memory if possible.
 
         `report` is called with the number of network calls so far.
         """
@@ -135,7 +135,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request, with a sentence of several actions turned into a sequence.
+        """Returns the request, in which a sentence with several actions has become a sequence.
 
         Raises the same errors as `generate`.
         """

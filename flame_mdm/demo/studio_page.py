@@ -315,7 +315,7 @@ def _verdicts(name: str, motion: Motion) -> str:
 
 
 def _understood(studio: Studio, request: DemoRequest) -> str:
-    """Returns the chips for the text and the messages about it."""
+    """Returns the chips for the text, and messages about the text."""
     notes = "".join(_note("warning", line) for line in studio.advice(request))
     readings, reader = studio.readings(request), studio.reader(request.model)
     if not readings or reader is None:
@@ -328,7 +328,7 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 def _refusal(error: NotUnderstood) -> str:
     """Returns the message for a text that contains no action that the model knows.
 
-    The nearest actions are shown as buttons with pictures.
+    The actions that are closest in meaning are shown as buttons with pictures.
     """
     message = escape(one_line(error.message))
     if not error.nearest:
@@ -352,7 +352,7 @@ def _still(text: str) -> str:
 def _note(kind: str, line: str) -> str:
     """Returns a message.
 
-    If the message suggests a text, the suggestion is a button that puts it into the form.
+    If the message suggests a text, the suggestion is shown as a button that puts it into the form.
     """
     shown = re.sub(
         r"Did you mean &#x27;(.+?)&#x27;\?$",

@@ -279,8 +279,8 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 class Constant:
     """Constant numbers, stored in one tensor per device.
 
-    They are not stored in a module's buffer, so they do not change when a model is cast or is built on the
-    meta device.
+    They are not stored in a module's buffer, so they do not change when a model is cast or is built
+    on the meta device.
 
     Example:
         >>> table = Constant([1.0, 2.0])

@@ -51,7 +51,7 @@ class Parts:
 
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
-        """Builds the parts of a recipe, including the sizes that depend on other parts."""
+        """Builds the parts in a recipe and sets the sizes that depend on other parts."""
         process: Process = instantiate(config["process"])
         condition: ConditionEncoder = instantiate(config["condition"], {"num_actions": num_actions})
         sizes = sizes_of_denoiser(config, representation, process, condition)
@@ -72,7 +72,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames of which all training lengths are multiples."""
+    """Returns the number of frames that all training lengths are multiples of."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -214,11 +214,11 @@ class MotionGenerator(Model, nn.Module):
         """Samples motions for the conditions, lengths and ids of a batch.
 
         The noise of a motion is a function of (seed, replication, id). Therefore, a motion does not
-        depend on the other motions of its batch.
+        depend on the other motions in its batch.
 
         Args:
             batch: conditions, `mask` and `ids` of B motions. `x` is ignored.
-            options: sampler options. An option that is None has the recipe's value.
+            options: sampler options. Options that are None default to the recipe's values.
             seed: seed of the noise.
             replication: index of the replication, used to sample several motions per id.
             edit: part of a motion to keep.
@@ -226,11 +226,11 @@ class MotionGenerator(Model, nn.Module):
                 motions. The windows' conditions replace the conditions of the batch.
             prefix: (B, C, D) normalized features of the frames before the motions. They are
                 required if the denoiser has `context_frames` C. Such a model continues the prefix
-                block by block and accepts neither an edit nor windows nor a trajectory.
+                block by block and does not support `edit`, `windows` or `trajectory`.
             unconditioned: whether to sample a conditional model with its null condition.
             shared_noise: whether the noise depends only on (seed, replication), so that it is the
                 same for all ids.
-            trajectory: list to which the normalized clean estimate (B, F, D) of each call of the
+            trajectory: list to which the normalized clean estimate (B, F, D) from each call of the
                 denoiser is appended.
 
         Returns:
@@ -303,7 +303,7 @@ class MotionGenerator(Model, nn.Module):
         return self.condition(empty).drop(nothing == 0)
 
     def guided(self, cond: Condition, options: SamplerOptions, unconditioned: bool) -> Denoise:
-        """Returns the denoiser, to which guidance is added if there is a condition."""
+        """Returns the denoiser, with guidance if there is a condition."""
         scale = options.guidance_scale
         if scale is None or cond.null is None or not self.condition.features or unconditioned:
             return self.denoiser
@@ -341,7 +341,7 @@ class Blocks:
         model: the model. Its denoiser has `context_frames` C.
         ids: B names of the motions, which seed the noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
-        options: sampler options. None of them may be None.
+        options: sampler options, none of which may be None.
         seed: seed of the noise.
         replication: index of the replication, used to sample several motions per id.
         unconditioned: whether all conditions are null conditions. Guidance is then not applied.
@@ -457,7 +457,7 @@ class DistilledGenerator(MotionGenerator):
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
         """Raises `UserError` if guidance or an unconditioned motion is requested.
 
-        A student model has not learned either of them.
+        A student model supports neither of them.
         """
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):

@@ -96,8 +96,8 @@ class MotionLosses(nn.Module):
             InterGen applies it only up to a certain level.
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of leading features that `velocity` uses. MDM's code omits the
-            last row of the feature matrix, and so uses 144 of 25 x 6 or 262 of 263 features. None =
-            all features.
+            last row of the feature matrix, and thus uses 144 of 25 x 6 or 262 of 263 features. None
+            = all features.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)

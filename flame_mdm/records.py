@@ -46,7 +46,7 @@ class Value(Schema):
 
     @property
     def counts(self) -> str:
-        """Numbers of motions as text: "3 x 64", or "64 + 5" if replications differ."""
+        """Numbers of motions as text: "3 x 64", or "64 + 5" if the replications differ."""
         if len(set(self.n_per_replication)) > 1:
             return " + ".join(map(str, self.n_per_replication))
         return f"{self.replications} x {self.n}"
@@ -57,7 +57,7 @@ def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
 
     Source: Efron and Tibshirani 1993, section 13.3. Some metrics, such as Fréchet distances, are
     larger for sets with repeated motions (section 10.6), so the interval is shifted to the value.
-    The interval holds only for sets of the same size.
+    The interval is valid only for sets of the same size.
 
     Example:
         >>> percentiles([1.0, 2.0, 3.0], 5.0)
@@ -212,7 +212,7 @@ class Result(Measured):
 
     @property
     def stand_in_skeleton(self) -> bool:
-        """Whether the bones come from a stand-in for SMPL's model file."""
+        """Whether the bone lengths come from a stand-in for SMPL's model file."""
         return self.skeleton is not None and self.skeleton.stand_in
 
 

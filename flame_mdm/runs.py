@@ -76,7 +76,7 @@ def made_by(path: str | Path) -> str:
     """Returns a hint on how to obtain a missing checkpoint or extractor.
 
     The hint is the command that creates the file. For a file in `assets/`, which no command
-    creates, the hint names the page of the documentation that explains where to find it.
+    creates, the hint names the documentation page that explains where to find it.
     """
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)

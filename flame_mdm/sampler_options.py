@@ -21,8 +21,8 @@ SPACINGS = (
 class SamplerOptions:
     """Options for sampling motions.
 
-    An option that is None has the recipe's value or, if the recipe has none, the sampler's default.
-    Each sampler in `flame_mdm.processes.samplers` declares its options, and
+    Options that are None default to the recipe's values or, if the recipe has none, to the
+    sampler's defaults. Each sampler in `flame_mdm.processes.samplers` declares its options, and
     `flame_mdm.processes.Process` rejects all others.
 
     Raises:

@@ -91,10 +91,10 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
 
 def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> T:
-    """Converts the content of an untrusted file, all of whose values must be plain.
+    """Converts the content of an untrusted file, which may contain only plain values.
 
-    The content is converted as in `check_shape`. Raises `UserError` with `path` if the conversion
-    fails, or if the content is nested too deeply or contains itself.
+    The content is converted as in `check_shape`. Raises a `UserError` that names `path` if the
+    conversion fails, or if the content is nested too deeply or contains itself.
     """
     # checked before the shape: the check of the shape would not end for content that contains
     # itself

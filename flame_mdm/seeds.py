@@ -35,9 +35,9 @@ def key(*parts: str | int) -> int:
 
 
 def seed_generator(number: int, device: torch.device) -> None:
-    """Seeds torch's random number generators of the CPU and of `device`.
+    """Seeds torch's random number generators for the CPU and for `device`.
 
-    `torch.manual_seed` is slower, because it seeds the generators of all devices. This takes about
+    `torch.manual_seed` is slower, because it seeds the generators for all devices. This takes about
     a millisecond if CUDA is not initialized.
     """
     torch.default_generator.manual_seed(number)

@@ -52,7 +52,7 @@ class Task(Model, LightningModule):
         actions: Sequence[str] = (),
         facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe, including the sizes that depend on other parts.
+        """Builds the task in a recipe and sets the sizes that depend on other parts.
 
         Args:
             config: the recipe.
@@ -187,12 +187,12 @@ class GeneratorTask(Task):
         compile: whether to compile the denoiser with torch.compile when training begins.
         checkpoint_activations: whether to store fewer activations for the backward pass and
             recompute the others; see `flame_mdm.denoisers.recomputation`. The resulting weights are
-            the same, but steps are slower.
+            the same, but training steps are slower.
         targets: options of `TargetConditions`, required by a denoiser with a target encoder. None =
             the model is trained without targets.
 
-    If the denoiser has `context_frames`, these first frames of each training sample are its clean
-    prefix, and only the later frames contribute to the losses.
+    If the denoiser has `context_frames`, the first `context_frames` frames of each training sample
+    are its clean prefix, and only the later frames contribute to the losses.
     """
 
     noun = MotionGenerator.noun
@@ -321,7 +321,7 @@ class GeneratorTask(Task):
             self.pretrain()
 
     def pretrain(self) -> None:
-        """Trains the text encoder on the captions before the first step, if the recipe says so."""
+        """Trains the text encoder on captions before the first step, if the recipe requests it."""
         self.encoder().pretrain([clip.captions for clip in self.data.train.clips], self.seed)
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
@@ -346,7 +346,7 @@ class GeneratorTask(Task):
         return terms["loss"].mean()
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws, at random, which motions (B,) of a batch receive the null condition."""
+        """Returns a random bool mask (B,): True = this motion receives the null condition."""
         return torch.rand(len(batch), device=self.device) < self.cond_drop_prob
 
     def loss_terms(
@@ -403,7 +403,7 @@ class GeneratorTask(Task):
             self.val_losses[name].update(value)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean of each loss over the clips of all ranks, all with equal weight."""
+        """Logs each loss as a mean over the clips of all ranks, with equal weight for all clips."""
         for name, metric in self.val_losses.items():
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")

@@ -38,8 +38,8 @@ With this number and `until` = 0.2, the paper's "first 6 time steps" agree with 
 class Edited(Motion):
     """An edited motion, with the original motion and the errors of the kept part.
 
-    The joint error can be large although the features are kept: they are relative to the root, so
-    that a kept part starts where the resampled part before it ends.
+    The joint error can be large even if the features are kept: they are relative to the root, so a
+    kept part starts where the resampled part before it ends.
 
     Example:
         >>> import flame_mdm
@@ -88,8 +88,8 @@ def edit(
 ) -> list[Edited]:
     """Resamples part of a motion and keeps the rest, without additional training.
 
-    Only `joints` in the frames of `region` are resampled. By default, these are all joints in all
-    frames. With `strength`, the result is a variation of the motion rather than a new one.
+    Only `joints` in the frames of `region` are resampled. By default, all joints in all frames are
+    resampled. With `strength`, the result is a variation of the motion rather than a new one.
 
     Args:
         model: the model, from `flame_mdm.load`.
@@ -98,10 +98,10 @@ def edit(
         texts: what the person does in the new part, as one string or several. By default, the new
             part is unconditioned, unless `actions` are given.
         fps: frames per second of an array or an .npy file. For other files, it overrides the frame
-            rate that the file states.
+            rate stated in the file.
         cut: the part of the motion to use, as [begin, end] in seconds. Default: the entire motion.
-        stages: list to which clean estimates of the first motion are appended, at equal intervals
-            of the sampling run, followed by the motion itself.
+        stages: list to which clean estimates of the first motion, taken at equal intervals during
+            sampling, and then the motion itself are appended.
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
             `method`, `until` and `resample` select how it is resampled. All of them are described
             in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
@@ -111,7 +111,7 @@ def edit(
     Returns:
         The edited motions, with `samples` motions for each text: all samples of the first text come
         first, then all samples of the second text, and so on. The list does not contain the
-        original, which is the attribute `original` of each edited motion.
+        original, which is stored in the attribute `original` of each edited motion.
 
     Raises:
         UserError: If the request is invalid, if the process does not support the method, or if the
@@ -285,7 +285,7 @@ def method_options(
 ) -> tuple[dict[str, Any], SamplerOptions]:
     """Returns the options for `Edit` and for the sampler that an editing method requires.
 
-    If the request names no method, the default method of the process is used.
+    If the request does not name a method, the process's default method is used.
     """
     possible = [
         name for name, method_edit in METHODS.items() if method_edit["mode"] in process.edit_modes

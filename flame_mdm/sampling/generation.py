@@ -41,9 +41,9 @@ def generate(
     """Generates motions for texts or actions, or unconditioned motions if neither is given.
 
     A motion depends only on its text, its length, its sample number and the seed, not on the other
-    texts. If the same text is given several times, sample numbers continue, so that all of its
-    samples differ. "A man walks, then sits down" becomes the sequence "A man walks | sits down",
-    unless `split=False`.
+    texts. If the same text is given several times, sample numbers continue, so all of its samples
+    differ. "A man walks, then sits down" becomes the sequence "A man walks | sits down", unless
+    `split=False`.
 
     Args:
         model: the model, from `flame_mdm.load`.
@@ -52,8 +52,8 @@ def generate(
             score is kept. By default, the candidate with the fewest faulty frames is kept.
         edit: an edit that keeps part of a motion in every sample. The motion is as long as the
             samples; `known` and `keep` have the shape (1, F, D).
-        stages: list to which clean estimates of the first motion are appended, at equal intervals
-            of the sampling run, followed by the motion itself (MFM, figure 5).
+        stages: list to which clean estimates of the first motion, taken at equal intervals during
+            sampling, and then the motion itself are appended (MFM, figure 5).
         keywords: fields of `flame_mdm.sampling.motion_request.SamplingRequest`, which describes
             them: `actions` (instead of texts), `seconds` or `frames` (default: 3 seconds, or less
             for one or two repetitions, as in "kicks twice"), `samples` per text (1), `candidates`
@@ -255,7 +255,7 @@ def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit 
 
 
 def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Tensor) -> Motion:
-    """Converts normalized features (F, D) to a motion, which starts where the previous one ends."""
+    """Converts normalized features (F, D) to a motion that starts where the previous one ends."""
     representation, prompt = model.representation, row.prompt
     features = representation.denormalize(x[: sum(prompt.frames)].float())
     if resolved.before is not None:
@@ -283,7 +283,7 @@ class _First(list[Tensor]):
 def _stages(model: MotionGenerator, trajectory: Sequence[Tensor], result: Motion) -> list[Motion]:
     """Returns up to `STAGES` clean estimates of the first motion, followed by the motion.
 
-    The estimates come from calls of the denoiser at equal intervals.
+    The estimates come from equally spaced calls of the denoiser.
     """
     count, stages = len(trajectory), []
     for call in sorted({index * count // STAGES for index in range(STAGES)}):

@@ -128,7 +128,7 @@ class EditRequest:
 
     @property
     def ranges(self) -> list[tuple[float, float]] | None:
-        """The ranges given as `region` or `region_seconds`, or None if neither contains any."""
+        """The ranges in `region` or `region_seconds`, or None if neither contains any ranges."""
         name = "region" if self.region_seconds is None else "region_seconds"
         value: Any = getattr(self, name)
         if value is None or (name == "region" and isinstance(value, str)):
@@ -144,7 +144,7 @@ class EditRequest:
         """Returns the options of `flame_mdm.batch.Edit` for an editing method.
 
         Raises:
-            UserError: If the request sets an option that the method does not have.
+            UserError: If the request sets an option that the method does not support.
         """
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
@@ -167,7 +167,7 @@ class SamplingRequest:
     A text or action may consist of several parts, each of which may state its duration in seconds,
     as in "walks forward @3 | turns left | sits down @2". The parts are generated together as one
     motion, in overlapping windows; see docs/sequences.md. A single part with a duration, such as
-    "walks forward @10", is also generated in windows, so that it may be longer than the training
+    "walks forward @10", is also generated in windows, so it may be longer than the training
     motions.
 
     `flame_mdm.sampling.resolution.resolve` adds the values that depend on a model.
@@ -387,7 +387,7 @@ class SamplingRequest:
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
-        """Returns the requested length of each prompt as a number of frames, not rounded.
+        """Returns the requested length of each prompt as an unrounded number of frames.
 
         The entries are None if no length was requested.
         """
@@ -472,7 +472,7 @@ def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
 def path_targets(path: Waypoints, seconds: float) -> dict[str, Any]:
     """Returns targets that lead a motion along a path at a constant speed.
 
-    The path starts at x = z = 0. The motion takes `seconds`.
+    The path starts at x = z = 0. The motion lasts `seconds` seconds.
     """
     steps = pairwise([(0.0, 0.0), *path])
     distances = list(accumulate(math.dist(*step) for step in steps))

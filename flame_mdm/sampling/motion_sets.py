@@ -169,8 +169,8 @@ def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **option
         options: sampling options, as in `generate`.
 
     Raises:
-        UserError: If the model has a different skeleton or cannot do what is requested, or if no
-            candidate shows a standing person.
+        UserError: If the model does not have SMPL's 22 joints or cannot do what is requested, or if
+            no candidate shows a standing person.
     """
     if model.representation.skeleton.joints != SMPL22.joints:
         raise UserError(

@@ -34,7 +34,7 @@ def refuse_no_condition(model: MotionGenerator) -> None:
 
 
 def default_folder(model: MotionGenerator, title: str, *request: object) -> Path:
-    """Returns `samples/<experiment>/<title>-<hash>`, where the hash covers the title and `request`.
+    """Returns `samples/<experiment>/<title>-<hash>`; the hash depends on the title and `request`.
 
     Requests for different motions therefore use different folders, even on a file system that
     ignores case. The folder is always inside `SAMPLES`, even if an untrusted checkpoint contains a

@@ -45,13 +45,13 @@ class Placement:
         return cls(turn, to_center - rotate_y(from_center, turn))
 
     def apply(self, joints: Tensor) -> Tensor:
-        """Moves joint positions (B, ..., 3) from body coordinates to the world, in float64."""
+        """Converts joint positions (B, ..., 3) from body to world coordinates, in float64."""
         ones = (1,) * (joints.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(joints.shape[:-1])
         return rotate_y(joints.double(), turn) + self.shift.view(-1, *ones, 3)
 
     def undo(self, points: Tensor) -> Tensor:
-        """Inverts `apply`: moves points (B, ..., 3) from the world to body coordinates."""
+        """Inverts `apply`: converts points (B, ..., 3) from world to body coordinates."""
         ones = (1,) * (points.ndim - 2)
         turn = self.turn.view(-1, *ones).expand(points.shape[:-1])
         return rotate_y(points.double() - self.shift.view(-1, *ones, 3), -turn)
@@ -60,7 +60,7 @@ class Placement:
 def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
     """Returns the placement at which the frames after `last` start when they are decoded.
 
-    It does not depend on these frames, because each frame contains the turn and the step of the
+    It does not depend on the later frames, because each frame contains the turn and the step of the
     root to the next frame.
 
     Args:

@@ -18,7 +18,7 @@ class PromptFile:
 
     Attributes:
         path: name of the file, as the user typed it.
-        lines: the prompts by line number, which starts at 1. Blank lines are omitted.
+        lines: the prompts by line number, starting at 1. Blank lines are omitted.
         refused: for each refused prompt, the reason why it cannot be sampled, by line number.
     """
 
@@ -79,7 +79,7 @@ class PromptFile:
         ]
 
     def report(self) -> list[str]:
-        """Returns one line per refused prompt, which states the reason."""
+        """Returns one line per refused prompt that states the reason."""
         return [
             f"{self.path}, line {number}: {first_line(self.refused[number])}"
             for number in sorted(self.refused)

@@ -107,7 +107,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
             raise UserError(
-                f"{name}features have shape {shape}, not (frames, {size}), or are not finite"
+                f"{name}features have shape {shape}, not (frames, {size}), or contain NaN or infinity"
             )
         return motion
     try:
@@ -128,7 +128,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
 
 
 def decoded(representation: Representation, features: Tensor, text: str, name: str) -> Motion:
-    """Decodes features (F, D), which are not normalized, to a motion."""
+    """Decodes unnormalized features (F, D) to a motion."""
     joints, fps, skeleton = (
         representation.decode(features).cpu().numpy(),
         representation.fps,

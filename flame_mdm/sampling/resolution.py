@@ -59,13 +59,13 @@ class ResolvedPrompt:
 
 @dataclass(frozen=True)
 class ResolvedRequest:
-    """A request for one model, with its sentences split, its lengths in frames and its files read.
+    """A request for one model: its sentences are split, lengths are in frames, and files are read.
 
     Attributes:
         request: the original request.
         prompts: the texts or actions of the request in order, without refused prompts.
         is_sequence: whether the motions are sampled in overlapping windows.
-        before: features (F, D), not normalized, of the motion that all sampled motions continue.
+        before: unnormalized features (F, D) of the motion that all sampled motions continue.
         targets: positions and poses to reach.
         edit: an edit that keeps part of a motion in all sampled motions. `known` and `keep` have
             the shape (1, F, D).
@@ -95,8 +95,8 @@ def resolve(
     Args:
         request: the request.
         model: the model that samples the motions.
-        refused: mapping to which the errors of prompts that the model cannot sample are added, by
-            prompt index; all other prompts are resolved. By default, the first error is raised.
+        refused: mapping from prompt indices to errors. Prompts that the model cannot sample are
+            added to it; all other prompts are resolved. By default, the first error is raised.
         check_words: whether to reject a text if the model knows none of its content words.
 
     Raises:
@@ -157,8 +157,8 @@ def _usual_frames(
 ) -> list[float | None]:
     """Returns the number of frames of each part whose duration the prompt does not state.
 
-    The result has one entry per part, where None stands for the default length. The requested
-    number, if any, applies to all parts. Otherwise, a part that states a number of repetitions is
+    The result has one entry per part; None stands for the default length. The requested number of
+    frames, if any, applies to all parts. Otherwise, a part that states a number of repetitions is
     as long as the repetitions take, because a longer motion would repeat the action more often.
     """
     parts = len(prompt.parts)

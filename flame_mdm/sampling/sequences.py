@@ -44,7 +44,7 @@ def part_frames(
         usual: the (unrounded) number of frames of each part whose duration the prompt does not
             state. None stands for `USUAL_SECONDS` or, if that is too long for one window, as many
             frames as fit into it.
-        is_sequence: whether the motion is sampled in windows. If not, it has a single part.
+        is_sequence: whether the motion is sampled in windows. If not, the prompt has a single part.
         loop: whether the last frame should lead to the first one.
 
     Raises:
@@ -93,7 +93,7 @@ def _sequence_frames(
         if length < shared:
             raise UserError(
                 f"'{name}': a part of {length / fps:g} seconds is too short. Use at least {shared / fps:g} seconds, "
-                "which neighboring windows share"
+                "the overlap of neighboring windows"
             )
     if sum(lengths) > MAX_SECONDS * fps:
         raise UserError(

@@ -63,7 +63,7 @@ def stream(
             per second of motion.
         cleanup: whether to smooth the motion, keep bone lengths constant, and keep feet from
             sliding. Each block is then returned only after the next one has been computed, because
-            the two must fit together.
+            the two blocks must fit together.
         options: `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing`. Default:
             the model's.
 
@@ -96,8 +96,8 @@ class Stream(Iterator[Motion]):
     """An endless motion, as an iterator of blocks; created by `flame_mdm.stream`.
 
     Each block is a `Motion` that is placed in the world where the previous block ends. A block is
-    computed when it is requested; with `cleanup`, so is the next block. If the seed is the same and
-    the text changes in the same way at the same times, the motion is the same.
+    computed when it is requested; with `cleanup`, so is the next block. With the same seed and the
+    same changes of the text at the same times, the motion is the same.
 
     Example:
         >>> import itertools, flame_mdm
@@ -113,7 +113,7 @@ class Stream(Iterator[Motion]):
 
     @property
     def frames(self) -> int:
-        """Total number of frames of the blocks so far."""
+        """Total number of frames in all blocks so far."""
         return self._streams.frames[0]
 
     @property
@@ -151,11 +151,11 @@ class Stream(Iterator[Motion]):
         """Leads the person along waypoints from the next block on.
 
         The path bends toward the next waypoint, while the text determines how the person moves; a
-        person who is standing stays there. After the last waypoint, the path no longer bends.
+        person who is standing stays in place. After the last waypoint, the path no longer bends.
 
         Args:
             waypoints: (x, z) in meters in the world, in order. They replace all earlier waypoints;
-                an empty list only removes these.
+                an empty list only removes them.
 
         Raises:
             UserError: If a waypoint does not consist of two finite numbers or is too far away, or
@@ -172,9 +172,9 @@ class Stream(Iterator[Motion]):
         """Drops the frames after a given time, so that the next block continues from there.
 
         If this is called before the dropped frames are shown, a new text takes effect at once, even
-        if blocks were computed ahead. The result is the same as if the text had been changed at
-        that time. Later changes of the text are also dropped, and waypoints that were reached later
-        count as not yet reached.
+        if blocks were computed in advance. The result is the same as if the text had been changed
+        at that time. Later changes of the text are also dropped, and waypoints that were reached
+        later count as not yet reached.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
@@ -263,7 +263,7 @@ class Schedule:
 
     @classmethod
     def of_parts(cls, conditions: Sequence[str], lengths: Sequence[int]) -> Self:
-        """Returns the schedule of consecutive parts, whose numbers of frames are `lengths`."""
+        """Returns the schedule of consecutive parts; `lengths` contains their numbers of frames."""
         schedule, begin = cls(conditions[0]), 0
         for condition, length in zip(conditions[1:], lengths, strict=False):
             begin += length
@@ -271,7 +271,7 @@ class Schedule:
         return schedule
 
     def add(self, frame: int, condition: str) -> None:
-        """Changes the condition from the given frame until the next change."""
+        """Changes the condition from the given frame on, until the next change."""
         changes = {**dict(self.changes), frame: condition}
         self.changes = sorted(changes.items())
 
@@ -284,7 +284,7 @@ class Schedule:
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames from a frame to the next change, or None if none follows."""
+        """Returns the number of frames from a frame to the next change, if any."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 
@@ -301,15 +301,15 @@ class Streams(Iterator[list[Motion]]):
         prefix: (B, C, D) normalized features of the frames before the streams.
         placement: placement of the first frames in the world. None = each stream starts at x = z =
             0, facing +z.
-        options: sampler options. An option that is None has the model's value.
+        options: sampler options. Options that are None default to the model's values.
         kind: "text", "action", or "none" for unconditioned motions.
         seed: seed of the noise.
         block: number of frames per block. Default: the number that the model predicts at once.
 
     Attributes:
         schedules: for each stream, the condition of each frame.
-        texts: the text as it was typed, by condition. It becomes the text of the blocks; a
-            condition without an entry is used unchanged.
+        texts: the text as it was typed, by condition. It becomes the text of the blocks; if a
+            condition has no entry, the condition itself is used.
         frames: number of frames of each stream so far.
         targets: positions that a single stream should reach, or None. Guidance leads the motion to
             them. If the model was trained with targets, they are also part of its condition.
@@ -495,9 +495,9 @@ class Streams(Iterator[list[Motion]]):
 
     @torch.no_grad()
     def _encode(self, conditions: list[str]) -> Condition:
-        """Returns the conditions in encoded form.
+        """Returns the encoded conditions.
 
-        The texts are encoded again only if they have changed.
+        They are encoded again only if they have changed.
         """
         if self._encoded is None or self._encoded[0] != conditions:
             model, device = self.model, self.model.device
@@ -570,8 +570,8 @@ def check_streams(model: MotionGenerator) -> None:
 def read_text(model: MotionGenerator, text: str) -> str:
     """Returns the text in the form that the model reads.
 
-    If the text names one action that occurs in the model's captions, it is rewritten in their
-    words.
+    If the text names one action that occurs in the model's captions, it is rewritten in the words
+    of these captions.
 
     Raises:
         UserError: If the text is empty or too long, or if the model does not understand it.

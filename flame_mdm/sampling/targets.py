@@ -66,7 +66,7 @@ class PoseTarget(Timed):
 
 
 class TargetFile(ClosedSchema):
-    """Content of a JSON file of targets; see docs/targets.md."""
+    """Content of a JSON file with targets; see docs/targets.md."""
 
     root: Sequence[Waypoint] = ()
     joints: Sequence[JointTarget] = ()

@@ -48,7 +48,7 @@ def bends(
     points: Sequence[Point],
     fps: float,
 ) -> list[float]:
-    """Returns the angles (F,) to add to the turns of the root so that it passes the waypoints.
+    """Returns the angles (F,) to add to the root's turns so that it passes through the waypoints.
 
     The direction of travel approaches the direction of the next waypoint. The added angle, in
     radians, is limited per second and per meter of the path. If a waypoint is beside the person and
@@ -56,8 +56,8 @@ def bends(
 
     Args:
         turns: (F,) turns of the root from each frame to the next in radians, positive to the left.
-        steps: (F, 2) steps of the root to the next frame in meters: to the left of the body, and
-            forward.
+        steps: (F, 2) displacements of the root from each frame to the next in meters, to the left
+            of the body and forward.
         heading: direction of the body in the first frame in radians, as in `Placement.turn`.
         position: position of the root in the first frame, in meters.
         points: positions of the waypoints, in order.
@@ -93,8 +93,8 @@ def _bend(travel: float, length: float, position: Point, goal: Point, fps: float
     """Returns the angle in radians to add in a frame; see `bends`.
 
     Args:
-        travel: direction of the step to the next frame in radians.
-        length: length of this step in meters.
+        travel: direction in which the root moves to the next frame, in radians.
+        length: distance that the root moves to the next frame, in meters.
         position: position of the root.
         goal: position of the next waypoint.
         fps: frames per second.
@@ -115,7 +115,8 @@ def _bend(travel: float, length: float, position: Point, goal: Point, fps: float
 class RouteGuide:
     """A `flame_mdm.batch.Guide` that bends the path of a block at each sampling step.
 
-    In the next steps, the denoiser sees the bent path and adapts the rest of the motion to it.
+    In the following sampling steps, the denoiser sees the bent path and adapts the rest of the
+    motion to it.
     """
 
     representation: HumanML

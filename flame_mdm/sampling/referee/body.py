@@ -87,7 +87,7 @@ class Body:
 
     @cached_property
     def forward(self) -> np.ndarray:
-        """Direction (F, 2) in x and z that the body faces, computed from the hips and shoulders."""
+        """Direction (F, 2) that the body faces, as x and z, based on the hips and shoulders."""
         across = self.joints[:, HIPS[0]] - self.joints[:, HIPS[1]]
         across = across + self.joints[:, SHOULDERS[0]] - self.joints[:, SHOULDERS[1]]
         left = gaussian_filter1d(across[:, [0, 2]], 0.1 * RATE, axis=0, mode="nearest")
@@ -119,7 +119,7 @@ class Body:
     def velocity(self) -> np.ndarray:
         """Velocity (F, 2) of the pelvis to the left and forward, in m/s.
 
-        The sway of the individual steps is filtered out.
+        The sway of individual steps is filtered out.
         """
         ground = gaussian_filter1d(
             self.joints[:, PELVIS][:, [0, 2]], 0.15 * RATE, axis=0, mode="nearest"
@@ -159,7 +159,7 @@ class Body:
 
 
 def rate_of(values: np.ndarray) -> np.ndarray:
-    """Returns the change per second of values (F, ...)."""
+    """Returns how fast values (F, ...) change per second."""
     if len(values) < 2:
         return np.zeros_like(values)
     return np.gradient(values, 1 / RATE, axis=0)

@@ -113,8 +113,8 @@ def judge(
 ) -> Judgment:
     """Judges whether a motion does what a sentence says.
 
-    Reads the claims in the sentence and measures each of them on the motion. The answer to each is
-    "yes", "no" or "cannot tell". docs/referee.md lists what can be checked.
+    Reads the claims in the sentence and checks each of them by measuring the motion. The answer to
+    each is "yes", "no" or "cannot tell". docs/referee.md lists the claims that can be checked.
 
     Args:
         motion: a motion of SMPL's 22 joints, or joint positions (F, 22, 3) in meters, with y up.
@@ -122,8 +122,9 @@ def judge(
         fps: frames per second; required for joint positions.
 
     Raises:
-        UserError: If the motion has a different skeleton, is shorter than 0.4 seconds or contains
-            NaN or infinity, if there is no text, or if joint positions are passed without `fps`.
+        UserError: If the motion does not have SMPL's 22 joints, is shorter than 0.4 seconds or
+            contains NaN or infinity, if there is no text, or if joint positions are passed without
+            `fps`.
     """
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
@@ -207,10 +208,10 @@ def decide(body: Body, claim: Claim) -> Verdict:
 
 
 def _order(body: Body, claim: Claim) -> Reading:
-    """Measures the time in seconds between the starts of the two parts of an order.
+    """Measures the time in seconds between the starts of two events whose order is claimed.
 
-    If a part happens several times, the pair of starts with the largest difference counts. The
-    order is undecided if the answer for either part is not "yes", or if the reverse order also
+    If an event happens several times, the pair of starts with the largest difference counts. The
+    order is undecided if the answer for either event is not "yes", or if the reverse order also
     happens.
     """
     first, second = (decide(body, part) for part in claim.parts)
@@ -256,7 +257,7 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 def _duration(body: Body, claim: Claim) -> Reading:
     """Measures how long a claim is true, including interruptions of up to `BREAK` seconds.
 
-    The score is -|log2(measured / claimed)|. The claim is undecided if it is not even true without
+    The score is -|log2(measured / claimed)|. The claim is undecided if it is not true even without
     its duration.
     """
     verdict = decide(body, replace(claim, seconds=None))

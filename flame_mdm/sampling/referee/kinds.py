@@ -49,7 +49,7 @@ class Kind:
         measure: function that measures a claim on a body.
         no, yes: thresholds that were set by hand. A claim is false for scores up to `no`, true for
             scores from `yes` on, and undecided in between.
-        is_timed: whether the spans of the reading tell when the claimed event happens. Only such
+        is_timed: whether the spans of the reading show when the claimed event happens. Only such
             events can be part of an order.
     """
 
@@ -147,7 +147,7 @@ def threshold_key(claim: Claim) -> str:
     """Returns the name of the thresholds for a claim.
 
     The name consists of the kind and the speed that the claim states. If it states no speed, the
-    name tells whether it has a side or a direction.
+    name says whether the claim has a side or a direction.
     """
     if claim.parts:
         return ORDER
@@ -160,12 +160,12 @@ def threshold_key(claim: Claim) -> str:
 
 @cache
 def thresholds() -> dict[str, Any]:
-    """Returns the calibrated thresholds and their numbers of motions, by `threshold_key`."""
+    """Returns the calibrated thresholds and the numbers of motions used, by `threshold_key`."""
     return read_package_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns the two thresholds of a claim, between which a score leaves it undecided.
+    """Returns the two thresholds of a claim; scores between them leave it undecided.
 
     They do not depend on whether the claim is about the start, the end or any time.
     """

@@ -98,7 +98,7 @@ def turn(body: Body, claim: Claim) -> Reading:
 
 
 def turn_amount(body: Body, claim: Claim) -> Reading:
-    """Measures the relative error of the largest turn with respect to the claimed angle."""
+    """Measures the relative error between the largest turn and the claimed angle."""
     reading = turn(body, claim)
     claimed = claim.amount or 180
     score = -abs(reading.number - claimed) / claimed
@@ -122,7 +122,7 @@ def _turn(yaw: np.ndarray, direction: str) -> Reading:
 
 
 def circle(body: Body, claim: Claim) -> Reading:
-    """Measures how far the direction of travel turns while the body travels, in degrees."""
+    """Measures how far the direction of travel turns while the body is moving, in degrees."""
     moving = body.speed > MOVING
     if moving.sum() < 0.5 * RATE:
         return Reading(0.0, 0.0, "degrees", "path")
@@ -151,7 +151,7 @@ def run(body: Body, claim: Claim) -> Reading:
 
 
 def walk(body: Body, claim: Claim) -> Reading:
-    """Measures the distance traveled below running speed, which begins at 2.2 m/s."""
+    """Measures the distance traveled at less than running speed (2.2 m/s)."""
     is_walk = (body.speed > MOVING) & (body.speed < 2.2)
     distance = float(body.speed[is_walk].sum() / RATE)
     spans = spans_of(is_walk, 0.3)
@@ -170,7 +170,7 @@ def pace(body: Body, claim: Claim) -> Reading:
 
 
 def stop(body: Body, claim: Claim) -> Reading:
-    """Measures by which fraction the last 0.3 seconds are slower than the fastest 0.3 seconds."""
+    """Measures by what fraction the last 0.3 seconds are slower than the fastest 0.3 seconds."""
     last = float(body.speed[-max(1, round(0.3 * RATE)) :].mean())
     fastest = held(body.speed, 0.3)
     share = 1 - last / fastest if fastest > 0.3 else np.nan

@@ -126,7 +126,10 @@ def get_down(body: Body, claim: Claim) -> Reading:
 
 
 def _change(signal: np.ndarray) -> Reading:
-    """Returns a reading of the largest rise of a signal (F,), in meters, whose span is the rise."""
+    """Returns a reading of the largest rise of a signal (F,), in meters.
+
+    The span of the reading is the time of the rise.
+    """
     lowest = np.minimum.accumulate(signal)
     end = int((signal - lowest).argmax())
     start = int(signal[: end + 1].argmin())
@@ -135,7 +138,7 @@ def _change(signal: np.ndarray) -> Reading:
 
 
 def stand_still(body: Body, claim: Claim) -> Reading:
-    """Measures how far the pelvis moves from its median position on the floor."""
+    """Measures how far the pelvis moves horizontally from its median position."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - np.median(ground, axis=0), axis=-1)
     farthest = float(np.percentile(away, 98))
@@ -161,7 +164,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the final distance from the start as a fraction of the largest distance from it."""
+    """Measures the final distance from the start, relative to the largest distance from it."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])
@@ -250,7 +253,7 @@ def raise_foot(body: Body, claim: Claim) -> Reading:
 
 
 def one_leg(body: Body, claim: Claim) -> Reading:
-    """Measures how long one foot is on the floor while the other foot is in the air, in seconds."""
+    """Measures for how many seconds one foot is on the floor while the other is in the air."""
     toes = body.height[:, TOES]
     readings = []
     for side in (0, 1):

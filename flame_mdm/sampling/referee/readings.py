@@ -25,8 +25,8 @@ class Reading:
         spans: start and end, in seconds, of each time span in which the claim is true or nearly
             true.
         unclear: reason why the claim is undecided despite a high score; "" = none.
-        signal: values (F,) that tell for each frame whether the claim is true, or None if this
-            cannot be told from single frames.
+        signal: values (F,) that show in which frames the claim is true, or None if single frames
+            cannot show this.
         level: minimum value of `signal` at which the claim is true; None = the middle of the kind's
             band.
     """
@@ -42,9 +42,9 @@ class Reading:
 
 
 def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
-    """Returns the start and the end, in seconds, of each run of frames whose flag (F,) is True.
+    """Returns the start and end times, in seconds, of stretches of True values in `flags` (F,).
 
-    Runs shorter than `shortest` seconds are omitted.
+    Stretches shorter than `shortest` seconds are omitted.
     """
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0])).reshape(-1, 2)
     return tuple(
@@ -55,7 +55,7 @@ def spans_of(flags: np.ndarray, shortest: float = 0.0) -> Spans:
 
 
 def held(signal: np.ndarray, seconds: float) -> float:
-    """Returns the highest value that a signal (F,) reaches for `seconds` seconds in total."""
+    """Returns the highest value that a signal (F,) reaches or exceeds for `seconds` in total."""
     count = min(len(signal), max(1, round(seconds * RATE)))
     return float(np.sort(signal)[-count])
 
@@ -65,9 +65,8 @@ def existence(
 ) -> Reading:
     """Returns a reading of the highest value that a signal (F,) holds for `seconds` seconds.
 
-    Its spans consist of the frames above a level, which lies between the median and the highest
-    value of the signal, at the fraction `share`. If the signal is short, its lowest value replaces
-    the median.
+    Its spans consist of the frames above a level, which is the fraction `share` of the way from the
+    signal's 20th percentile to this value.
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))
@@ -103,8 +102,8 @@ def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
 def cycles(signal: np.ndarray, depth: float) -> list[int]:
     """Returns the frames in which a signal (F,) has peaks.
 
-    A peak is `depth` above the valleys on both sides. If a signal begins or ends high, the outer
-    valley exists only if the signal returns to a low value within the motion.
+    A peak is more than `depth` above the valleys on both sides. If a signal begins or ends high,
+    the outer valley exists only if the signal returns to a low value within the motion.
     """
     peaks: list[int] = []
     low, high, at = signal[0], -np.inf, 0

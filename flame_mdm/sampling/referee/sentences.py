@@ -112,7 +112,7 @@ def read_claims(text: str) -> list[Claim]:
 def _plain(text: str) -> str:
     """Converts text to lower case and removes hyphens and apostrophes.
 
-    Phrases that contain a connective are joined to one word.
+    Phrases that contain a connective are joined into one word.
     """
     plain = re.sub(r"[-'’\"]", " ", text[:LONGEST].lower())
     plain = re.sub(r"\b(?:counter|anti) ?clockwise\b", "counterclockwise", plain)
@@ -218,7 +218,7 @@ def _claims(pattern: Pattern, text: str) -> list[Claim]:
 
 
 def _further(take: str, claim: Claim, text: str) -> list[Claim]:
-    """Returns the claims that a clause makes in addition to the one of its pattern."""
+    """Returns the claims that a clause makes in addition to the claim of its pattern."""
     if take == "travel" or take == "jumped":
         direction = _direction(text)
         kind = "step" if take == "jumped" or claim.kind == "step" else "travel"

@@ -167,7 +167,7 @@ class Guide(Protocol):
         ...
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns a clean estimate that meets the goal."""
+        """Returns a version of a clean estimate that reaches the goal."""
         ...
 
 
@@ -184,9 +184,10 @@ class Edit:
             the kept part of the noisy sample with the known motion at the same noise level (FLAME,
             RePaint). "trajectory" overwrites the beginning of the flow's path (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
-        blend: for "x_t", when the kept part is replaced: "after" each step (FLAME, eq. 6), so that
-            the result contains the known motion itself, or "before" each call of the denoiser
-            (FLAME's code), so that the result contains the model's version of the known motion.
+        blend: for "x_t", when the kept part is replaced. "after" = after each step (FLAME, eq. 6);
+            the result then contains the known motion itself. "before" = before each call of the
+            denoiser (FLAME's code); the result then contains the model's version of the known
+            motion.
         resample: for "x_t", how many times each step is repeated. Noise is added again before each
             repetition (RePaint, algorithm 1).
         guide: for "x0", a guide toward a goal, which changes the clean estimate at each step before

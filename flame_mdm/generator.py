@@ -335,7 +335,7 @@ class Blocks:
     """Generates motions block by block: each block continues the last frames of the previous one.
 
     Source: Tevet et al. 2025, "CLoSD". The noise of a block is a function of (seed, replication,
-    id, block index). Changing a condition therefore changes only the later blocks.
+    id, block index). Changing a condition therefore affects only later blocks.
 
     Args:
         model: the model. Its denoiser has `context_frames` C.

@@ -192,7 +192,7 @@ class Result(Measured):
 
     @property
     def counts(self) -> str:
-        """Most common `Value.counts` of the values, or "" if there are no values."""
+        """The most common `Value.counts`, or "" if there are no values."""
         values = [value for value in (self.values or {}).values() if value and value.replications]
         counts = Counter(value.counts for value in values if value.n != 0)
         return counts.most_common(1)[0][0] if counts else ""

@@ -302,7 +302,7 @@ class GeneratorTask(Task):
             self.generator.denoiser.compile()
 
     def on_fit_start(self) -> None:
-        """Samples once, with a denoiser that returns 0, so that invalid options fail early."""
+        """Samples once, with a denoiser that returns 0, so that invalid options are found early."""
         process = self.generator.process
         like = torch.zeros(1, 2, self.generator.representation.features, device=self.device)
         mask = torch.ones(1, 2, dtype=torch.bool, device=self.device)

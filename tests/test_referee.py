@@ -418,7 +418,7 @@ def test_the_command_samples_candidates_and_warns_of_a_text_without_claims(
     assert main([*sample, "text=a person raises the left hand"]) == 0
     assert "no claim" not in capsys.readouterr().out
     assert main([*sample, "text=a person dances"]) == 0
-    assert "'a person dances' has no claim that can be checked" in capsys.readouterr().out
+    assert "'a person dances' contains no claim that can be checked" in capsys.readouterr().out
 
 
 def test_pages_mark_the_evidence_and_the_demo_lists_the_verdicts(tmp_path):

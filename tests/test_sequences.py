@@ -248,12 +248,12 @@ def test_bad_requests_give_one_clear_line(model, subtests):
         (
             "walks",
             {"after": "walk.npz", "loop": True},
-            r"^after=walk\.npz: a motion .* cannot have loop\.",
+            r"^after=walk\.npz: a motion .* cannot be combined with loop\.",
         ),
         (
             "walks",
             {"after": "walk.npz", "targets": "path.json"},
-            r"^after=walk\.npz: .* cannot have targets\.",
+            r"^after=walk\.npz: .* cannot be combined with targets\.",
         ),
         ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Use a \.npz"),
         ("walks", {"seed": 0.5}, "seed=0.5: expected a whole number"),

@@ -33,7 +33,7 @@ class BenchmarkSettings:
     out: str | None = option(None, "folder; default: runs/benchmark/<exp>")
     jobs: int = option(
         1,
-        "number of models to train at the same time, which share the CPU cores and take about "
+        "number of models to train at the same time; they share the CPU cores and need about "
         "2 GiB of memory each",
     )
     device: str | None = option(

@@ -39,11 +39,11 @@ class CompareSettings(BodySettings):
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and
     motions for the same prompts. If the runs have results for the same protocol, data and
-    extractor, prints the difference in each metric with its 95 % interval, and whether the
-    interval contains 0. Instead of a run, you can name a FOLDER of motion files, such as real
-    motions (`browse motions=FOLDER`) or motions from another program. The runs are then sampled
-    for the captions and lengths of these motions. rate=true writes a blind user study
-    instead: a page that asks which of two motions fits a text better. ratings= counts the answers.
+    extractor, prints the difference in each metric with its 95 % interval, and whether the interval
+    contains 0. Instead of a run, you can name a FOLDER of motion files, such as real motions
+    (`browse motions=FOLDER`) or motions from another program. Motions with the same captions and
+    lengths are then sampled from the runs. rate=true writes a blind user study instead: a page that
+    asks which of two motions fits a text better. ratings= counts the answers.
     """
 
     OBJECTS: ClassVar = ("runs",)
@@ -52,7 +52,7 @@ class CompareSettings(BodySettings):
     )
     prompts: str | None = option(
         None,
-        "file with one prompt per line, for which the last.ckpt of each run is sampled. Default: the "
+        "file with one prompt per line, to sample from the last.ckpt of each run. Default: the "
         "captions of the first folder of motion files or, without such a folder, the newest samples "
         "of each run",
     )

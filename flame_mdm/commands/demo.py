@@ -23,7 +23,7 @@ class DemoSettings:
         "one or more models, separated by spaces: names, files, runs or hub ids",
     )
     adapter: list[str] = option(
-        list, "adapters for the first model, separated by spaces, of which users can choose one"
+        list, "adapters for the first model, separated by spaces; users can choose one of them"
     )
     host: str = option(
         "127.0.0.1",

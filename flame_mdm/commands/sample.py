@@ -231,7 +231,9 @@ def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptF
     if settings.scorer == CLAIMS:
         for prompt in resolved.prompts:
             if not read_claims(prompt.text):
-                say(f"warning: '{shortened(prompt.text, 60)}' has no claim that can be checked")
+                say(
+                    f"warning: '{shortened(prompt.text, 60)}' contains no claim that can be checked"
+                )
     stages = [] if settings.trajectory else None
     motions = sample(model, resolved, score=score, stages=stages)
     say(*degenerate_notes(motions))

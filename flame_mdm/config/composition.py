@@ -92,7 +92,7 @@ def prepare_overrides(
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
-    if recipe.saved:  # the parts are fixed, so that a launcher can only be added
+    if recipe.saved:  # the parts are fixed, so only a launcher can be added
         parsed = parse(
             [f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in overrides]
         )

@@ -72,7 +72,7 @@ EXAMPLES = (
     "a person talks on the phone",
     "a person does a push-up",
 )
-"""Example texts, of which the page shows those that its model can generate."""
+"""Example texts; the page shows those that its model can generate."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
 <div class="list"></div><button type="button" class="add">+ Add an action</button></div>

@@ -105,8 +105,8 @@ def edit(
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
             `method`, `until` and `resample` select how it is resampled. All of them are described
             in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
-            also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` changes
-            the kept part, too, usually by millimeters; `Edited.joint_error` says by how much.
+            also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
+            changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
 
     Returns:
         The edited motions, with `samples` motions for each text: all samples of the first text come

@@ -1,7 +1,7 @@
 # pyright: standard
 """Requests for motions and edits.
 
-Requests are checked without torch, so that invalid input fails quickly.
+Requests are checked without torch, so that invalid input is rejected quickly.
 """
 
 from __future__ import annotations
@@ -282,7 +282,8 @@ class SamplingRequest:
         if self.after is not None and other is not None:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
             raise UserError(
-                f"after={name}: a motion that continues another motion cannot have {other}. Omit after or {other}"
+                f"after={name}: a motion that continues another motion cannot be combined with {other}. "
+                f"Omit after or {other}"
             )
 
         if (edit := self.editing) is not None:

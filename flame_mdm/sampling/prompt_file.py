@@ -1,5 +1,5 @@
 # pyright: standard
-"""Prompt files, which are read without torch, so that invalid files fail quickly."""
+"""Prompt files, which are read without torch, so that invalid files are rejected quickly."""
 
 from __future__ import annotations
 

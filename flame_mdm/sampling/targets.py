@@ -276,7 +276,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
 def _pose(
     representation: Representation, entry: PoseTarget, folder: Path, where: str
 ) -> tuple[np.ndarray, Tensor]:
-    """Returns the joint positions (J, 3) of a pose, whose root is at x = z = 0, and its features."""
+    """Returns the joint positions (J, 3) of a pose with its root at x = z = 0, and its features."""
     motion = read_motion(
         representation, folder / entry.file if Path(entry.file).suffix else entry.file
     )

@@ -384,8 +384,8 @@ class Blocks:
 
         Args:
             cond: the conditions of this block.
-            kept: (B,) int64, number of frames of the block that are kept and that the next block
-                continues. Default: all frames.
+            kept: (B,) int64, number of frames to keep at the beginning of the block. The next block
+                continues these frames. Default: all frames.
             edit: part of the block that is given rather than generated.
         """
         model, prefix = self.model, self.prefix

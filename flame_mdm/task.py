@@ -271,7 +271,7 @@ class GeneratorTask(Task):
         return self.generator.condition
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
-        """Adds facts about the training data to the generator, which shares them."""
+        """Adds facts about the training data, which the task and the generator share."""
         self.generator.add_facts(facts)
 
     def describe(self) -> str:

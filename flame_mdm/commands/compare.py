@@ -75,7 +75,7 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
-    """Writes a page that compares runs, or counts the ratings in a user study."""
+    """Compares runs on a page, or counts the ratings in a user study."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError(
             'use either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings'

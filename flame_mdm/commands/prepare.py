@@ -26,7 +26,7 @@ class PrepareSettings(DataSettings):
 
 
 def main(settings: PrepareSettings) -> None:
-    """Writes the store of a data set, or checks its files, and prints the report."""
+    """Writes a data set's store or checks its files, and prints a report."""
     node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import write_store

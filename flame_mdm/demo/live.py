@@ -171,8 +171,8 @@ class LiveStreams:
     def _count(self, live: LiveStream) -> None:
         """Counts a block toward the limits of a stream.
 
-        Raises `UserError` if a stream computes more blocks than a visitor can watch, or if it has
-        reached its maximum duration.
+        Raises `UserError` if a stream computes blocks faster than a visitor can watch them, or if
+        it has reached its maximum duration.
         """
         now = self.clock()
         live.allowance = min(BURST, live.allowance + RATE * (now - live.used))

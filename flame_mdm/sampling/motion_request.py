@@ -355,7 +355,7 @@ class SamplingRequest:
 
     @property
     def kind(self) -> Literal["text", "action", "none"]:
-        """Kind of condition of the motions to sample."""
+        """Kind of condition for the motions to sample."""
         return (
             "text" if self.texts is not None else "action" if self.actions is not None else "none"
         )

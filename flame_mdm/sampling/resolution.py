@@ -38,8 +38,8 @@ class ResolvedPrompt:
         is_split: whether the original prompt was a sentence with several actions.
         conditions: caption or action of each part, as the model reads it.
         texts: the words of the prompt that belong to each part.
-        frames: number of frames of each part. In a continued motion, the first part includes the
-            frames that overlap with the previous motion.
+        frames: number of frames of each part. If the motion continues another one, the first part
+            includes the frames in which they overlap.
         unknown: words of the text that do not occur in the training captions or that the model does
             not read.
         summary: one line that states how the text was understood, or "" if the model's captions may

@@ -55,8 +55,9 @@ def stream(
     Args:
         model: a model that continues frames (DiP), from `flame_mdm.load`.
         text: what the person does at first.
-        start: the motion to continue: a `Motion`, a file, or "dataset:id" for a clip of a prepared
-            data set. Only its last frames are used. By default, the person first stands still.
+        start: the motion to continue, as a `Motion`, a file, or "dataset:id" for a clip of a
+            prepared data set. Only its last frames are used. By default, the person first stands
+            still.
         seed: seed of the noise.
         block: number of frames per block. The default and maximum is the number of frames that the
             model predicts at once. Shorter blocks react sooner to a new text, but cost more time

@@ -1,1 +1,1 @@
-"""The referee: reads the claims in a sentence, measures them on a motion and shows evidence."""
+"""The referee: reads the claims in a sentence, checks them against a motion and shows evidence."""

@@ -146,7 +146,7 @@ def test_arrays_are_edited_and_what_cannot_be_edited_is_refused_in_one_line(
             30,
             r"^the legs are 8\d\.\d m long .* The unit may be 0\.01 \(centimeters\)",
         ),
-        (joints * np.nan, 30, "numbers in joints, frame 0, are not finite"),
+        (joints * np.nan, 30, "joints in frame 0 contain NaN"),
         (
             np.tile(joints, (9, 1, 1)),
             30,

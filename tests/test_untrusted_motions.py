@@ -89,12 +89,12 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     (
         "a.npz",
         npz(poses=LONG, trans=np.zeros((4, 3)), mocap_framerate=20),
-        "poses are not an array of real numbers",
+        "poses must be an array of real numbers",
     ),
     (
         "a.npz",
         npz(joints=JOINTS, fps=20, representation="smpl147", features=FIELDS),
-        "features are not an array",
+        "features must be an array",
     ),
     ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
     ("a.npz", BOMB, "expand to"),

@@ -19,7 +19,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class AnimatedNodes:
-    """The node hierarchy of a file and its motion in one animation.
+    """A file's node hierarchy, and how the nodes move in one animation.
 
     Attributes:
         names: names of the N nodes.
@@ -71,7 +71,7 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 
 
 def parents_first(parents: Sequence[int]) -> list[int]:
-    """Returns the node indices in an order in which parents precede their children.
+    """Returns the node indices, ordered so that parents precede their children.
 
     Args:
         parents: index of each node's parent, or -1 for a root.

@@ -54,9 +54,9 @@ NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays in an .npz, .json or .npy motion file.
 
-    The result contains `joints`, or `poses` (F, 72) and `trans` (F, 3) as in AMASS. If the file
-    stores them, it also contains `fps`, `text`, `features` and `representation` and, for `.json`
-    files, `up`, `unit` and `names`. `ours` states whether this project wrote the file.
+    The result contains either `joints` or, as in AMASS, `poses` (F, 72) and `trans` (F, 3). These
+    entries are added if the file contains them: `fps`, `text`, `features`, `representation` and,
+    for `.json` files, `up`, `unit` and `names`. `ours` is True if this project wrote the file.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -78,7 +78,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     for name in {"joints", "poses", "trans"} & data.keys():
         check_numbers(name, data[name])
     if "features" in data and (not is_real(data["features"]) or data["features"].ndim != 2):
-        raise UserError("features are not an array (frames, features) of real numbers")
+        raise UserError("features must be an array (frames, features) of real numbers")
     if "poses" in data:
         data["poses"] = _axis_angles(data["poses"])
         if data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
@@ -97,7 +97,7 @@ def is_real(values: np.ndarray) -> bool:
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns the translation (F, 3) and the quaternions (F, 24, 4) in AMASS arrays.
+    """Converts AMASS arrays to a translation (F, 3) and quaternions (F, 24, 4).
 
     Both are float64. If `fps` is given, the motion is resampled.
     """
@@ -124,7 +124,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
     """Returns the axis-angle vectors (F, 72) of SMPL's joints.
 
-    The vectors of the hands are 0 if the file contains no hands.
+    If the file contains no hands, their vectors are 0.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
@@ -144,18 +144,18 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     """Checks the numbers in an array (F, ...).
 
     Raises:
-        UserError: If the array has no frames or too many frames, or if a number is not real, is not
-            finite, or has an absolute value of a million or more.
+        UserError: If the array has no frames or too many frames, or if it contains numbers that are
+            not real or not finite, or absolute values of a million or more.
     """
     if not is_real(values):
-        raise UserError(f"{name} are not an array of real numbers")
+        raise UserError(f"{name} must be an array of real numbers")
     if not values.ndim or not len(values):
-        raise UserError(f"{name} with shape {values.shape} have no frames")
+        raise UserError(f"{name} have no frames (shape {values.shape})")
     check_frames(len(values))
     if (beyond := ~(np.abs(values.astype(float)) < 1e6)).any():
         raise UserError(
-            f"numbers in {name}, frame {np.argwhere(beyond)[0][0]}, are not finite, or exceed "
-            "a million"
+            f"{name} in frame {np.argwhere(beyond)[0][0]} contain NaN, infinity, or numbers of "
+            "a million or more"
         )
 
 

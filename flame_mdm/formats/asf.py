@@ -1,10 +1,10 @@
 """ASF/AMC motion capture files (Acclaim, CMU): one file per skeleton, and one per motion.
 
-An ASF file lists the bones of a subject. For each bone, it contains the direction and the length in
-the standing rest pose, in world coordinates, as well as the coordinate axes C in which the bone
-turns and its degrees of freedom. An AMC file contains the angles of these degrees of freedom in
+An ASF file lists the bones of a subject. For each bone, it contains the direction (in world
+coordinates) and the length in the standing rest pose, the coordinate axes C in which the bone
+turns, and the degrees of freedom. An AMC file contains the angles of these degrees of freedom in
 each frame. If M is the rotation given by these angles, the bone turns by C M C^-1 relative to its
-parent. In an order such as XYZ, x is applied first: C = Rz Ry Rx.
+parent. With the order XYZ, for example, the rotation about x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints.
 
     Each bone becomes a joint with the same name at its start. The frame rate `fps` is required,
-    because AMC files do not contain it. It is 120 for most of CMU's recordings.
+    because AMC files do not contain it. Most of CMU's recordings have 120 frames per second.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
@@ -88,8 +88,8 @@ def read(path: Path, fps: float | None) -> Bvh:
 def skeleton_of(path: Path) -> Path:
     """Returns the ASF file that belongs to an AMC file in the same folder.
 
-    The ASF file has the name of the AMC file or of its subject (02.asf), or is the only ASF file in
-    the folder.
+    The ASF file is named after the AMC file or its subject (02.asf), or is the only ASF file in the
+    folder.
 
     Raises:
         UserError: If there is no such file.
@@ -101,13 +101,13 @@ def skeleton_of(path: Path) -> Path:
     )
     if chosen is None:
         raise UserError(
-            f"{path}: there is no skeleton {candidates[1].name} next to it. Put the ASF file into the same folder"
+            f"{path}: found no skeleton {candidates[1].name} next to it. Put the ASF file into the same folder"
         )
     return chosen
 
 
 def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
-    """Returns the bones of an ASF file and the parent of each bone except the root.
+    """Returns the bones in an ASF file, and the parent of every bone except the root.
 
     Parents precede their children.
     """
@@ -179,7 +179,7 @@ def _order(lines: Lines, words: list[str]) -> str:
 
 
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
-    """Returns the angles (F, N) in degrees of the N degrees of freedom of each bone.
+    """Returns the angles (F, N), in degrees, of each bone's N degrees of freedom.
 
     Raises:
         UserError: If there are too many frames for this number of `joints`.

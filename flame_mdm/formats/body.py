@@ -70,8 +70,7 @@ class PosedFigure(Figure):
 def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     """Fits a body to a clip and computes the rotations of its bones.
 
-    The joints of the body coincide with the joints of the motion, raised by the thickness of the
-    sole.
+    The body's joints coincide with the motion's joints, raised by the thickness of the sole.
 
     Args:
         motion: the clip. If it has no rotations, they are computed from its joint positions.
@@ -113,7 +112,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 def local_rotations(body: FittedBody) -> np.ndarray:
     """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents.
 
-    These rotations include the bend of the toes.
+    They include the bend of the toes.
     """
     count = len(SMPL22)
     world = body.turns[:, :count] @ body.mesh.turns[:count] @ body.neutral.mT
@@ -124,9 +123,9 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the linear maps (22, 3, 3) of the parts of a body, and the scale of its width.
+    """Returns a linear map (22, 3, 3) for each body part, and the scale of the body's width.
 
-    With these maps, the body in its rest pose has the `offsets` (22, 3) of a clip.
+    In its rest pose, the mapped body has the `offsets` (22, 3) of a clip.
     """
     # The limbs determine the size of the body. Hips and shoulders follow the clip's own widths.
     # The trunk blends both widths from bottom to top. Limbs are stretched only along their bones.
@@ -136,7 +135,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
             raise UserError(
                 f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's bone is "
-                f"{usual[joint]:.3g} m. Is the unit right? Such a motion is drawn without a body"
+                f"{usual[joint]:.3g} m. Is the unit right? Motions like this are drawn without a body"
             )
     wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())
 
@@ -161,7 +160,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _check_rotations(world: np.ndarray) -> None:
-    """Raises `UserError` if a matrix in (F, 22, 3, 3) is not finite or far from a rotation."""
+    """Raises `UserError` if a matrix in `world` (F, 22, 3, 3) is not close to a rotation."""
     products = world @ world.mT
     near = (np.abs(products - np.eye(3)) < ORTHONORMAL).all((2, 3))
     mirrored = (np.cross(world[..., 0, :], world[..., 1, :]) * world[..., 2, :]).sum(-1) < 0
@@ -174,7 +173,7 @@ def _check_rotations(world: np.ndarray) -> None:
 
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Appends the rotations of the helper bones to the rotations of the joints (F, 22, 3, 3)."""
+    """Appends the rotations of the helper bones to the joint rotations (F, 22, 3, 3)."""
     # Skin that follows a twisting bone collapses at the joint. A helper bone takes part of the
     # twist about the limb, so that the twist is distributed along the limb, as under real skin.
     helpers = []

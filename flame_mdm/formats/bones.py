@@ -1,10 +1,10 @@
 """Rotations for SMPL's joints, computed from the bones in a BVH or AMC file.
 
-Joint positions do not show how a forearm or a head turns about its own axis, but the bones of a
-file do. Each SMPL joint takes the rotation by which its bone has turned from the rest pose. Three
-rest poses are tried, in this order: the pose of the file without rotations, a rest pose that
+Joint positions do not show how a forearm or a head turns about its own axis, but the bones in a
+file do. The rotation of each SMPL joint is the rotation of its bone relative to the rest pose.
+Three rest poses are tried, in this order: the file's pose without rotations, a rest pose that
 precedes the motion, and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose,
-its arms and legs are turned to SMPL's directions by the smallest rotation.
+its arms and legs are turned by the smallest rotations that point them in SMPL's directions.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def bone_poses(
     """Returns the rotations of SMPL's joints, taken from the bones in a file.
 
     They cannot be used if the rest pose is unknown, or if they do not reproduce the joint
-    positions, as in files that move each joint by position channels.
+    positions, for example because position channels move each joint.
 
     Args:
         tree: the tree of joints in the file.
@@ -133,7 +133,7 @@ def _limbs() -> list[tuple[int, int]]:
 
 
 def _aligned(rest: np.ndarray, turned: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Returns the rotations (22, 3, 3) from SMPL's joints at rest to the bones of the file."""
+    """Returns the rotations (22, 3, 3) from SMPL's joints at rest to the bones in the file."""
     aligned = np.swapaxes(rest, 1, 2).copy()
     for start, end in _limbs():
         along = rest[start] @ _local(turned, steps, start, end)
@@ -145,7 +145,7 @@ def _aligned(rest: np.ndarray, turned: np.ndarray, steps: np.ndarray) -> np.ndar
 
 
 def _local(turned: np.ndarray, steps: np.ndarray, start: int, end: int) -> np.ndarray:
-    """Returns the mean position (3,) of the end of a bone, in the bone's coordinates."""
+    """Returns the mean position (3,) of a bone's end, in the bone's coordinates."""
     return np.einsum("fji,fj->fi", turned[:, start], steps[:, end]).mean(0)
 
 

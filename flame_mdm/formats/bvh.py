@@ -59,7 +59,7 @@ class Bvh:
         ]
 
     def rotations(self) -> np.ndarray:
-        """Returns the rotation (F, J, 3, 3) of each joint in its parent's frame."""
+        """Returns the rotation (F, J, 3, 3) of each joint relative to its parent."""
         rotations = np.tile(np.eye(3), (len(self.frames), len(self.joints), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
@@ -70,7 +70,7 @@ class Bvh:
         return rotations
 
     def translations(self) -> np.ndarray:
-        """Returns the position (F, J, 3) of each joint in its parent's frame.
+        """Returns the position (F, J, 3) of each joint in its parent's coordinates.
 
         Positions are read from the position channels. A joint without such channels stays at its
         offset.
@@ -90,8 +90,8 @@ class Bvh:
         """Resamples the motion at times 0, 1/fps, ... up to the last frame.
 
         Returns rotations (F', J, 3, 3) and translations (F', J, 3). Rotations are interpolated on
-        the sphere (slerp), so that bones keep their length. Translations are interpolated linearly
-        or, with `cubic`, by cubic splines.
+        the sphere (slerp), so that bones keep their lengths. Translations are interpolated
+        linearly, or by cubic splines if `cubic` is set.
         """
         before, after, share = frame_pairs(
             len(self.frames), self.fps, fps, len(self.joints), slack=0
@@ -121,7 +121,7 @@ def forward_kinematics(
     Args:
         parents: index of each joint's parent, or -1 for a root. Parents precede their children.
         rotations: (F, J, 3, 3), relative to the parents.
-        translations: (F, J, 3), in the parents' frames.
+        translations: (F, J, 3), in the parents' coordinates.
     """
     positions, turned = translations.copy(), rotations.copy()
     for joint, parent in enumerate(parents):
@@ -262,7 +262,7 @@ class Lines:
     def word(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy.
 
-        If `expected` is not empty, the word must be equal to it, ignoring case.
+        If `expected` is not empty, the word must match it, ignoring case.
         """
         if not self.pending:
             self.pending = next(iter(self), [])[::-1]
@@ -302,7 +302,7 @@ class Lines:
 
 
 def write(bvh: Bvh, path: str | Path) -> None:
-    """Writes a BVH file. Reading the file with `read` returns the same numbers.
+    """Writes a BVH file. Reading it back with `read` returns the same numbers.
 
     Joints are written in depth-first order.
     """

@@ -1,4 +1,4 @@
-"""Converts the meshes of a .glb character for writers of other formats."""
+"""Converts the meshes of a .glb character, so that writers of other formats can use them."""
 
 import io
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ MAX_IMAGE = 64 * 2**20
 
 
 def character_clip(character: Character, motion: PosedFigure, name: str) -> RiggedClip:
-    """Returns a clip in which a character with its meshes performs a motion.
+    """Returns a clip in which a character, including its meshes, performs a motion.
 
     `name` is the name of the animation.
 
@@ -68,7 +68,7 @@ def _distinct(names: Sequence[str]) -> tuple[str, ...]:
 def meshes(file: glb.Glb) -> list[Skin]:
     """Returns one skinned mesh for each part of each mesh in a file.
 
-    Parts without a skin follow their node.
+    Parts without a skin move with their node.
 
     Raises:
         ValueError: If a part is compressed, has no triangles, or is damaged.

@@ -1,12 +1,12 @@
-"""Motions for a user's character, which is a skinned .glb file or the skeleton of a .bvh file.
+"""Motions for a user's character: a skinned .glb file or the skeleton of a .bvh file.
 
 A character may differ from SMPL's body in proportions, units, axes, names and rest pose. The rest
 pose must be upright with flat feet.
 
-Arms and legs take the directions of the motion's bones. Trunk, head, hands and feet are turned as
-in the motion, relative to the rest pose. The path of the hips is scaled by the leg length. Then the
-legs are bent so that the toes reach the motion's toe positions, which are scaled in the same way
-and adjusted to the character's own toe height.
+The arms and legs point in the directions of the motion's bones. The trunk, the head, the hands and
+the feet turn as in the motion, relative to the rest pose. The path of the hips is scaled in
+proportion to the leg length. Then the legs are bent so that the toes reach the motion's toe
+positions, which are scaled in the same way and adjusted to the character's own toe height.
 """
 
 import copy
@@ -107,7 +107,7 @@ def _moves(channels: Sequence[str]) -> bool:
 
 
 def _above(file: bvh.Bvh, joint: int) -> dict[int, Sequence[str]]:
-    """Returns the channels of a joint and of all joints above it, from the joint to the root."""
+    """Returns the channels of a joint and its ancestors, from the joint to the root."""
     channels: dict[int, Sequence[str]] = {}
     while joint >= 0:
         channels[joint] = file.channels[joint]
@@ -116,7 +116,7 @@ def _above(file: bvh.Bvh, joint: int) -> dict[int, Sequence[str]]:
 
 
 def _vertical(positions: np.ndarray, joints: Mapping[str, int]) -> tuple[int, int, int]:
-    """Returns the direction, along y or z, in which the trunk of a pose (J, 3) points."""
+    """Returns the direction, along y or z, in which the trunk points in a pose (J, 3)."""
     shoulders = positions[[joints["left_shoulder"], joints["right_shoulder"]]].mean(0)
     hips = positions[[joints["left_hip"], joints["right_hip"]]].mean(0)
     axes = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
@@ -141,7 +141,7 @@ def read_skinned(path: Path) -> Character:
     worlds, corners = _rest(file, joints["pelvis"])
     if not (np.abs(worlds) <= glb.LARGEST).all() or not (np.abs(corners) <= glb.LARGEST).all():
         raise UserError(
-            f"{path}: the rest pose is not finite, or too large. Export the character again"
+            f"{path}: the rest pose contains numbers that are not finite or too large. Export the character again"
         )
     scales = np.cbrt(np.linalg.det(worlds[:, :3, :3]))
     for joint, number in joints.items():
@@ -201,9 +201,9 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 
 
 class UnknownJoints(UserError):
-    """Error for joints that cannot be identified.
+    """Error raised when joints cannot be identified.
 
-    `template` contains the lines of a joint name file for the user to complete.
+    `template` contains the lines of a file of joint names, which the user can complete.
     """
 
     def __init__(self, message: str, template: list[str]):
@@ -278,9 +278,9 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
-    """Writes the character's file with an additional animation, and returns a summary line.
+    """Writes a copy of the character's file with the motion, and returns a summary line.
 
-    The new animation is the first one.
+    The motion becomes the first animation in the file.
     """
     if path.suffix.lower() != ".glb":
         raise UserError(
@@ -324,7 +324,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 
 
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
-    """Writes the character's file with this motion, and returns a summary line."""
+    """Writes a copy of the character's file with the motion, and returns a summary line."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
             f"{path}: a .bvh character has no meshes, so it can only be saved as a .bvh file"

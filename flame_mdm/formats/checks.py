@@ -44,9 +44,9 @@ _LIMBS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 def check_body(joints: np.ndarray, layout: Layout) -> None:
     """Checks that joints (F, 22, 3) form a human body.
 
-    The `layout` of the file contains its unit, its up axis, and whether the body may be a child's.
-    If the size is wrong and the body is lying, the message names both the unit and the axis, so
-    that the user can correct both at once.
+    The file's `layout` specifies the unit, the up axis, and whether the person may be a child. If
+    the size is wrong and the body is lying, the message names both the unit and the axis, so that
+    the user can correct both at once.
 
     Raises:
         UserError: If the size is wrong, if a foot has no length, or if the feet point backwards.
@@ -59,16 +59,17 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
 def uprightness(joints: np.ndarray) -> float:
     """Returns the mean vertical component of the trunk direction, from -1 to 1.
 
-    `joints` (F, 22, 3) have y up.
+    In `joints` (F, 22, 3), y is up.
     """
     return float(_trunk(joints)[:, 1].mean())
 
 
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
-    """Returns a message if the body is lying in most frames, with the axis that makes it stand.
+    """Returns a message if the body is lying in most frames, or "" otherwise.
 
-    Returns "" otherwise. `joints` (F, 22, 3), with y up, were converted from the axes of the file
-    by `axes` (3, 3). `up` is the up axis of the file.
+    The message suggests the up axis with which the body would stand, if there is one. `up` is the
+    file's up axis. `axes` (3, 3) is the matrix that converted `joints` (F, 22, 3) from the file's
+    axes to y up.
     """
     if uprightness(joints) >= LYING:
         return ""
@@ -108,7 +109,7 @@ def jump(joints: np.ndarray, fps: float) -> str:
 def below_floor(joints: np.ndarray) -> str:
     """Returns a message if a body with adult bones sinks below the floor, or "" otherwise.
 
-    This happens if the body in the file is smaller than an adult.
+    This happens if the person in the file is smaller than an adult.
     """
     lowest = float(np.median(joints[..., 1].min(1)))
     if lowest > -UNDER:
@@ -120,8 +121,9 @@ def below_floor(joints: np.ndarray) -> str:
 def rest_frames(joints: np.ndarray, fps: float) -> int:
     """Returns the number of initial frames that show a rest pose or lead from it to the motion.
 
-    Several programs write a T-pose or A-pose as the first frame. In a recorded motion that begins
-    with a rest pose, the first step is not longer than the following steps.
+    Several programs write a T-pose or A-pose as the first frame. If the recorded person really
+    stands in a rest pose at first, the change from the first frame to the second is not larger than
+    the following changes.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0

@@ -53,12 +53,12 @@ REACH = 0.999
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
     """Returns a motion with smooth joint paths, constant bone lengths and feet that do not slide.
 
-    `cleanup` describes the changes to the joints. The result has no features, rotations or
-    contacts, because they would no longer match the joints.
+    See `cleanup` for the changes. The result contains no features, rotations or contacts, because
+    they would no longer match the joints.
 
     Args:
         motion: the motion.
-        contacts: (F, N), probabilities that each of `skeleton.feet` is on the floor. None = the
+        contacts: (F, N), probability that each of `skeleton.feet` is on the floor. None = the
             contacts are estimated from the joints.
 
     Example:
@@ -83,18 +83,18 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 def cleanup(
     joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None
 ) -> np.ndarray:
-    """Removes pops, changes in bone lengths, foot sliding, toes below the floor, and hands inside the body.
+    """Corrects pops, bone lengths, sliding feet, toes below the floor, and hands inside the body.
 
-    The height of the floor is the 10th percentile, over all frames, of the height of the lowest
-    toe, but at most y = 0.
+    The floor is at the 10th percentile, over all frames, of the height of the lowest toe, but not
+    above y = 0.
 
     Args:
         joints: (F, J, 3), joint positions in meters, y up. Motions with fewer than 4 frames are
             returned unchanged.
         fps: frames per second.
         skeleton: skeleton of the joints.
-        contacts: (F, N), probabilities that each of `skeleton.feet` stays on the floor until the
-            next frame, as models predict them with some representations. None = the contacts are
+        contacts: (F, N), probability that each of `skeleton.feet` stays on the floor until the next
+            frame, as predicted by models for some representations. None = the contacts are
             estimated from the height and speed of the toes.
 
     Returns:
@@ -137,9 +137,9 @@ def _least_squares(
 ) -> np.ndarray:
     """Returns the x (frames, N) that minimizes the sum of all terms.
 
-    A term (n, weight, target) is weight (n-th differences of x - target)^2. The weight is a number
-    or has the shape (frames - n,). The target is a number or has the shape (frames - n, N), and at
-    least one target is an array.
+    A term (n, weight, target) stands for the sum of weight * (d - target)^2, where d are the n-th
+    differences of x. The weight is a number or has the shape (frames - n,). The target is a number
+    or has the shape (frames - n, N), and at least one target is an array.
     """
     # An n-th difference has binomial coefficients with alternating signs. It couples frames that
     # are at most three apart. The normal equations are therefore a banded matrix, and solving
@@ -202,7 +202,7 @@ def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) ->
 
 
 def _arm(skeleton: Skeleton, side: str) -> list[int]:
-    """Returns the shoulder, elbow, wrist and, if the skeleton has one, the hand of one side."""
+    """Returns the shoulder, elbow and wrist on one side and, if the skeleton has one, the hand."""
     arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
     return arm + [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
 
@@ -210,7 +210,7 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
     """Returns the confidence (F - 1, 2) in [0, 1] that each toe stays on the floor.
 
-    The confidence of a frame refers to the time until the next frame. `toes` (F, 2, 3) are the
+    The confidence for a frame refers to the time until the next frame. `toes` (F, 2, 3) are the
     positions of the toes.
     """
     # A toe is on the floor if it is both low and slow. The faster the body travels, the faster a
@@ -225,7 +225,7 @@ def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> n
 
 
 def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
-    """Moves the body over the ground so that its feet in contact stand still on average."""
+    """Moves the body over the ground so that the feet on the floor stand still on average."""
     # The drift of the body is the mean sliding of the feet in contact. It is smooth in time, and
     # almost 0 while no foot is in contact. Once the drift is subtracted from the root trajectory,
     # these feet stand still.
@@ -250,7 +250,7 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
 
 
 def _lift(motion: np.ndarray, leg: Sequence[int], floor: float) -> None:
-    """Bends a leg where its toe is more than `DEEP` below the floor."""
+    """Bends a leg in the frames in which its toe is more than `DEEP` below the floor."""
     # The shift fades in and out within a frame, because the path of the toe is already smooth. The
     # second pass lifts what the fading has left below the floor.
     for _ in range(2):
@@ -263,14 +263,14 @@ def _lift(motion: np.ndarray, leg: Sequence[int], floor: float) -> None:
 
 
 def _faded(size: np.ndarray, frames: float) -> np.ndarray:
-    """Returns sizes (F, ...) that rise and fall smoothly within `frames` of each peak."""
+    """Smooths `size` (F, ...), so that each peak fades in and out within about `frames` frames."""
     return gaussian_filter1d(
         maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0
     )
 
 
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
-    """Moves a wrist away from the axis of the trunk or thigh until wrist and hand are outside the body."""
+    """Moves a wrist away from the axis of the trunk or thigh until the hand is outside the body."""
     arm = _arm(skeleton, side)
     frames = max(1.0, CLEAR * fps)
     other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
@@ -292,7 +292,7 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
     """Moves the foot of a leg, or the hand of an arm, by `shift` (F, 3).
 
-    `leg` contains the hip, the knee, the ankle and other joints of the foot.
+    `leg` contains the hip, the knee, the ankle and any further joints of the foot.
     """
     # This is two-bone inverse kinematics. The new ankle is on the line from the hip to the
     # requested position, as far as the leg can reach. Thigh, shin and this line form a triangle,

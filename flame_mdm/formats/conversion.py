@@ -60,7 +60,7 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     Joint positions are resampled with cubic splines, and rotations are interpolated on the sphere.
     KIT-ML's 21 joints are computed from SMPL's joints. If SMPL rotations are unknown, they are
     computed from the bones of the file or, without bones, fitted to the joints. The body then has
-    the bones of an adult, and its path is scaled by the leg length.
+    the bones of an adult, and its path is scaled in proportion to the leg length.
 
     Raises:
         UserError: If the representation cannot encode the skeleton of the motion.
@@ -77,10 +77,10 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
 
 
 def kit_joints(joints: np.ndarray) -> np.ndarray:
-    """Converts joints (F, 22 or more, 3) of SMPL to the 21 joints (F, 21, 3) of KIT-ML.
+    """Converts SMPL's joints (F, 22 or more, 3) to KIT-ML's 21 joints (F, 21, 3).
 
-    The result is mirrored, as in KIT-ML. The middle of a foot in KIT-ML is placed halfway between
-    the ankle and the toes.
+    The result is mirrored, as in KIT-ML. KIT-ML's joint in the middle of a foot is placed halfway
+    between the ankle and the toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     feet = {
@@ -125,14 +125,15 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
 
 
 def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
-    """Transfers a motion to an adult body. The path is scaled by the leg length.
+    """Transfers a motion to an adult body, and scales its path in proportion to the leg length.
 
     Args:
         body: the motion on a body with its original bone lengths.
         joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:
-        The poses, and the distances (F, 22) in meters of their joints from the scaled `joints`.
+        The poses, and the distances (F, 22), in meters, between their joints and the scaled
+        `joints`.
     """
     adult = body.offsets.new_tensor(ADULT[: len(SMPL22)])
     legs = list(LEGS)

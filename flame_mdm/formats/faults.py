@@ -65,7 +65,7 @@ THIGH = 0.17
 
 
 class Fault(NamedTuple):
-    """A fault of a joint or of the body in frames `start` to `end` (exclusive).
+    """A fault of one joint or of the whole body in frames `start` to `end` (exclusive).
 
     `worst` is the worst value in these frames, in the unit of the limit.
     """
@@ -87,7 +87,7 @@ class Fault(NamedTuple):
 
 
 def find_faults(motion: Motion) -> list[Fault]:
-    """Returns the faults of a motion, sorted by their first frame."""
+    """Returns the faults in a motion, sorted by first frame."""
     joints, skeleton, fps = motion.joints.astype(float), motion.skeleton, motion.fps
     names = skeleton.joints
     step = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
@@ -168,9 +168,9 @@ def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 
 def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Finds knees that bend forward, and knees and elbows that are folded too far.
+    """Finds knees that bend forward, and knees and elbows that bend too far.
 
-    The direction of the foot determines the front of the knee.
+    The direction of the foot determines which way is forward.
     """
     limit = LIMITS["limit"][0]
     flags = np.zeros(joints.shape[:2], bool)
@@ -200,7 +200,7 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
     """Measures how deep an arm is inside the body.
 
-    The body consists of capsules for the trunk and the thighs, whose sizes are derived from the
+    The body is modeled by capsules for the trunk and the thighs. Their sizes are derived from the
     bones.
 
     Args:
@@ -209,9 +209,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        The depths (F, 3) in meters of the elbow, the wrist and the middle of the hand, which are
-        negative outside the body, and unit vectors (F, 3, 3). Each vector points to one of these
-        points from the axis of the part in which the point is deepest.
+        The depths (F, 3), in meters, of the elbow, the wrist and the middle of the hand (negative
+        outside the body), and a unit vector (F, 3, 3) for each of these points. The vector points
+        away from the axis of the body part in which the point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]
@@ -239,7 +239,7 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns vectors (F, P, 3) from a segment to points (F, P, 3).
 
-    Each vector starts at the nearest point of the segment, whose ends are (F, 3).
+    Each vector begins at the nearest point of the segment. `start` and `end` are (F, 3).
     """
     axis, points = (end - start)[:, None], points - start[:, None]
     share = (points * axis).sum(-1, keepdims=True) / np.maximum(

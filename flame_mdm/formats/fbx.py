@@ -105,11 +105,11 @@ class Record:
 
 
 class Int(int):
-    """An integer that is written with 32 bits."""
+    """An integer that is stored in 32 bits."""
 
 
 class Short(int):
-    """An integer that is written with 16 bits."""
+    """An integer that is stored in 16 bits."""
 
 
 def read(path: Path) -> Record:

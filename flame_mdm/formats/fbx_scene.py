@@ -108,7 +108,7 @@ class Curve:
 
 
 def hermite(begin: Any, end: Any, leaving: Any, arriving: Any, share: Any) -> Any:
-    """Evaluates the cubic Hermite spline between two keys at `share`, from 0 to 1.
+    """Evaluates the cubic Hermite spline between two keys at the fraction `share`, from 0 to 1.
 
     `leaving` and `arriving` are the slopes at the two keys, per segment.
     """
@@ -256,7 +256,7 @@ class _Scene:
         ]
 
     def _keys(self, layer: int) -> list[tuple[int, int, int]]:
-        """Returns the curve node, the axis and the curve itself for each curve in a layer."""
+        """Returns each curve in a layer, with its curve node and its axis."""
         axes = {"d|X": 0, "d|Y": 1, "d|Z": 2}
         curves = []
         for node in self._below(layer, "AnimationCurveNode"):
@@ -365,7 +365,7 @@ def _properties(record: fbx.Record | None) -> dict[str, tuple[float, ...]]:
 
 
 def _model_defaults(root: fbx.Record) -> dict[str, tuple[float, ...]]:
-    """Returns the default properties of models, from the template of the file."""
+    """Returns the default properties of models, which are stored in the file's template."""
     definitions = root.first("Definitions")
     for kind in definitions.all("ObjectType") if definitions else ():
         if kind.properties[:1] == ["Model"]:

@@ -1,7 +1,7 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
 The structure of the scene follows files written by Autodesk's FBX SDK. Programs differ in the
-details that they require; comments name the program that requires a detail. The bones are at the
+details that they require; for each such detail, a comment names the program. The bones are at the
 top level, because Unreal and Unity treat a node above them as a bone. The rest pose of the bones is
 stored in `PreRotation`, so that rotations of 0 result in the rest pose in every program.
 """
@@ -39,7 +39,7 @@ HELD_KEY = 0x2  # flag of a key whose value is held until the next key
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a motion, including the skin of the person if the clip has one."""
+    """Writes a motion, including the person's skin if the clip has one."""
     fbx.write(path, _Writer(clip).scene())
 
 
@@ -109,9 +109,9 @@ class _Writer:
             self.connections.add("C", "OP", child, parent, target)
 
     def _lifted(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Returns the offsets (J, 3) and the moves of the clip in centimeters.
+        """Returns the clip's `offsets` (J, 3) and `moves` in centimeters.
 
-        The person is raised to stand on the soles. A root on the floor is moved back by
+        The person is raised by the thickness of the soles. A root on the floor is moved back by
         `ROOT_BACK`, and the hips are moved forward by the same distance.
         """
         clip = self.clip
@@ -222,7 +222,7 @@ class _Writer:
         return number
 
     def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
-        """Adds the bind pose of the meshes, given the matrix (4, 4) of each object by id."""
+        """Adds the bind pose of the meshes, given each object's matrix (4, 4) by id."""
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))

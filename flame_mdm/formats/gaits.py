@@ -2,7 +2,7 @@
 
 The ends of the clips fit together. A gait is cut at two frames that are one cycle apart. The start
 clip ends at the first of these frames, the loop lies between them, and the stop clip begins at the
-second one. Then the ends of the clips are changed to shared poses: the first pose of the loop, and
+second one. Then the ends of the clips are adjusted to shared poses: the first pose of the loop, and
 the standing pose.
 """
 
@@ -87,7 +87,10 @@ class Cycle:
 
 
 def direction(degrees: float) -> np.ndarray:
-    """Returns x and z (2,) of a direction. 0 degrees is ahead, 90 degrees is to the left."""
+    """Returns the x and z components (2,) of a direction.
+
+    0 degrees is straight ahead, and 90 degrees is to the left.
+    """
     return np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
 
 
@@ -109,7 +112,7 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 
 
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
-    """Returns the gait cycle in a direction whose ends differ least.
+    """Of the gait cycles in a direction, returns the one whose ends differ least.
 
     Returns None if there is no cycle. Cycles that begin with a landing of the left foot are
     preferred, so that the loops of a set begin with the same foot.
@@ -154,13 +157,13 @@ def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
 def gait(
     motion: GroundedMotion, cycle: Cycle, degrees: float, stand: np.ndarray
 ) -> list[GroundedMotion]:
-    """Returns the start, the loop and the stop of a gait on a straight path.
+    """Returns the start, loop and stop clips of a gait on a straight path.
 
     Args:
         motion: a motion in which a person stands, moves in a direction, and stands again.
-        cycle: the cycle that becomes the loop.
+        cycle: the cycle that becomes the loop clip.
         degrees: the direction, relative to the heading of the person.
-        stand: (22, 3), the first pose of the start and the last pose of the stop.
+        stand: (22, 3), the first pose of the start clip and the last pose of the stop clip.
     """
     # All three parts come from one motion, so they nearly fit. The loop is closed first. Then the
     # ends of the start and the stop are changed to the loop's first pose and to the standing pose,
@@ -193,7 +196,7 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
-    """Returns a cycle whose first and last poses are equal.
+    """Returns the cycle with equal first and last poses.
 
     The difference between these poses is distributed evenly over the cycle.
     """
@@ -256,8 +259,8 @@ def loop(motion: GroundedMotion) -> GroundedMotion:
 def passing(motion: GroundedMotion) -> list[float | None]:
     """Returns the times in seconds at which the planted left and right toes pass the root of a loop.
 
-    The time is None if the toes never pass the root. Two gaits are best blended at these times,
-    because both then have the foot in the same place.
+    A time is None if the toes never pass the root. Two gaits are best blended at these times,
+    because the foot is then in the same place in both gaits.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)
@@ -278,9 +281,9 @@ def passing(motion: GroundedMotion) -> list[float | None]:
 def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list[slice]]:
     """Returns the joints of all clips in one array, and the frames of each clip.
 
-    The joints are relative to the root. Each clip has `frames` neighbors before and after it, so
-    that filters over time do not mix the clips. The neighbors of a loop are repetitions of the
-    loop. The neighbors of all other clips are their first and last poses.
+    The joints are relative to the root. Each clip is padded with `frames` frames on both sides, so
+    that filters over time do not mix the clips. A loop is padded with repetitions of itself, and
+    all other clips are padded with their first and last poses.
     """
     parts, slices, position = [], [], 0
     for clip in clips:

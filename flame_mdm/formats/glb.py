@@ -60,7 +60,7 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class _Object(BaseModel):
-    """Base of the parts of the document that are read.
+    """Base class for the parts of the document that are read.
 
     Types are checked strictly. Keys without a field are ignored here, and copied unchanged when the
     file is written.
@@ -140,7 +140,7 @@ class _Document(_Object):
 
 
 def _item(items: Sequence[Item], index: int, name: str) -> Item:
-    """Returns an item of a list in the document. Raises `ValueError` if it does not exist."""
+    """Returns an item from a list in the document, or raises `ValueError` if it does not exist."""
     if not 0 <= index < len(items):
         raise ValueError(
             f"{name}: index {index} does not exist, because there are only {len(items)}"
@@ -167,7 +167,7 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A skin of a file.
+    """A skin in a .glb file.
 
     Attributes:
         joints: indices of the K joints.
@@ -365,7 +365,7 @@ class Binary:
     ) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor.
 
-        If `normalized`, bytes represent numbers from 0 to 1.
+        If `normalized` is set, bytes represent numbers from 0 to 1.
         """
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]

@@ -171,7 +171,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of the animations in a file that move nodes."""
+    """Returns the names of those animations in a file that move nodes."""
     file = glb.read(path)
     try:
         return [name for name, _ in _animations(file)]
@@ -299,10 +299,7 @@ def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
 
 
 def humanoid(file: glb.Glb) -> dict[str, int]:
-    """Returns the node index of each SMPL joint if the file declares a VRM humanoid.
-
-    Returns {} for other files.
-    """
+    """Returns the node index of each SMPL joint, or {} if the file declares no VRM humanoid."""
     extensions = file.document.get("extensions")
     if not isinstance(extensions, dict):
         return {}

@@ -65,13 +65,13 @@ class GroundedMotion:
         return joints
 
     def with_world(self, joints: np.ndarray) -> "GroundedMotion":
-        """Returns a motion with the same root but other world joint positions (F, 22, 3)."""
+        """Returns a motion with the same root, but with other world joint positions (F, 22, 3)."""
         local = joints.copy()
         local[..., [0, 2]] -= self.path[:, None]
         return replace(self, local=turned(local, -self.heading[:, None]))
 
     def cut(self, first: int, last: int) -> "GroundedMotion":
-        """Returns the frames from `first` to `last`, both included.
+        """Returns the frames from `first` to `last` (inclusive).
 
         The root begins at the origin and faces +z.
         """
@@ -121,7 +121,7 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns whether the left and right toes are planted (F, 2), from their height and speed."""
+    """Derives from height and speed whether the left and right toes are planted (F, 2)."""
     # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
     # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
@@ -170,7 +170,7 @@ def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Returns the first and the last frame of each run of flags (F,)."""
+    """Returns the first and last frame of each sequence of True values in `flags` (F,)."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0]))
     return [(begin, end - 1) for begin, end in edges.reshape(-1, 2).tolist()]
 
@@ -219,7 +219,7 @@ def planted(
 
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
-    """Returns how far (F,) the hip of a leg must be lowered for a foot moved by `shift` (F, 3)."""
+    """Returns how far a hip must be lowered (F,) so that its foot can move by `shift` (F, 3)."""
     # The hip may be anywhere in a sphere around the ankle. The radius of the sphere is the length
     # of the straight leg, or the distance from hip to ankle in the motion if this distance is
     # longer. `highest` is the height of the sphere above the hip's position on the floor.
@@ -234,7 +234,7 @@ def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndar
 def _shift(
     toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool, near: int
 ) -> np.ndarray:
-    """Returns the horizontal displacement (F, 3) of a toe (F, 3).
+    """Returns the horizontal displacement (F, 3) that keeps a toe (F, 3) in place during contacts.
 
     The displacement changes smoothly from each contact to the next.
     """
@@ -305,7 +305,7 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 def planted_loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns a loop with planted toes.
 
-    The result is still a loop: its last pose is its first pose.
+    The result is still a loop: its last pose equals its first pose.
     """
     # The ends of a single cycle would cut contacts in two. Therefore, several cycles in a row are
     # planted, and the middle one is kept, because its neighbors are also cycles.

@@ -255,7 +255,7 @@ BAD = {
     ),
     "yaml key": (
         lambda f: skeleton(f, rate=30),
-        r"skeleton\.yaml: rate: Extra inputs are .* The keys are map, joints",
+        r"skeleton\.yaml: rate: Extra inputs are .* Valid keys: map, joints",
     ),
     "yaml map": (
         lambda f: skeleton(f, map={"pelvis": "Hips"}),

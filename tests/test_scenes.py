@@ -128,7 +128,7 @@ def test_a_key_acts_on_scenes_or_is_refused(tmp_path: Path):
     assert any("lying" in note for note in lying.notes)
     synthetic("kick").save(tmp_path / "kick.npz")
     with pytest.raises(
-        UserError, match=r"animation=Walk has no effect, because \.npz files have one animation"
+        UserError, match=r"animation=Walk has no effect, because \.npz files contain only one animation"
     ):
         read(tmp_path / "kick.npz", animation="Walk")
 
@@ -291,7 +291,7 @@ def test_a_file_keeps_its_unit_if_the_folder_maps_its_joints(ending: str, tmp_pa
     (tmp_path / "skeleton.yaml").write_text(json.dumps({"map": mapped}))
     again = read(tmp_path / f"a{ending}")
     assert np.abs(again.joints - motion.joints).max() < 0.04
-    with pytest.raises(UserError, match=r"people's are 0\.6 to 1\.2 m"):
+    with pytest.raises(UserError, match=r"people's legs are 0\.6 to 1\.2 m"):
         read(tmp_path / f"a{ending}", unit=0.02 if ending == ".fbx" else 2.0)
 
 

@@ -415,7 +415,7 @@ def test_bad_motions_are_refused_by_name(subtests):
     joints[2, 5, 1] = np.nan
     good = {"joints": np.zeros((4, 22, 3)), "fps": 20, "skeleton": SKELETONS["smpl22"], "id": "m"}
     for change, message in (
-        ({"joints": joints}, "'m': joint 5 in frame 2 is not finite"),
+        ({"joints": joints}, "'m': the position of joint 5 in frame 2 is NaN or infinite"),
         ({"joints": np.zeros((0, 22, 3))}, r"'m': joints have shape \(0, 22, 3\)"),
         (
             {"joints": np.zeros((4, 24, 3))},

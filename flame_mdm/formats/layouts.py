@@ -84,7 +84,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The names of the joints in the files that the map uses."""
+        """The names of those joints in the files that the map uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -102,14 +102,14 @@ class Layout(BaseModel):
 
     @property
     def rig(self) -> str:
-        """The name of the skeleton of `rigs.yaml` with the same joints, or "" if there is none."""
+        """The name of the skeleton in `rigs.yaml` with the same joints, or "" if there is none."""
         return self._rig
 
     def bone(self, joint: str) -> str:
-        """Returns the joint in the files that turns like an SMPL joint.
+        """Returns the name, in the files, of the joint that turns like an SMPL joint.
 
-        This is the bone of the SMPL joint or, without a bone, the joint with the largest weight in
-        its position.
+        This is the bone of the SMPL joint. If it has no bone, this is the joint with the largest
+        weight in its position.
         """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
@@ -132,7 +132,7 @@ class Layout(BaseModel):
         }
 
     def pairs(self) -> dict[str, str]:
-        """For each joint in the files that the map uses, returns its counterpart on the other side.
+        """Returns the counterpart, on the other side, of each joint that the map uses.
 
         A joint without a counterpart is its own counterpart.
         """
@@ -213,7 +213,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @cache
 def _variants() -> dict[str, Layout]:
-    """Returns the supported layouts by name, and variants with end sites for toes, hands, or both."""
+    """Returns the supported layouts by name, including variants with end sites as toes or hands."""
     variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
     toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
     for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
@@ -227,7 +227,7 @@ def _variants() -> dict[str, Layout]:
 def _spelled() -> dict[str, dict[str, str]]:
     """Returns the spellings of the joint names for each of `_variants`.
 
-    The result maps each layout to a mapping from spelling to name.
+    For each layout, the result contains a mapping from spellings to names.
     """
     return {name: spelled(layout.pairs()) for name, layout in _variants().items()}
 
@@ -247,7 +247,7 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout of a file that `read_tree` has read, and the names of its joints.
+    """Returns the layout and the joint names of a file that was read with `read_tree`.
 
     `fields` override the fields of the supported layout. If arrays with this skeleton are in
     meters, BVH files are assumed to be in centimeters, as written by `flame_mdm.formats`.
@@ -292,9 +292,9 @@ def layout_name(layout: Layout) -> str:
 
 
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the supported layout for joints with these names, overridden by `fields`.
+    """Returns the supported layout for joints with these names, with the changes in `fields`.
 
-    The map of this layout uses the `names`, which are matched as in `flame_mdm.formats.names`.
+    The map in this layout uses the `names`, which are matched as in `flame_mdm.formats.names`.
 
     Raises:
         UserError: If no layout fits, or if a name could refer to several joints.
@@ -346,7 +346,7 @@ def _renamed(source: Source, names: Mapping[str, str]) -> Source:
 
 
 def skeleton_file(path: Path) -> Path | None:
-    """Returns the nearest `skeleton.yaml` in a file's folder or above it.
+    """Returns the nearest `skeleton.yaml` in a file's folder or its parent folders.
 
     Raises `UserError` if that path is not a regular file.
     """
@@ -358,7 +358,7 @@ def skeleton_file(path: Path) -> Path | None:
 
 
 def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
-    """Returns the fields of `Layout` in the `skeleton_file` of a file.
+    """Returns the fields of `Layout` from a file's `skeleton_file`.
 
     `up` (y, z or -y) overrides the up axis.
     """
@@ -382,7 +382,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
         )
         where = ".".join(map(str, first["loc"]))[:100]
         raise UserError(
-            f"{path}: {where}: {first['msg']}. The keys are {keys} (docs/own-data.md)"
+            f"{path}: {where}: {first['msg']}. Valid keys: {keys} (see docs/own-data.md)"
         ) from error
     if missing := sorted(set(SMPL22.joints) - set(fields.get("map", SMPL22.joints))):
         raise UserError(f"{path}: the map has no joint for {', '.join(missing)}")
@@ -390,7 +390,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
 
 
 def leg_length(joints: np.ndarray) -> float:
-    """Returns the mean length in meters of the left leg, from hip to knee to ankle.
+    """Returns the mean length of the left leg, from hip to knee to ankle, in meters.
 
     `joints` (F, 22, 3) are the positions of SMPL's joints.
     """
@@ -398,7 +398,7 @@ def leg_length(joints: np.ndarray) -> float:
 
 
 def head_height(joints: np.ndarray) -> float:
-    """Returns the median height in meters of the head joint above the lowest joint of a frame."""
+    """Returns the median height, in meters, of the head joint above each frame's lowest joint."""
     return float(np.median(joints[:, SMPL22.joints.index("head"), 1] - joints[..., 1].min(1)))
 
 
@@ -408,7 +408,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
     Args:
         joints: (F, 22, 3), positions of SMPL's joints in meters.
         unit: meters per unit of length in the file.
-        children: whether the people may be children.
+        children: whether the person may be a child.
         doubt: a line about another problem with the motion, to be added to the error message.
 
     Raises:
@@ -431,13 +431,13 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
         else ""
     )
     raise UserError(
-        f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
+        f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's legs are {shortest:g} to {LEG[1]:g} m.{small} "
         f"{advice}. Set `unit` in skeleton.yaml, or unit=... in convert and edit{also}"
     )
 
 
 def _usual_unit(leg: float, unit: float) -> str:
-    """Returns advice for a file with legs of `leg` meters that no common unit explains."""
+    """Returns advice for a file whose leg length (`leg` meters) no common unit explains."""
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"
@@ -450,7 +450,7 @@ BACKWARDS = 0.25
 
 
 def check_feet(joints: np.ndarray) -> None:
-    """Checks the feet of SMPL's joints (F, 22, 3).
+    """Checks the feet of a body with SMPL's joints (F, 22, 3).
 
     Raises:
         UserError: If a foot has no length, or if the toes point backwards.
@@ -480,7 +480,7 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Checks that an array was not mistaken for a skeleton with the same number of joints.
+    """Checks that an array does not contain another skeleton with the same number of joints.
 
     The limbs of a person have the same length on both sides, and this length does not change. If
     the joint order or the skeleton is wrong, the pairs of joints that are compared are not limbs.

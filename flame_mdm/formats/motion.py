@@ -85,8 +85,8 @@ class Motion(PosedFigure):
             pictures are created from `poses` or joint positions instead.
 
     Raises:
-        UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive
-            number.
+        UserError: If a shape is wrong, a joint position is NaN or infinite, or the frame rate is
+            not a positive number.
 
     Example:
         >>> Motion(joints=np.zeros((40, 22, 3)), fps=20, text="a person stands")
@@ -113,7 +113,7 @@ class Motion(PosedFigure):
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
             raise UserError(
-                f"{name}: joint {joint} in frame {frame} is not finite. Did the model diverge?"
+                f"{name}: the position of joint {joint} in frame {frame} is NaN or infinite. Did the model diverge?"
             )
         self.fps = frame_rate(self.fps, f"{name}: fps")
         if self.contacts is not None:
@@ -142,8 +142,8 @@ class Motion(PosedFigure):
 
         Args:
             path: the file. Its extension selects the format (docs/formats.md).
-            rest_pose: begin a `.bvh` file with a frame in the rest pose, in which the arms point to
-                the sides. Some programs expect this frame.
+            rest_pose: whether a `.bvh` file begins with a frame in the rest pose, in which the arms
+                point to the sides. Some programs expect this frame.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file: a name from
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's skeleton.
             character: your own character, as a file or as the result of `characters.read`. The
@@ -157,8 +157,8 @@ class Motion(PosedFigure):
             facts: additional entries for an `.npz` file, such as the seed.
 
         Raises:
-            UserError: If an argument is unknown or does not fit the file or the motion, or if the
-                package av, which `.mp4` files require, is missing.
+            UserError: If an argument is unknown or does not fit the file or the motion, or if
+                `.mp4` is requested and the av package is not installed.
         """
         path = Path(path)
         ending = path.suffix.lower()
@@ -200,9 +200,9 @@ class Motion(PosedFigure):
     def resampled(self, fps: float) -> "Motion":
         """Returns this motion at another frame rate, with the same duration.
 
-        Known rotations are interpolated on the sphere, so that bones keep their length. Without
-        rotations, joints are interpolated by cubic splines. Features are left out, because they are
-        valid at only one frame rate.
+        Known rotations are interpolated on the sphere, so that bones keep their lengths. Without
+        rotations, joint positions are interpolated by cubic splines. Features are left out, because
+        they are valid at only one frame rate.
         """
         if math.isclose(self.fps, fps):
             return self
@@ -237,8 +237,8 @@ class Motion(PosedFigure):
     def show(self) -> Any:
         """Returns a player.
 
-        In a Jupyter notebook, the player is displayed. Elsewhere, the path of an HTML page that
-        opens in any browser is returned.
+        Jupyter notebooks display it. Elsewhere, the result is the path of an HTML page that opens
+        in any browser.
         """
         from flame_mdm.visualize import player_page
 
@@ -266,7 +266,7 @@ def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
 
 
 def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> Motion:
-    """Returns the motion of a body whose rotations are known."""
+    """Converts poses to a motion with known rotations."""
     return Motion(poses.joints().float().numpy(), fps, SMPL22, text, id, poses)
 
 
@@ -383,7 +383,7 @@ def _write_character(motion: Motion, path: Path, character: Character | BvhChara
 
 
 def _write_vrma(motion: Motion, path: Path) -> str:
-    """Writes a .vrma file: a motion for VRM avatars, without a body."""
+    """Writes a .vrma file, which contains a motion for VRM avatars but no body."""
     poses = motion.posed()
     fitted, _ = motion.try_fit()
     name = motion.text or motion.id or "motion"
@@ -424,9 +424,7 @@ LARGE_ERROR = 10
 
 
 def _error(motion: Motion, poses: Poses) -> str:
-    """Describes the errors of joint positions with constant bone lengths.
-
-    Errors are distances from the joints of the motion.
+    """Describes how far joint positions with constant bone lengths are from the motion's joints.
     """
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()

@@ -23,7 +23,7 @@ JOINED = re.compile(r"mixamorig\d*")
 
 
 class Match(NamedTuple):
-    """The best-matching skeleton for some names.
+    """The skeleton that best matches a list of joint names.
 
     Attributes:
         skeleton: key of the skeleton.
@@ -45,8 +45,8 @@ def plain(name: str) -> str:
 def spellings(name: str, opposite: str) -> list[str]:
     """Returns the `plain` spellings of a name, beginning with the name itself.
 
-    `opposite` is the counterpart on the other side. The mark of the side may be short or long, and
-    may precede or follow the rest of the name: LeftHip, L_Hip, hip.L.
+    `opposite` is the counterpart on the other side. The side may be marked by a letter or a word,
+    before or after the rest of the name: LeftHip, L_Hip, hip.L.
     """
     name, opposite = plain(name), plain(opposite)
     options = [name]
@@ -87,8 +87,8 @@ def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]])
 
     Args:
         names: joint names in a file. There must be at least one.
-        skeletons: for each skeleton, a mapping from spellings of a joint to the skeleton's name of
-            the joint. The first spelling is preferred.
+        skeletons: for each skeleton, a mapping from spellings of a joint to the joint's name in the
+            skeleton. The first spelling is preferred.
     """
     best: list[Match] = []
     score = (False, -1)
@@ -123,9 +123,9 @@ def _match(key: str, skeleton: Mapping[str, str], by_name: Mapping[str, list[int
 
 
 def _prefixes(names: Sequence[str]) -> list[str]:
-    """Returns "" and all prefixes, up to a separator, that at least `SHARED` names have.
+    """Returns "" and the prefixes, up to a separator, that at least `SHARED` names share.
 
-    The most frequent prefix is first.
+    The most frequent prefix comes first.
     """
     counts: Counter[str] = Counter()
     for name in set(names):

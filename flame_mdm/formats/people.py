@@ -1,9 +1,9 @@
 """Bodies by name: the mannequin, the body in a file, and people of all shapes from Anny.
 
 Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
-Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp., Apache-2.0.
-Its shapes and weights come from MakeHuman and MPFB2, CC0. Anny can also download topologies of SMPL
-and SMPL-X, which are not free for commercial use. This project never uses these topologies.
+Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589 ((c) 2025 NAVER Corp., Apache-2.0).
+Anny's shapes and weights come from MakeHuman and MPFB2 (CC0). Anny can also download topologies of
+SMPL and SMPL-X, which are not free for commercial use. This project never uses these topologies.
 """
 
 import os
@@ -232,9 +232,9 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns how far points on the head are inside the hair region.
+    """Returns how far points on the head lie inside the hair region.
 
-    Hair is above the forehead and behind the ears.
+    This region is above the forehead and behind the ears.
     """
     above = (points - [0, 0.757, 0.086]) @ np.array([0, 0.84, -0.54])
     behind = np.minimum(
@@ -252,9 +252,9 @@ def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
 def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Adds helper bones to skinning weights, and returns the new weights (V, 28).
 
-    The upper part of a limb follows a helper bone, which turns less about the limb. In the forearm,
-    the lower part follows a helper bone, which takes part of the twist of the wrist. `joints` (22,
-    3) are the joint positions of the mesh.
+    The upper part of a limb follows a helper bone that turns less about the limb's axis. The lower
+    part of the forearm follows a helper bone that takes over part of the wrist's twist. `joints`
+    (22, 3) are the joint positions of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:

@@ -72,7 +72,8 @@ class Poses:
     def resampled(self, rate: float, fps: float) -> "Poses":
         """Returns the motion at `fps` instead of `rate` frames per second.
 
-        Rotations are interpolated on the sphere, and the path of the pelvis by cubic splines.
+        Rotations are interpolated on the sphere; the path of the pelvis is interpolated by cubic
+        splines.
         """
         if math.isclose(rate, fps):
             return self
@@ -102,9 +103,9 @@ class BoneRotations:
 def solve(joints: Tensor, fps: float) -> Poses:
     """Computes a body and the rotations with which it reproduces joint positions in every frame.
 
-    Bones have their mean length over the clip. Pelvis and chest, which have three bones each, take
-    the rotation that fits all three bones best (Kabsch 1976). Every other joint aims its bone at
-    the next joint.
+    Each bone has its mean length over the clip. The pelvis and the chest, which have three bones
+    each, receive the rotation that fits all three bones best (Kabsch 1976). Every other joint aims
+    its bone at the next joint.
 
     Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
     twisted so that knees and elbows bend like hinges. The twist of the spine is distributed evenly
@@ -226,7 +227,7 @@ def _twist(
         group: the G joints at which the limbs begin.
         swung: (F, G, 4), rotations of the limbs before the twist.
         offsets: (G, 3), offsets of the limbs.
-        bones: (F, 22, 3), all bones.
+        bones: (F, 22, 3), vectors along all bones.
         fps: frames per second.
     """
     middle = [CHILDREN[joint][0] for joint in group]

@@ -1,7 +1,7 @@
 """The reader for motion files; the writers are in `flame_mdm.formats.motion`.
 
 `docs/formats.md` describes the files. Commands, data sets and the Python API all use this reader,
-so that a file is always read with the same skeleton, frame rate and checks.
+so a file is always read with the same skeleton, frame rate and checks.
 """
 
 import math
@@ -97,7 +97,7 @@ class Recording:
     Attributes:
         motion: the motion. Its notes are lines for the user.
         layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
-        doubts: properties that look wrong. The notes of the motion also state them.
+        doubts: properties that look wrong. They are also listed in the notes of the motion.
         smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, or
             None if the file contains no such rotations.
         tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
@@ -143,7 +143,7 @@ def read(
     Raises:
         FileNotFoundError: If there is no such file.
         UserError: If the file is damaged or of an unsupported type, if it has no frame rate, if the
-            body does not have the size of a person, or if an argument has no effect on the file.
+            body is not the size of a person, or if an argument has no effect on the file.
 
     Example:
         >>> walk = read("walk.bvh", resample_to=20)
@@ -168,8 +168,8 @@ def read_recording(
     """Reads and checks a motion; see `read` for arguments and errors.
 
     With `as_smpl`, all arrays are mapped to SMPL's 22 joints. Otherwise, KIT-ML's 21 joints and
-    SMPL's hands are kept. `standard` changes the tree of a published data set, and the root is then
-    resampled linearly, as in the published version.
+    SMPL's hands are kept. `standard` is a function that changes the joint tree of a published data
+    set. If it is given, the root is resampled linearly, as in the published version.
     """
     path = Path(path)
     if path.suffix.lower() not in ENDINGS:
@@ -180,7 +180,7 @@ def read_recording(
     fields = find_skeleton(path, up) | said
     if animation is not None and path.suffix.lower() not in SCENES:
         raise UserError(
-            f"{path}: animation={animation} has no effect, because {path.suffix} files have one animation. "
+            f"{path}: animation={animation} has no effect, because {path.suffix} files contain only one animation. "
             "Remove animation="
         )
     with naming(path, ValueError):
@@ -199,7 +199,7 @@ def read_recording(
 def from_array(joints: Any, fps: float | None) -> Motion:
     """Converts joints (F, J, 3) in meters, y up, to a motion.
 
-    The number of joints selects the built-in skeleton.
+    The number of joints determines the built-in skeleton.
     """
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not is_real(values):
@@ -271,9 +271,9 @@ def _of_scene(
     resample_to: float | None,
     fields: Mapping[str, Any],
 ) -> Recording:
-    """Returns the recording of a node animation.
+    """Reads the recording in a file with animated nodes.
 
-    Its positions are in meters, y up, unless `fields` override this.
+    Its positions are in meters, y up, unless `fields` specify otherwise.
     """
     _refuse(fields, ["joints"], "FBX and GLB files contain the names of their joints")
     scene = scenes.read(path, animation)
@@ -303,7 +303,7 @@ def _of_joints(
     said: dict[str, Any],
     as_smpl: bool,
 ) -> Recording:
-    """Returns the recording of an array of joints.
+    """Converts an array of joints to a recording.
 
     `said` contains the keys that were set in the command. They override the keys in the file.
     """
@@ -392,7 +392,7 @@ def _of_ours(
     said: dict[str, Any],
     as_smpl: bool,
 ) -> Recording:
-    """Returns the recording of a file that this project wrote.
+    """Returns the recording in a file that this project wrote.
 
     Such a file is in meters, y up, and contains rotations and features.
     """
@@ -424,7 +424,7 @@ def _of_ours(
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
     """Returns the frame rate of arrays.
 
-    The rate is taken from the command, the file, or skeleton.yaml, in this order.
+    The sources, in order of priority, are the command, the file, and skeleton.yaml.
     """
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
@@ -477,7 +477,7 @@ def _label(path: Path, layout: Layout, rate: float) -> str:
 
 
 def _resampled(motion: Motion, fps: float | None) -> Motion:
-    """Returns a motion at another frame rate, with only its joints.
+    """Returns a motion at another frame rate, without features and rotations.
 
     A motion that already has this frame rate is returned unchanged.
     """
@@ -527,7 +527,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
             raise UserError(
-                f"{len(data['poses'])} frames of poses, but {len(data['joints'])} frames of joints"
+                f"found {len(data['poses'])} frames of poses, but {len(data['joints'])} frames of joints"
             )
         # This translation does not include the pelvis position in SMPL's template
         translation, turns = smpl_motion(data)

@@ -1,6 +1,7 @@
 """Frame rates, lengths and resampling of motions.
 
-Frame rates and lengths are limited, because even a file of a few bytes can declare any values.
+Frame rates and lengths are limited, because even a file of a few bytes can declare arbitrary
+values.
 """
 
 import math
@@ -55,7 +56,7 @@ def check_frames(frames: int) -> None:
 def check_tree(frames: int, joints: int, size: int) -> None:
     """Raises `UserError` if a file of `size` bytes has too many frames for its number of joints.
 
-    Each joint takes memory in each frame, even if the file contains no numbers for this joint.
+    Each joint takes up memory in each frame, even if the file contains no numbers for it.
     """
     check_frames(frames)
     most = min(MAX_POSITIONS, max(FEW_POSITIONS, size // BYTES_PER_POSITION))
@@ -82,8 +83,8 @@ def frame_pairs(
     count = math.floor((frames - 1) * fps / rate + slack) + 1
     if count * joints > max(frames * joints, MAX_RESAMPLED):
         raise UserError(
-            f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
-            "too many. Check the frame rate, or cut the motion"
+            f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}. For {joints} joints, "
+            "this is too many. Check the frame rate, or cut the motion"
         )
     # Frames are counted from the first frame, so that rounding errors do not accumulate. A new
     # frame that is slightly past the last old frame takes the value of the last old frame.
@@ -96,7 +97,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
     """Resamples positions (F, ...) from `rate` to `fps` frames per second.
 
     Returns F' = floor((F - 1) fps / rate) + 1 frames. With `cubic`, values between frames lie on a
-    cubic spline, and bones keep their length to within 0.1 %. Otherwise, values are interpolated
+    cubic spline, and bones keep their lengths to within 0.1 %. Otherwise, values are interpolated
     linearly.
     """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
@@ -107,9 +108,9 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 
 
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Returns the cubic spline through values (F, ...) at `times` (N,).
+    """Evaluates the cubic spline through values (F, ...) at `times` (N,).
 
-    The values are at times 0, 1, ..., and `times` are in frames.
+    Times are in frames, and the values are at times 0, 1, ...
     """
     from scipy.interpolate import CubicSpline  # imported here, because few motions need it
 

@@ -36,7 +36,7 @@ def presets() -> dict[str, dict[str, Any]]:
 
 
 def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the joint names of a skeleton in `rigs.yaml`, without prefix, by SMPL joint."""
+    """Returns the joint names of a skeleton in `rigs.yaml`, without their prefix, by SMPL joint."""
     names = {}
     for part, side, mark in _parts(skeleton):
         bones = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
@@ -47,7 +47,7 @@ def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
 def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a skeleton in `rigs.yaml`.
 
-    Each part is given by its key, the prefix of SMPL's joints, and the mark of the side in names.
+    Each part consists of its key, the prefix of SMPL's joints, and the side mark in joint names.
     """
     yield "trunk", "", ""
     for side, mark in zip(("left_", "right_"), skeleton["sides"], strict=True):
@@ -55,7 +55,7 @@ def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def preset(name: str | None, poses: Poses) -> Rig:
-    """Returns a skeleton from `rigs.yaml` with the bone lengths of a body; None = SMPL's skeleton."""
+    """Returns a skeleton (None = SMPL's) from `rigs.yaml`, with the bone lengths of a body."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
         return Rig(

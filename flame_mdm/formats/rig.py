@@ -69,7 +69,7 @@ class Rig:
     def offsets(self) -> np.ndarray:
         """Returns the position (J, 3) of each joint relative to its parent.
 
-        The position of a root is in the world coordinates of the file.
+        A root's position is in the world coordinates of the file.
         """
         return np.stack(
             [self.within(self.positions[joint], joint) for joint in range(len(self.joints))]
@@ -86,14 +86,14 @@ class Rig:
     def rest(self) -> np.ndarray:
         """Returns the rotation (J, 3, 3) of each joint relative to its parent.
 
-        The rotation of a root is relative to the world coordinates of the file.
+        A root's rotation is relative to the world coordinates of the file.
         """
         return self.local(self.turns)
 
     def local(self, turned: np.ndarray) -> np.ndarray:
         """Converts world rotations (..., J, 3, 3) to rotations relative to the parents.
 
-        The rotation of a root becomes relative to the world coordinates of the file.
+        A root's rotation becomes relative to the world coordinates of the file.
         """
         local = turned.copy()
         for joint, parent in enumerate(self.parents):
@@ -200,13 +200,13 @@ def rest_pose(
     """Returns a rest pose, turned so that y is up and +z is ahead.
 
     Args:
-        source: the character as it is named in error messages.
+        source: name of the character in error messages.
         names: names of the J joints.
         parents: index of each joint's parent.
         positions: (J, 3), joint positions in world coordinates with any unit and orientation.
         turned: (J, 3, 3), joint rotations in these coordinates.
         joints: index of the character's joint for each SMPL joint.
-        lowest: points in these coordinates that include the lowest point.
+        lowest: points in these coordinates, among them the lowest point of the character.
         vertical: (3,), the up direction in these coordinates.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
@@ -269,7 +269,7 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with neutral rotations that give its limbs SMPL's directions at rest.
+    """Returns the skeleton with neutral rotations that turn its limbs to SMPL's rest pose.
 
     `offsets` (22, 3) are the offsets of SMPL's joints from their parents at rest.
     """
@@ -379,7 +379,7 @@ def follow(
 def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
-    """Returns the knee position (F, 3) if the ankle is at `target` or as close to it as possible.
+    """Returns the knee position (F, 3) that moves the ankle to `target`, or as close as possible.
 
     The knee bends to the same side as before.
     """

@@ -1,7 +1,7 @@
 """Moving skeletons of other programs, with the skin of a person, for .glb, .fbx and USD files.
 
-Lengths are in meters, y up. The rest pose faces +z. F, J and V are the numbers of frames, joints
-and vertices.
+Lengths are in meters, and y is up. The rest pose faces +z. F, J and V are the numbers of frames,
+joints and vertices.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ class Material:
 
     Attributes:
         name: the name of the material.
-        color: red, green and blue from 0 to 1, as on screens.
+        color: red, green and blue from 0 to 1, in the color space of screens.
         image: content of a PNG or JPEG file. Its colors are multiplied by `color`. Empty = no
             image.
     """
@@ -63,8 +63,8 @@ class Skin:
         weights: (V, K), weights of these joints; each row adds up to 1.
         binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
             of each joint.
-        colors: (V, 3), colors of the vertices from 0 to 255, as on screens; (0, 3) if only the
-            materials have colors.
+        colors: (V, 3), colors of the vertices from 0 to 255, in the color space of screens; (0, 3)
+            if only the materials have colors.
         uvs: (V, 2), positions of the vertices in the images, from the lower left corner; (0, 2) if
             there are no images.
     """
@@ -272,7 +272,7 @@ def rigged(
 def _with_root_motion(
     turns: np.ndarray, hips: np.ndarray, skeleton: Rig
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-    """Transfers the horizontal path and the heading of the hips to the root, their parent.
+    """Transfers the horizontal path and the heading of the hips to the root, which is their parent.
 
     The heading is the direction of the hips about the vertical axis, relative to their direction in
     the rest pose.

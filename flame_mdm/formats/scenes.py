@@ -28,11 +28,11 @@ def animations(path: Path) -> list[str]:
 
 
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
-    """Returns a joint name for each node, as in the layouts of skeletons.
+    """Returns a joint name for each node, as used in skeleton layouts.
 
     If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the
-    tip of a bone is called `NAME.end`, like the end site of a bone in a BVH file, whichever suffix
-    it has in the file.
+    tip of a bone is always called `NAME.end`, like an end site in a BVH file, whatever its suffix
+    is in the file.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

@@ -56,7 +56,7 @@ def write(path: Path, clip: RiggedClip) -> None:
 
 
 def _paths(clip: RiggedClip) -> list[str]:
-    """Returns the path of each joint from the root, which consists of names from `_name`."""
+    """Returns the path from the root to each joint, composed of names from `_name`."""
     paths: list[str] = []
     for name, parent in zip(clip.joints, clip.parents, strict=True):
         paths.append(f"{paths[parent]}/{_name(name)}" if parent >= 0 else _name(name))
@@ -70,7 +70,7 @@ def _name(name: str) -> str:
 
 
 def _matrices(values: np.ndarray) -> Any:
-    """Returns matrices (N, 4, 4) as USD stores them: the translation is in the last row."""
+    """Returns matrices (N, 4, 4) in USD's convention: the translation is in the last row."""
     from pxr import Gf, Vt
 
     return Vt.Matrix4dArray([Gf.Matrix4d(matrix.T.tolist()) for matrix in values])

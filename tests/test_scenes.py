@@ -128,7 +128,8 @@ def test_a_key_acts_on_scenes_or_is_refused(tmp_path: Path):
     assert any("lying" in note for note in lying.notes)
     synthetic("kick").save(tmp_path / "kick.npz")
     with pytest.raises(
-        UserError, match=r"animation=Walk has no effect, because \.npz files contain only one animation"
+        UserError,
+        match=r"animation=Walk has no effect, because \.npz files contain only one animation",
     ):
         read(tmp_path / "kick.npz", animation="Walk")
 

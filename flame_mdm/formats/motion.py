@@ -424,8 +424,7 @@ LARGE_ERROR = 10
 
 
 def _error(motion: Motion, poses: Poses) -> str:
-    """Describes how far joint positions with constant bone lengths are from the motion's joints.
-    """
+    """Describes how far joint positions with constant bone lengths are from the motion's joints."""
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()
     line = f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"

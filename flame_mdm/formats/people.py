@@ -1,7 +1,7 @@
 """Bodies by name: the mannequin, the body in a file, and people of all shapes from Anny.
 
 Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
-Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589 ((c) 2025 NAVER Corp., Apache-2.0).
+Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589, (c) 2025 NAVER Corp., Apache-2.0.
 Anny's shapes and weights come from MakeHuman and MPFB2 (CC0). Anny can also download topologies of
 SMPL and SMPL-X, which are not free for commercial use. This project never uses these topologies.
 """

@@ -77,7 +77,7 @@ def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotations (..., 3, 3) from `start` to `end`, both directions (..., 3)."""
+    """Returns the smallest rotations (..., 3, 3) that turn `start` (..., 3) to `end` (..., 3)."""
     a, b = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=-1)

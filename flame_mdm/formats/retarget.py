@@ -55,7 +55,7 @@ def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def preset(name: str | None, poses: Poses) -> Rig:
-    """Returns a skeleton (None = SMPL's) from `rigs.yaml`, with the bone lengths of a body."""
+    """Returns a skeleton from `rigs.yaml`, or SMPL's (None), with the bone lengths of a body."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
         return Rig(

@@ -1,9 +1,9 @@
 """Atomic writes, hashes, locks, and safe reading of files from other people.
 
 Files that may come from other people are first read or checked with this module. Such a file must
-be a regular file of limited size, and the sizes that it declares must match its bytes. Functions
-that read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is not a
-regular file or if its content is rejected.
+be a regular file of limited size, and the sizes that it declares must match its actual size.
+Functions that read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is
+not a regular file or if its content is rejected.
 """
 
 from __future__ import annotations
@@ -70,15 +70,15 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # error numbers of 
 def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` at the end.
 
-    A failure leaves no files behind. The temporary name is unique, so that several processes can
-    write the same file, and the last one wins. A link at `path` is replaced, but its target is not
-    changed. Before this process writes its first file in the folder, temporary files that killed
-    processes left there are removed.
+    A failure leaves no files behind. The temporary name is unique, so several processes can write
+    the same file; the last one wins. A link at `path` is replaced, but its target is not changed.
+    Before this process writes its first file in the folder, temporary files that killed processes
+    left there are removed.
 
     Args:
         path: file to write.
-        within: folder that contains `path` and that other people may have filled. Links must not
-            lead out of it.
+        within: folder that contains `path` and may contain files from other people. Links must not
+            lead out of this folder.
 
     Raises:
         UserError: If a link leads out of `within`, if `path` is a pipe or a device, or if the file
@@ -102,7 +102,8 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 
     Either all files are moved or none. If `path` exists, files with the same names are replaced,
     and all other files are kept. Temporary folders that killed processes left behind are removed.
-    Links must not lead out of the folder `within`. Errors are the same as in `atomic_write`.
+    Links must not lead out of the folder `within`. The errors are the same as those of
+    `atomic_write`.
     """
     path = Path(path)
     if within is not None:
@@ -159,7 +160,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Describes why a file could not be written, with the free space if the disk may be full."""
+    """Returns why a file could not be written, and the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -204,7 +205,7 @@ def write_json(
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` that lacks it.
+    """Adds the name of a file to every `UserError` that does not contain it.
 
     The exceptions in `errors` are converted to `UserError`, with `prefix` before their message.
     """
@@ -224,10 +225,10 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
 
     Yields the name of a dead process that left the file behind, or "". If another process holds the
     lock, `busy` is called with the name of that process. Unless `busy` raises an error, this
-    function then waits for the lock. `advice` is part of the warning for file systems without
-    locks. The operating system releases the lock when the process ends for any reason. The lock is
-    a POSIX record lock. Unlike the locks of `filelock`, it also works between hosts on NFS and
-    Lustre, but it does not exist on Windows.
+    function then waits for the lock. `advice` is part of the warning about file systems that do not
+    support locks. When the process ends, for whatever reason, the operating system releases the
+    lock. The lock is a POSIX record lock. Unlike the locks of `filelock`, such a lock also works
+    between hosts on NFS and Lustre, but it does not exist on Windows.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:
@@ -240,7 +241,9 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
                     busy(owner)
                     fcntl.lockf(file, fcntl.LOCK_EX)
                 else:
-                    say(f"{path}: this file system has no locks ({error.strerror}); {advice}")
+                    say(
+                        f"{path}: this file system does not support locks ({error.strerror}); {advice}"
+                    )
             try:
                 if not os.path.samestat(os.fstat(file.fileno()), path.stat()):
                     # Another process holds a new lock file
@@ -270,8 +273,8 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        UserError: If it cannot be read, is not a regular file, has more than `limit` bytes, or is a
-            Git LFS pointer.
+        UserError: If it cannot be read, is not a regular file, is larger than `limit` bytes, or is
+            a Git LFS pointer.
     """
     try:
         status = Path(path).stat()
@@ -367,8 +370,8 @@ def read_yaml(path: str | Path) -> Any:
 def read_package_yaml(path: Path) -> Any:
     """Returns the plain content of a YAML file that is part of the package.
 
-    It uses LibYAML, which is fifteen times as fast as `read_yaml` but does not apply the checks for
-    files from other people.
+    LibYAML makes it fifteen times as fast as `read_yaml`, but it skips the checks for files from
+    other people.
     """
     import yaml
 
@@ -378,7 +381,7 @@ def read_package_yaml(path: Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of nodes in a YAML file with expanded aliases, or infinity for cycles."""
+    """Returns the number of YAML nodes after aliases are expanded, or infinity if they are cyclic."""
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
@@ -399,12 +402,12 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 def read_npz(
     source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays in an .npz file or a seekable open file, by name.
+    """Returns the arrays, by name, in an .npz file, which may be a path or an open, seekable file.
 
     Args:
         source: the file.
-        skip: names of arrays that are not read.
-        only: names of the arrays that are read; None = all arrays.
+        skip: names of arrays not to read.
+        only: names of the arrays to read; None = all arrays.
 
     Raises:
         UserError: If the file is damaged, contains objects, or exceeds the limits of this module.
@@ -429,8 +432,9 @@ def read_npz(
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
     """Returns the array in an .npy file.
 
-    `mmap` maps the file read-only instead of reading it, and requires a path. Raises `UserError` if
-    the file is damaged, contains objects, or exceeds the limits of this module.
+    With `mmap`, the file is mapped into memory (read-only) instead of read, which requires a path.
+    Raises `UserError` if the file is damaged, contains objects, or exceeds the limits of this
+    module.
     """
     import numpy as np
 
@@ -443,7 +447,10 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 
 @contextmanager
 def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
-    """Yields a file of arrays and its size. Errors for damaged content are converted to `UserError`."""
+    """Yields an open file of arrays and its size.
+
+    Errors about damaged content are raised as `UserError`.
+    """
     with ExitStack() as stack:
         name = ""
         if isinstance(source, Path):
@@ -492,11 +499,11 @@ def _check_array(file: IO[bytes], size: int, name: str) -> int:
 
 @contextmanager
 def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    """Opens a zip archive for reading, and raises `UserError` if it has too many members.
+    """Opens a zip archive for reading.
 
-    The limit is `MAX_MEMBERS`. The size of the archive's directory is also limited, because
-    `zipfile` reads it at once and creates an object for each entry, even if the archive declares
-    fewer entries.
+    Raises `UserError` if the archive has more than `MAX_MEMBERS` members. The size of the archive's
+    directory is also limited, because `zipfile` reads it at once and creates an object for each
+    entry, even if the archive declares fewer entries.
     """
     directory = _DirectoryReader(file)
     with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
@@ -506,7 +513,7 @@ def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
 
 
 def check_members(count: int) -> None:
-    """Raises `UserError` if an archive has too many members."""
+    """Raises `UserError` if an archive has more than `MAX_MEMBERS` members."""
     if count > MAX_MEMBERS:
         raise UserError(
             f"more than {MAX_MEMBERS:,} files in one archive. Unpack it, and use the folder instead"
@@ -514,7 +521,7 @@ def check_members(count: int) -> None:
 
 
 class _DirectoryReader:
-    """A file from which only a limited number of bytes can be read at once, until `limit` is None."""
+    """A file that limits the number of bytes read at once, until `limit` is None."""
 
     def __init__(self, file: IO[bytes]):
         self.file, self.limit = file, DIRECTORY_LIMIT
@@ -529,9 +536,9 @@ class _DirectoryReader:
 
 
 def check_member(member: zipfile.ZipInfo) -> None:
-    """Refuses members of a zip archive that are not deflated.
+    """Raises `UserError` if a zip member is encrypted, or neither stored nor deflated.
 
-    `zipfile` limits the number of unpacked bytes only for deflated members.
+    `zipfile` limits the number of unpacked bytes only for such members.
     """
     if member.flag_bits & 1 or member.compress_type not in (
         zipfile.ZIP_STORED,
@@ -545,7 +552,9 @@ def check_member(member: zipfile.ZipInfo) -> None:
 def check_expansion(expanded: int, packed: int) -> None:
     """Raises `UserError` if compressed content expands disproportionately."""
     if expanded > max(ARRAYS_LIMIT, INFLATION * packed):
-        raise UserError(f"its {_size(packed)} expand to {_size(expanded)}, unlike motion data")
+        raise UserError(
+            f"its {_size(packed)} expand to {_size(expanded)}, which is implausible for motion data"
+        )
 
 
 def _size(count: float) -> str:

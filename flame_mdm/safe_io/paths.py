@@ -1,4 +1,4 @@
-"""Paths for writing safely in a folder that other people may have filled.
+"""Paths for safe writing to a folder that may contain files from other people.
 
 Links must not lead out of the folder. A file that is written in place must not have a second name
 (hard link). Temporary names are unique.
@@ -36,7 +36,7 @@ _tokens: set[str] = set()
 
 
 def check_within(path: str | Path, root: str | Path) -> None:
-    """Raises `UserError` if links along a path in the folder `root` lead out of that folder."""
+    """Raises `UserError` if a link along a path leads out of the folder `root`."""
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
@@ -45,7 +45,7 @@ def check_within(path: str | Path, root: str | Path) -> None:
 
 
 def check_tree(folder: Path) -> None:
-    """Checks a folder from someone else before libraries write into it.
+    """Checks a folder from someone else before libraries write to it.
 
     Libraries open files in place, so they could change files outside the folder. Raises `UserError`
     if the folder contains a pipe, a device, a link that leads out of the folder, or a file with a
@@ -72,8 +72,8 @@ def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
     Writing in place would also change the target of a link, so links are not followed. Raises
-    `UserError` if the path is a link, if it is not a regular file, or if the file has a second name
-    (hard link).
+    `UserError` if the path is a link or not a regular file, or if the file has a second name (hard
+    link).
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -81,7 +81,7 @@ def open_in_place(path: Path) -> IO[str]:
     except OSError as error:
         if path.is_symlink():
             raise UserError(
-                f"{path}: a link, and links are not followed for writing. Remove it"
+                f"{path}: this is a link, and links are not followed when writing. Remove it"
             ) from error
         raise
     status = os.fstat(descriptor)
@@ -146,7 +146,7 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
 
 
 def _lives(process: int) -> bool:
-    """Returns whether another process exists on this machine."""
+    """Returns whether an id belongs to another process that is running on this machine."""
     if process == os.getpid():
         return False
     try:

@@ -72,7 +72,7 @@ class Figure:
 
 
 def target(path: str | Path, motions: Sequence[Figure]) -> Path:
-    """Returns the path as a `Path`, and raises `UserError` if there are no motions to write."""
+    """Converts the path to a `Path`, and raises `UserError` if there are no motions to write."""
     if not motions:
         raise UserError(f"{path}: no motions to show")
     return Path(path)
@@ -91,7 +91,7 @@ def head(skeleton: Skeleton) -> int | None:
 def radii(skeleton: Skeleton) -> list[float]:
     """Returns the radius of the body around each joint, in meters.
 
-    It increases with the number of descendants of the joint.
+    It increases with the joint's number of descendants.
     """
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
@@ -102,7 +102,7 @@ def radii(skeleton: Skeleton) -> list[float]:
 class Mesh:
     """A closed mesh in its stored pose, an A-pose with the pelvis at the origin.
 
-    The mesh of the mannequin is written by `tools/mannequin.py`.
+    `tools/mannequin.py` writes the mannequin's mesh.
 
     Attributes:
         points: (V, 3), vertices in meters.
@@ -111,9 +111,9 @@ class Mesh:
         weights: (V, 28), weights of SMPL's 22 joints and of `HELPERS`. At most four weights per
             vertex are nonzero.
         triangles: (T, 3), counterclockwise as seen from outside.
-        turns: (28, 3, 3), world rotation of each bone from SMPL's rest pose to the stored pose.
+        turns: (28, 3, 3), world rotation of each bone, from SMPL's rest pose to the stored pose.
         rest: (22, 3), position of each joint relative to its parent in SMPL's rest pose.
-        sole: height in meters of the toe joints above the soles.
+        sole: height of the toe joints above the soles, in meters.
     """
 
     def __init__(self, path: Path) -> None:
@@ -161,7 +161,7 @@ def read_body(name: str) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class FittedBody:
-    """A body with the bone lengths of a clip, and its motion in F frames, with B = 28 bones."""
+    """A body (B = 28 bones) that has the bone lengths of a clip, and its motion over F frames."""
 
     mesh: Mesh
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the

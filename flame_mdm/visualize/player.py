@@ -1,4 +1,4 @@
-"""HTML player for motions: a single file that opens from disk and requires no network."""
+"""HTML player for motions: a single file that opens from disk, without a network connection."""
 
 import base64
 import html
@@ -29,7 +29,7 @@ from flame_mdm.visualize.body import (
 def write_player(
     path: str | Path, motions: Sequence[Figure], title: str = "Motions", **options: Any
 ) -> None:
-    """Writes an HTML page that plays motions in any browser and requires no network.
+    """Writes an HTML page that plays motions in any browser, without a network connection.
 
     Args:
         path: the .html file.
@@ -68,8 +68,8 @@ def player_page(
         groups: for each motion, a name to filter by, such as its split; "" = none.
         beside: for each motion, the id of an earlier motion next to which it is shown, such as the
             original of an edited motion; "" = none.
-        marks: for each motion, the spans to mark on the timeline, each given by its first frame,
-            its end (exclusive), its kind and a description.
+        marks: for each motion, the spans to mark on the timeline. Each span consists of its first
+            frame, its end (exclusive), its kind and a description.
         body: the body to draw; None = the mannequin.
     """
     blank = [""] * len(motions)
@@ -98,7 +98,7 @@ def player_page(
 def packed_motion(motion: Figure, begin: int = 0) -> dict[str, Any]:
     """Returns the frames of a motion for the player, starting at `begin`.
 
-    Earlier frames influence only the rotations.
+    Frames before `begin` influence only the rotations.
     """
     return _packed(motion, "", "", (), None, begin)
 
@@ -142,8 +142,8 @@ def _packed(
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
     """Returns the proportions of a body, and a 32-bit quaternion for each frame and bone.
 
-    The quaternions are accurate to about 0.1 degrees. The two highest bits state which of x, y, z
-    and w is largest. They are followed by the three other components, from -0.71 to 0.71, with 10
+    The quaternions are accurate to about 0.1 degrees. The two highest bits indicate which of x, y,
+    z and w is largest. The other three components, which range from -0.71 to 0.71, follow in 10
     bits each.
     """
     quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()

@@ -43,10 +43,10 @@ def write_gif(
 ) -> None:
     """Writes a looping animation of motions side by side, with a caption below each.
 
-    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second, so the frame
-    rate is the highest frame rate of the motions, divided by the smallest integer that results in
-    50 or less. For example, 60 fps becomes 30, and 120 fps becomes 40. A motion that ends earlier
-    holds its last frame. `body` is the body to draw; None = the mannequin.
+    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second, so the
+    highest frame rate of the motions is divided by the smallest integer for which the result is 50
+    or less. For example, 60 fps becomes 30, and 120 fps becomes 40. Motions that end earlier hold
+    their last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -67,13 +67,13 @@ def write_gif(
 def write_mp4(
     path: str | Path, motions: Sequence[Figure], size: int = 384, body: Mesh | None = None
 ) -> None:
-    """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate."""
+    """Writes the same animation as `write_gif`, but as H.264 video (yuv420p) at any frame rate."""
     path = target(path, motions)
     try:
         av = import_module("av")
     except ImportError:
         raise UserError(
-            f'{path}: MP4 requires the av package. Run pip install "flame-mdm[video]", or write GIF'
+            f'{path}: MP4 requires the av package. Run pip install "flame-mdm[video]", or save a .gif file'
         ) from None
     fps = max(motion.fps for motion in motions)
     with (
@@ -106,7 +106,7 @@ def contact_sheet(
 ) -> None:
     """Writes one PNG image with a row per motion.
 
-    A row has `frames` poses of `size` pixels, equally spaced in time, and a caption.
+    Each row contains `frames` poses of `size` pixels, equally spaced in time, and a caption.
     """
     path = target(path, motions)
     rows = []
@@ -148,7 +148,7 @@ def thumbnail(motion: Figure, height: int = 120) -> bytes:
 def _palette() -> Image.Image:
     """Returns one palette for all frames, so that colors do not flicker.
 
-    The palette contains all colors, and the blends between them at smoothed edges.
+    The palette contains all colors, and the blends between them that occur at smoothed edges.
     """
     drawn = np.array(
         [*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT]
@@ -167,7 +167,7 @@ def _palette() -> Image.Image:
 def _video(
     motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
 ) -> Iterator[Image.Image]:
-    """Yields one image of all panels every 1 / fps seconds, and shows a progress bar."""
+    """Yields an image of all panels, with a progress bar, for each 1 / fps seconds of motion."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]
@@ -265,7 +265,7 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
 def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that projects points (N, 3) in meters.
 
-    Its results (N, 4) are x, y, pixels per meter and depth.
+    The function returns x, y, pixels per meter and depth (N, 4).
     """
 
     def project(points: np.ndarray) -> np.ndarray:
@@ -294,8 +294,8 @@ def _rasterize(
 
     Colors are interpolated between the corners. The image is (height, width, 3) uint8. The vertices
     have pixel coordinates `at` (V, 2), y down, distances from the camera `depth` (V,), and `colors`
-    (V, 3) from 0 to 255. Triangles (T, 3) that are seen from inside, and whose corners therefore
-    appear clockwise, are not drawn.
+    (V, 3) from 0 to 255. Triangles (T, 3) whose corners appear clockwise are seen from inside, so
+    they are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
@@ -373,7 +373,7 @@ def _capsule(
     color: Color | int,
     grow: float = 0,
 ) -> None:
-    """Draws a line with round ends of radius `radius` meters plus `grow` pixels."""
+    """Draws a line with round ends, whose radius is `radius` meters plus `grow` pixels."""
     (ax, ay, per_meter_a, *_), (bx, by, per_meter_b, *_) = a, b
     size_a, size_b = radius * per_meter_a + grow, radius * per_meter_b + grow
     pen.line([(ax, ay), (bx, by)], color, round(size_a + size_b))
@@ -386,7 +386,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns at most three lines of a caption, plus a line if a skeleton is drawn."""
+    """Returns up to three caption lines, and one more line if no body fits the motion."""
     lines, font = [""], _font(size)
     # The caption has room for three lines
     for word in shortened(motion.text or motion.id, width).split():
@@ -401,7 +401,7 @@ def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> li
 
 
 def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:
-    """Draws lines of text on an image with room for `lines` lines."""
+    """Draws lines of text on an image that has room for `lines` lines."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)

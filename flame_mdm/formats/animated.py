@@ -46,7 +46,7 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 
     Args:
         animations: name and content of each animation.
-        requested: the name or 1-based number of an animation. None = the first one.
+        requested: the name or 1-based number of an animation. None = the first animation.
 
     Raises:
         UserError: If there is no such animation.

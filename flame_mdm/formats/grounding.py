@@ -1,9 +1,9 @@
 """Motions relative to a root on the floor, and feet that stay where they are planted.
 
-Game engines move a character with a root on the floor, and play the rest of the motion relative to
-this root. Motions are cut in this representation, so that the last pose of one clip can be the
-first pose of the next. Afterward, the path of the root is added again, and inverse kinematics keeps
-each foot in place during its contacts.
+In game engines, a root on the floor moves the character, and the rest of the motion is played
+relative to this root. Motions are cut in this representation, so that the last pose of one clip can
+be the first pose of the next. Afterward, the path of the root is added again, and inverse
+kinematics keeps each foot in place during its contacts.
 
 Arrays contain the positions of the 22 SMPL joints in F frames, in meters, y up. Angles are in
 radians. Positive angles turn to the left.

@@ -167,7 +167,7 @@ class Layout(BaseModel):
 
 
 def opposite(joint: str) -> str:
-    """Returns the SMPL joint on the other side of the body, or the joint itself."""
+    """Returns the SMPL joint on the other side, or the joint itself if it has no counterpart."""
     for side, other in (SIDES, SIDES[::-1]):
         if joint.startswith(side):
             return other + joint.removeprefix(side)

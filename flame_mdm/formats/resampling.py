@@ -72,8 +72,8 @@ def frame_pairs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the frames before and after each new frame, and its position between them, from 0 to 1.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may be up
-    to `slack` frames later.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may lie up
+    to `slack` frames after the last frame.
 
     Raises:
         UserError: If there are more than `MAX_FRAMES` frames before resampling, or more than

@@ -273,7 +273,7 @@ def test_a_text_in_another_script_is_refused_in_one_line(trained, tmp_path, monk
     assert main(["sample", f"ckpt={trained}", "text=走る \x1b[31mü", "samples=1", "out=out"]) == 1
     message = capsys.readouterr().err
     assert message.count("\n") == 1
-    assert "English only" in message
+    assert "only English prompts" in message
     assert "\x1b" not in message
     assert not (tmp_path / "out").exists()
 

@@ -202,7 +202,7 @@ def test_words_that_no_table_lists_are_read_as_they_are_if_the_model_knows_them(
     "text", ["ein Mann geht langsam", "un homme marche", "人が歩く", "человек идёт"]
 )
 def test_other_languages_are_refused_with_one_line(text):
-    with pytest.raises(UserError, match="understood in English only"):
+    with pytest.raises(UserError, match="only English prompts are supported"):
         Reader(FACTS).read(text)
 
 

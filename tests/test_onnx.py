@@ -603,7 +603,7 @@ def test_the_page_shows_what_was_understood(served: tuple[Path, str], tmp_path: 
         assert made(tab)["text"].startswith("a person ")
 
         typed(tab, "ein Mann geht nach links")
-        assert "in English only" in tab.run(NOTES)
+        assert "only English prompts" in tab.run(NOTES)
         assert tab.run(CHIPS) == []
         assert tab.errors == []
 

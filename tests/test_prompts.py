@@ -150,7 +150,7 @@ def test_refused_lines_of_a_file_are_named_at_the_end_and_the_others_are_written
             "the text has 3,000 characters",
             "part 2 is empty",
             "30 seconds (600 frames)",
-            "in English only",
+            "only English prompts",
         ),
         strict=True,
     ):

@@ -593,8 +593,8 @@ def test_unseen_and_unread_words_are_named_once_with_one_suggestion(subtests):
 def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, capsys, subtests):
     monkeypatch.chdir(tmp_path)
     refusals = {
-        "un uomo cammina in avanti": "prompts are understood in English only",
-        "人が歩く": "prompts are understood in English only",
+        "un uomo cammina in avanti": "only English prompts are supported",
+        "人が歩く": "only English prompts are supported",
         "a person": "no word says what happens. Nearest in meaning",
     }
     for text, line in refusals.items():

@@ -83,7 +83,7 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """Empty condition whose vectors and tokens have width 0. The null condition is the same.
+    """Empty condition whose vectors and tokens have width 0. The null condition is identical.
 
     Example:
         >>> x = torch.zeros(2, 5, 3)

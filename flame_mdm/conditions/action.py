@@ -13,8 +13,8 @@ class ActionLabels(ConditionEncoder):
 
     The null condition is the zero vector.
 
-    Source: Tevet et al. 2023 (MDM), section 3. For denoisers that read tokens, the pooled vector is
-    also the only token.
+    Source: Tevet et al. 2023 (MDM), section 3. For denoisers that read tokens, the pooled vector
+    also serves as the only token.
 
     Args:
         features: C, the width of the vectors.

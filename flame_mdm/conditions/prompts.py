@@ -18,8 +18,8 @@ class ReadPrompt:
             none.
         captions: the caption that the model reads for each part.
         unknown: words that never occur in the training captions, or that the model does not read.
-        summary: one line that states how the prompt was understood, or "" unless each caption of
-            the model describes a single action.
+        summary: one line that states how the prompt was understood, or "" if the model's captions
+            may describe several actions.
         changes: lines about differences between the prompt and the sampled motion.
         fitting: for each part, a duration in seconds that suits its stated number of repetitions,
             or None if it states no number. The tuple is empty if the captions do not describe
@@ -53,8 +53,8 @@ def read_prompt(
         max_words: maximum number of words that the model reads in a caption; None = no limit.
         splits: whether a sentence with several actions is split into one part per action. This
             applies only to texts with a single part.
-        check_words: whether the model's words for actions replace the words of the text. The text
-            is then also rejected if the model knows none of its content words.
+        check_words: whether to replace words for actions with the model's own words, and to reject
+            text if the model knows none of its content words.
 
     Raises:
         UserError: If the model does not understand a part.

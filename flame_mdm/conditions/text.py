@@ -42,11 +42,11 @@ class PretrainedText(ConditionEncoder):
             unnormalized text embedding. "mean" is the mean of the real tokens, including special
             tokens (Reimers & Gurevych 2019). "pooler" is the first token after a linear map and
             tanh, as in BERT. RoBERTa is published without this map, and transformers initializes it
-            with new random numbers each time. FLAME was trained with one of these random maps. In
-            this implementation, the map is drawn with a fixed seed, and a released checkpoint can
+            with new random numbers each time. FLAME was trained with such a random map. In this
+            implementation, the map is drawn with a fixed seed, but a released checkpoint can
             replace it.
         revision: full 40-digit commit hash on the hub; required for models from the hub.
-        package: installed Python package from which the files are loaded instead of the hub. In
+        package: installed Python package to load the files from, instead of the hub. In
             this case, `model` is used only as a name.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
@@ -198,7 +198,7 @@ class PretrainedText(ConditionEncoder):
         return Path(folder) / f"{Path(source.model).name}-{key[:16]}.safetensors"
 
     def _pool(self, first: Tensor) -> Tensor:
-        """Applies the part of the pooling that is not cached to vectors (N, C)."""
+        """Applies the uncached part of the pooling to vectors (N, C)."""
         if self.pooling == "pooler":
             first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
         return nn.functional.normalize(first, dim=-1) if self.normalize else first

@@ -66,8 +66,8 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
     The vector of the word is the sum of both rows.
 
     The numbers of the rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash
-    embeddings"). Two words are confused only if both parts are equal. The hash (CRC-32) is the same
-    on every machine.
+    embeddings"). The model cannot distinguish two words if both parts are equal. The hash (CRC-32)
+    is the same on every machine.
     """
     # Two hashes of the word with different prefixes would not be enough: CRC is linear, so both
     # hashes would collide for the same pairs of words.
@@ -168,9 +168,9 @@ def unknown_words(text: str, facts: Mapping[str, Any]) -> list[str]:
 def _suggested(text: str, facts: Mapping[str, Any]) -> str:
     """Returns the question " Did you mean '...'?" for text with unknown words.
 
-    The question quotes the text with its unknown words replaced by known words. If one of them
-    cannot be replaced, it quotes the nearest training caption that contains a content word of the
-    text.
+    The question quotes the text with its unknown words replaced by known words. If an unknown word
+    cannot be replaced, the question quotes the most similar training caption that contains a
+    content word of the text.
 
     A word that is not English is replaced by a known word with a similar spelling. An English word
     is replaced only by a known word with a similar meaning ("shelf" never becomes "she").
@@ -189,7 +189,7 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 
 
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
-    """Returns the known word that an unknown word probably stands for, or None.
+    """Returns the known word that an unknown word probably stands for, or None if there is none.
 
     The unknown word is a typo of the known word, or has a similar meaning.
     """

@@ -121,7 +121,7 @@ class MotionSource(ABC):
             self.excluded[reason] += count
 
     def not_excluded(self, named: Mapping[str, Value], path: Path) -> dict[str, Value]:
-        """Removes the names in `exclude` from a mapping and counts them.
+        """Removes the names in `exclude` from a mapping, and counts the removed names.
 
         Raises:
             UserError: If `exclude` contains a name that is not in the mapping.
@@ -219,7 +219,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice about a split without clips, with a leading space.
+    """Returns advice for the case that a split contains no clips. The advice begins with a space.
 
     The advice is "" for published data sets, because their splits are fixed.
     """
@@ -238,7 +238,7 @@ def required(path: Path, get_it: str) -> Path:
 
 
 def some(names: Iterable[str]) -> str:
-    """Lists the first five of the sorted names, followed by the number of the remaining names."""
+    """Lists the first five of the sorted names, followed by the number of remaining names."""
     first = sorted(names)
     return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
 
@@ -261,7 +261,7 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 
 
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
-    """Draws the split of each block of `size` consecutive clips with a hash of `name`.
+    """Assigns each block of `size` consecutive clips to a split, using a hash of `name`.
 
     Neighboring clips may be similar, so all clips of a block are in the same split. `val` and
     `test` are fractions of the blocks. Each split gets at least one block.

@@ -36,7 +36,7 @@ KEPT = "prior/"  # prefix of the names of the known clips
 
 
 class Lesson(MotionSource):
-    """Clips in the user's folder, with mirrored copies, and clips that the model already knows.
+    """Clips from the user's folder, with mirrored copies, and clips that the model already knows.
 
     All clips in the folder are used for training unless the caption table says otherwise. Clips are
     normalized with the statistics of the store that contains the known clips.
@@ -90,7 +90,7 @@ class Lesson(MotionSource):
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips with the style in their captions, then the clips of the store.
+        """Yields the user's clips, with the style in their captions, and then the store's clips.
 
         Raises:
             UserError: If one of the user's motions cannot be read. The folder contains only a few
@@ -106,7 +106,7 @@ class Lesson(MotionSource):
 
 
 def styled(caption: str, name: str) -> str:
-    """Returns the caption that a clip of the style `name` has in training."""
+    """Returns the training caption of a clip in the style `name`."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 

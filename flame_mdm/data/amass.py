@@ -107,8 +107,8 @@ def read(file: Path | bytes, name: str) -> Recording:
         name: file name for error messages.
 
     Raises:
-        UserError: If the file is not a motion from the SMPL+H G release, or if a number is not
-            finite.
+        UserError: If the file is not a motion from the SMPL+H G release, or if it contains NaN or
+            infinite values.
     """
     names = ("poses", "trans", "betas", "gender", "mocap_framerate")
     with naming(name, ValueError), naming(name, KeyError, prefix=f"{RELEASE}: it lacks "):
@@ -137,7 +137,7 @@ def read(file: Path | bytes, name: str) -> Recording:
 
 @dataclass
 class Amass:
-    """A folder that contains AMASS as downloaded archives, as unpacked subsets, or as both."""
+    """A folder that contains AMASS as downloaded archives, as unpacked subsets, or both."""
 
     root: Path
 

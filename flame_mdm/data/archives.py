@@ -42,7 +42,7 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
     Raises:
         UserError: If the archive is damaged, expands disproportionately or has too many members,
-            or if a wanted file is a link, sparse or encrypted.
+            or if a wanted file is a link, is sparse or is encrypted.
     """
     size = regular_file(path)
     with path.open("rb") as file:
@@ -62,8 +62,8 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
     """Returns `path` if it is a folder, or a temporary folder with the `members` of the archive.
 
-    The temporary folder is removed when `owner` is garbage-collected. The result is the deepest
-    folder inside it that contains all members.
+    The temporary folder is removed when `owner` is garbage-collected. The returned folder is its
+    deepest subfolder that contains all members.
 
     Raises:
         UserError: For the same reasons as `members`, and if a member would be unpacked outside
@@ -135,20 +135,20 @@ def _tar_members(
 
 def _check_size(name: str, size: int) -> None:
     if size > MEMBER_LIMIT:
-        raise UserError(f"{name} has {size:,} bytes, which is too large for a motion")
+        raise UserError(f"{name} is {size:,} bytes, which is too large for a motion")
 
 
 class _Member(tarfile.TarInfo):
     """A tar member.
 
-    Large headers and sparse files are refused before their content is read.
+    Large headers and sparse files are rejected before their content is read.
     """
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:
             raise UserError(f"{self.name} is a sparse file, which is not supported")
         if self.type in _HEADERS and self.size > HEADER_LIMIT:
-            raise UserError(f"a header has a size of {self.size:,} bytes, which is too large")
+            raise UserError(f"a header is {self.size:,} bytes, which is too large")
         return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _proc_gnusparse_10(self, *_: Any) -> None:
@@ -158,7 +158,7 @@ class _Member(tarfile.TarInfo):
 class _Bounded:
     """Reader that limits how far a compressed file of `packed` bytes may expand.
 
-    It refuses to return an implausibly large amount of data.
+    It raises an error if the file expands to an implausible size.
     """
 
     def __init__(self, file: IO[bytes], packed: int):

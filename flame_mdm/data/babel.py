@@ -173,7 +173,7 @@ class Babel(MotionSource):
                     motion = key_of(str(sequence["feat_p"]))
                     if motion is None:
                         raise UserError(
-                            f"the labels refer to {sequence['feat_p']}, which is in no subset of AMASS"
+                            f"the labels refer to {sequence['feat_p']}, which is not in AMASS"
                         )
                     yield motion, _segment(label)
 
@@ -185,7 +185,7 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the fields of a label that are used.
+    """Returns the fields of a label that this module uses.
 
     Raises `TypeError` if a field has the wrong type.
     """
@@ -197,7 +197,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip for a label, and the reason if there is no clip.
+    """Returns the first frame of each clip for a label, and a reason if there are no clips.
 
     `frames` is the number of frames in the motion.
     """

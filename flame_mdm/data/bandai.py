@@ -49,7 +49,7 @@ def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns a matrix with orthonormal columns.
 
     The columns are the direction of x, the direction of the component of y that is perpendicular to
-    x, and the cross product of both.
+    x, and the cross product of these two.
     """
     first = x / np.linalg.norm(x)
     third = np.cross(first, y) / np.linalg.norm(np.cross(first, y))
@@ -139,7 +139,7 @@ class Bandai(MotionSource):
             rotations.
         mirror: whether a mirrored copy follows each clip of the training split.
         workers: number of processes; 0 = one per core.
-        exclude: file names of takes to leave out, without extension.
+        exclude: file names (without extension) of the takes to leave out.
         split: "takes" holds out takes whose combinations of content and style occur in training.
             "compositional" holds out the combinations in `HELD_OUT`, so that their contents and
             styles occur in training only in other combinations.
@@ -220,7 +220,7 @@ class Bandai(MotionSource):
 
 
 def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
-    """Converts a BVH file to joint positions or to an SMPL motion.
+    """Converts a BVH file to joint positions or an SMPL motion.
 
     Joint positions (F, 22, 3) are float32, in meters, with y up.
 
@@ -287,7 +287,7 @@ def mirror(motion: np.ndarray) -> np.ndarray:
 
 
 def side_of(content: str) -> str:
-    """Returns the moving side, or the side to which the body moves: left, right or both.
+    """Returns the side that moves, or the side to which the body moves: left, right or both.
 
     The result is "" if the content has no side.
     """

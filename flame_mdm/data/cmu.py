@@ -241,7 +241,7 @@ class CMU(MotionSource):
 
     @cached_property
     def items(self) -> dict[str, list[Item]]:
-        """Parts to cut from each existing recording with captions."""
+        """Parts to cut from each existing recording that has captions."""
         files, (rows, texts, splits) = self.files, self.humanml3d
         items: defaultdict[str, list[Item]] = defaultdict(list)
         cut_from: defaultdict[str, set[Split]] = defaultdict(set)
@@ -585,7 +585,7 @@ def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.n
 
 
 def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Returns a standardized recording (see `standardize`) at its frame rate."""
+    """Returns a recording, standardized by `standardize`, at its own frame rate."""
     tree, fields = standardize(tree)
     rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
     return replace(tree, fps=rate), fields

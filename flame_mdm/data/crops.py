@@ -181,7 +181,7 @@ class Clips(Dataset[Sample]):
     def draw(
         self, indices: Sequence[int] | np.ndarray, batch: int | Sequence[int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draws the first frame, the number of frames and the caption index (B,) of clips.
+        """Draws the first frame, the number of frames and the caption index for each of B clips.
 
         The numbers depend only on the seed, the batch and the index of the clip. In evaluation
         (batch -1), they are always the same.

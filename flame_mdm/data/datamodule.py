@@ -76,7 +76,7 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns batches that contain each clip once across all ranks.
+    """Returns the batches of this rank. Across all ranks, the batches contain each clip once.
 
     The longest clips come first.
     """

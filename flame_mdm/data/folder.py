@@ -76,7 +76,7 @@ class Folder(MotionSource):
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about as many. Each clip
             occurs at most 16 times. 0 = clips are not repeated.
-        license: license of motions whose row in the table states no license. This is a key in
+        license: license of motions for which the table states no license. This is a key in
             `licenses.yaml`, or "" if the license is unknown.
         prefixes: words to insert before captions. Each word is mapped to the actions whose captions
             it precedes. A model can then distinguish these motions from motions with the same
@@ -152,12 +152,12 @@ class Folder(MotionSource):
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
-        """Returns the licenses in the table, and `license` if a row states no license."""
+        """Returns the licenses in the table, including `license` if a row states no license."""
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
     def copies(self) -> dict[str, int]:
-        """Number of times that each motion occurs in the data set; see `balance`.
+        """How often each motion occurs in the data set; see `balance`.
 
         A mirrored copy occurs as often as its original.
         """
@@ -257,7 +257,7 @@ class Folder(MotionSource):
 
     @cached_property
     def files(self) -> dict[str, MotionFile]:
-        """Motion files by name, sorted.
+        """Maps names to motion files, in sorted order.
 
         The name of a file is its path in the folder, without extension. If a file has several
         animations, each animation is called `PATH/ANIMATION`.
@@ -337,7 +337,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
     Args:
         prefixes: the word to insert for each action.
         notes: captions and labels of all motions.
-        table: the file that lists the actions, named in the error message.
+        table: the file that lists the actions, for the error message.
 
     Raises:
         UserError: If no motion has one of the actions.
@@ -357,7 +357,7 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
     """Raises `UserError` if the body is lying in most motions of a layout.
 
     Args:
-        folder: the folder named in the error message.
+        folder: the folder to name in the error message.
         uprights: for each layout, the value `upright` of each motion; see `Doubts`.
     """
     for layout, values in uprights.items():

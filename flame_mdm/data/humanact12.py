@@ -140,7 +140,7 @@ def find(path: Path, name: str) -> Path:
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns the named lists, which must have equal lengths, from a pickled dictionary."""
+    """Returns the lists with these names from a pickled dictionary. Their lengths must be equal."""
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (

@@ -42,7 +42,7 @@ class IndexedClip(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Whether the clip is an entire file from HumanAct12, whose name is `key`."""
+        """Whether the clip is an entire HumanAct12 file. `key` is then the name of this file."""
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
@@ -69,7 +69,7 @@ def read_index(path: Path) -> list[IndexedClip]:
             source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
             key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
             if key is None:
-                raise UserError(f"{source} is in no subset of AMASS")
+                raise UserError(f"{source} is not in any subset of AMASS")
             rows.append(IndexedClip(name, key, int(line["start_frame"]), int(line["end_frame"])))
     return rows
 
@@ -149,7 +149,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Files with HumanAct12's joint positions, by name.
+        """Files with HumanAct12's joint positions, by file name.
 
         The dictionary is empty if the files are missing.
         """
@@ -223,7 +223,7 @@ class HumanML3D(T2MFolder):
     def _write_statistics(self) -> None:
         """Writes the mean and std over all motions and their mirrored copies.
 
-        Motions of every length and split are included.
+        Motions of all lengths and splits are included.
         """
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
@@ -296,7 +296,8 @@ class HumanML3DSMPL(MotionSource):
     motion and caption match.
 
     Args:
-        path: folder of HumanML3D with texts, splits and `index.csv`. No motions are needed.
+        path: folder of HumanML3D with texts, splits and `index.csv`. The folder does not need to
+            contain motions.
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
         humanact12: path of FLAME's `humanact12_processed.pkl`. Without this file, the clips of
             HumanAct12 are left out.

@@ -35,10 +35,10 @@ class KITTemos(MotionSource):
     """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
 
     The recordings have 100 frames per second, and every eighth frame is used. Source: Petrovich,
-    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. The training and validation
-    splits leave out motions of fewer than 10 or more than 500 frames. The test split keeps all
-    motions, but only the first caption of each. The attribute `ghosh_test` states whether a clip is
-    in Ghosh et al.'s test split.
+    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions of fewer than 10 or more
+    than 500 frames are left out of the training and validation splits. The test split contains all
+    motions, but only the first caption of each motion. The attribute `ghosh_test` states whether a
+    clip is in Ghosh et al.'s test split.
 
     `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
     contains TEMOS's lists of these numbers.
@@ -59,7 +59,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Split of each motion, by name."""
+        """Maps the name of each motion to its split."""
         return self.not_excluded(read_splits(self.splits, "", self.get_it), self.splits)
 
     @cached_property
@@ -102,7 +102,7 @@ class KITTemos(MotionSource):
         return {name: ceil_div(count, 8) for name, count in rows.items()}
 
     def count(self) -> int:
-        """Returns the number of motions with a caption and a permitted length."""
+        """Returns the number of motions that have a caption and a permitted length."""
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:

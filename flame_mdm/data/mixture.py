@@ -21,12 +21,13 @@ def known_licenses() -> dict[str, dict[str, str]]:
 
 
 class Mixture(MotionSource):
-    """Clips from several data sets, one data set after the other.
+    """The clips of several data sets, one data set after the other.
 
     Args:
-        parts: the data sets, each under a name of your choice.
-        use: purpose of the trained model. "any" refuses data sets with motions whose license is
-            unknown or permits only research. "research" accepts all data sets.
+        parts: the data sets, each with a name of your choice.
+        use: purpose of the trained model. With "any", data sets with motions whose license is
+            unknown or permits only research are rejected. With "research", all data sets are
+            accepted.
     """
 
     name = "mixture"
@@ -48,10 +49,10 @@ class Mixture(MotionSource):
         }
 
     def count(self) -> int:
-        """Returns the number of clips of all parts.
+        """Returns the total number of clips in all parts.
 
         Raises:
-            UserError: If a license forbids the use.
+            UserError: If a license forbids this use of the data.
         """
         self.check_licenses()
         return sum(part.count() for part in self.parts.values())
@@ -81,7 +82,7 @@ class Mixture(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields the clips of each part.
 
-        Actions with the same name have the same number in all parts.
+        Actions with the same name have the same label in all parts.
         """
         self.check_licenses()
         names: dict[str, int] = {}
@@ -97,7 +98,7 @@ class Mixture(MotionSource):
         self.failures = [line for part in self.parts.values() for line in part.failures]
 
     def findings(self) -> list[str]:
-        """Returns the findings of each part, preceded by its name."""
+        """Returns the findings of all parts, each preceded by the name of its part."""
         return [f"{name}: {line}" for name, part in self.parts.items() for line in part.findings()]
 
     def failure_lines(self) -> list[str]:

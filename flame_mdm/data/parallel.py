@@ -1,4 +1,4 @@
-"""Parallel processing of files in worker processes, which keeps the order of the results."""
+"""Parallel processing of files in worker processes, with results in the original order."""
 
 import os
 import threading
@@ -34,8 +34,8 @@ def in_order(
 ) -> Generator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks.
 
-    Only a few tasks are read ahead. If `tasks` comes from another `in_order`, both share one
-    pool.
+    Only a few tasks are read ahead. If `tasks` is the result of another call of `in_order`, both
+    calls share one pool.
 
     Args:
         function: called with each task. It must be picklable, like its tasks and results.
@@ -44,7 +44,7 @@ def in_order(
             the work has taken `PATIENCE` seconds.
 
     Raises:
-        UserError: If a worker died, for example because the system ran out of memory.
+        UserError: If a worker process died, for example because the system ran out of memory.
     """
     workers = 1 if not workers and cores() == 1 else workers
     start, remaining = time.monotonic(), iter(tasks)

@@ -30,7 +30,8 @@ PLANNED = 16
 def free_memory(device: torch.device) -> int:
     """Returns the free memory of a device in bytes.
 
-    For devices other than GPUs, this is the memory that the system or the container has available.
+    For devices other than GPUs, this is the memory that is available in the system or the
+    container.
     """
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]

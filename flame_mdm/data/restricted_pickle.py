@@ -7,7 +7,7 @@ bytes. NumPy's own functions are not used for this, because a wrong byte in a dt
 
 Python's C unpickler allocates as much memory as a file declares, even if the file has only ten
 bytes. Therefore, this reader is based on the Python version of the unpickler, and never reads more
-bytes than are left in the file. Content that a pickle repeats counts toward the size limit each time.
+bytes than are left in the file. Repeated content counts toward the size limit each time.
 """
 
 import pickle
@@ -125,7 +125,7 @@ class _Unpickler(pickle._Unpickler):
     def plain_object(self, name: str, value: _Object) -> Any:
         """Returns the array, number or text that an object describes.
 
-        For opaque objects, returns their state.
+        For an opaque object, its state is returned.
         """
         if name == ARRAY:
             _, shape, dtype, is_fortran, data = value.state

@@ -204,7 +204,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     existing intact store is replaced.
 
     Raises:
-        UserError: If `folder` contains anything other than an intact store.
+        UserError: If `folder` contains anything except an intact store.
     """
     source.suit(representation)
     total, before = source.count(), (folder / "store.json").exists()
@@ -299,14 +299,14 @@ def _line(entry: Entry) -> str:
 def _pack(
     folder: Path, name: str, encoded: Iterable[tuple[Clip, np.ndarray]], features: int
 ) -> tuple[list[Entry], int]:
-    """Writes the features and references of the data set `name`, clip by clip.
+    """Writes the features and references of the data set `name`, one clip at a time.
 
     Returns the entries of the clips and the total number of frames. Consecutive clips with the same
     motion share the frames of the motion.
 
     Raises:
-        UserError: If a clip exceeds its motion, if two clips have the same id, or if clips of the
-            same source are in different splits.
+        UserError: If a clip extends past the end of its motion, if two clips have the same id, or
+            if clips of the same source are in different splits.
     """
     entries: dict[str, Entry] = {}
     split_of: dict[str, Split] = {}  # split of each source

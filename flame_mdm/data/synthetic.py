@@ -164,7 +164,7 @@ def _template(rng: np.random.Generator, attributes: Attributes) -> str:
 
 
 def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str, int]]) -> str:
-    """Returns the text with all verbs in one of the tenses."""
+    """Returns the text with all verbs in one tense, which is drawn from `tenses`."""
     auxiliary, column = _one(rng, tenses)
 
     def form(verb: re.Match[str]) -> str:

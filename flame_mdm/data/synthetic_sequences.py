@@ -1,4 +1,4 @@
-"""Synthetic clips for models that continue frames: motions that follow another motion."""
+"""Synthetic clips for models that continue a motion: each one shows two successive motions."""
 
 from collections.abc import Sequence
 
@@ -55,7 +55,7 @@ HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothin
 
 
 class SyntheticSequences(Synthetic):
-    """Clips of the end of a previous motion, followed by the motion that the captions describe.
+    """Clips with the end of a previous motion and the motion that the captions describe.
 
     The previous motion is a different action, the same action, or standing still. The described
     motion begins before the body comes to rest. People who sit, lie or kneel stand up first.
@@ -92,7 +92,7 @@ class SyntheticSequences(Synthetic):
         return self.described(name, joints.astype(np.float32), attributes, words)
 
     def _attributes(self, rng: np.random.Generator) -> Attributes:
-        """Draws the attributes of a clip that shows a whole motion, not a part of a cycle."""
+        """Draws the attributes of a clip that shows a whole motion rather than part of a cycle."""
         attributes = self.attributes(rng)
         while attributes.get("ends"):
             attributes = self.attributes(rng)

@@ -56,8 +56,8 @@ class Cut(NamedTuple):
     ) -> Clip:
         """Returns the clip that this cut selects from a motion.
 
-        `facts` are additional attributes. The attribute `tokens` is left out if a description has
-        none.
+        `facts` are additional attributes. The attribute `tokens` is left out if any description has
+        no tokens.
         """
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
         attributes = facts | ({"tokens": tokens} if all(tokens) else {})
@@ -158,7 +158,7 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Split of each motion that is not excluded, by name."""
+        """Maps the name of each motion that is not excluded to its split."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property

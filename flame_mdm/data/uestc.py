@@ -57,8 +57,8 @@ class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl` as raw SMPL motions, rotated to the front view.
 
     As in the published data set, training clips of fewer than 45 frames are left out, and all test
-    clips are kept. The published split trains on all 51 training subjects. The project's own split
-    uses 5 of these subjects for validation.
+    clips are kept. In the published split, all 51 training subjects are used for training. The
+    project's own split uses 5 of these subjects for validation.
     """
 
     name = "uestc"
@@ -177,7 +177,7 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
     Args:
         pose: (F, 72), axis-angle vectors.
         root: (F, 3), position of the root relative to the body.
-        camera: (F, 4), the scales sx and sy, of which only sx is used, followed by the shift.
+        camera: (F, 4), the scales sx and sy, followed by the shift. The scale sy is not used.
         video: the fields of the video's file name.
 
     Returns:

@@ -38,7 +38,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: If the data set is not prepared.
-        UserError: If a hash does not match, or if a number is not finite.
+        UserError: If a hash does not match, or if the features contain NaN or infinite values.
     """
     store = data.open()
     store.verify()
@@ -166,7 +166,7 @@ def _anomalies(
     captions.
 
     Raises:
-        UserError: If a frame is not finite.
+        UserError: If a frame contains NaN or infinite values.
     """
     sharing: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
     for clip in store.clips:
@@ -179,8 +179,8 @@ def _anomalies(
         if not finite.all():
             frame = int(np.argmin(finite))
             raise UserError(
-                f"{store.folder} is damaged: frame {frame} of clip {clip.id} is not finite. "
-                "Prepare the data set again"
+                f"{store.folder} is damaged: frame {frame} of clip {clip.id} contains NaN or "
+                "infinite values. Prepare the data set again"
             )
         joints = representation.decode(torch.from_numpy(motion))
         if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:

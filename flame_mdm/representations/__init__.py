@@ -48,8 +48,8 @@ class Representation(nn.Module, ABC):
     Mean and std are buffers, so that sampling does not require the data set.
 
     Args:
-        name: name in stores and checkpoints. Features of representations with different names are
-            never combined.
+        name: name that is used in stores and checkpoints. Features of representations with
+            different names are never combined.
         features: D, the number of features per frame.
         fps: frames per second, 1 to 1000.
         skeleton: skeleton of the decoded joint positions.
@@ -112,7 +112,7 @@ class Representation(nn.Module, ABC):
         """
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Returns the 6D rotations (..., F, N, 6) in features (..., F, D) in the data's units.
+        """Extracts the 6D rotations (..., F, N, 6) from features (..., F, D) in the data's units.
 
         By default, features contain no rotations (N = 0).
         """
@@ -141,7 +141,7 @@ class Representation(nn.Module, ABC):
         return mask
 
     def contacts(self, features: Features) -> Features | None:
-        """Returns the columns (..., F, N) for contacts of `skeleton.feet` with the floor.
+        """Returns the columns (..., F, N) for the floor contacts of `skeleton.feet`.
 
         The values range from about 0 to 1. Returns None if the features contain no contacts.
         """
@@ -172,7 +172,7 @@ class Representation(nn.Module, ABC):
 
 
 def check_finite(motion: Tensor, name: str = "motion") -> None:
-    """Raises `UserError` if a raw motion (F, ...) contains a number that is not finite."""
+    """Raises `UserError` if a raw motion (F, ...) contains NaN or infinite values."""
     if not motion.isfinite().all():
         frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
         raise UserError(

@@ -46,8 +46,8 @@ class HumanML(Representation):
     not. `turn` is half the turn to the right, and changes its sign where the heading crosses 180
     degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
     rotations of the bones relative to the inverse heading, including the bones at the shoulders.
-    `decode` also follows the published code. If a bone is exactly opposite to its rest direction,
-    the published code returns NaN. This implementation returns a half turn instead.
+    `decode` also follows the published code. If a bone points exactly opposite to its rest
+    direction, the published code returns NaN. This implementation returns a half turn instead.
 
     The variant "clean" has none of these peculiarities. Headings are unwrapped and padded
     point-symmetrically at both ends before they are smoothed, which preserves steady turns and the
@@ -121,7 +121,7 @@ class HumanML(Representation):
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions in one pass over all their frames, which is faster."""
+        """Encodes several motions at once, which is faster than encoding each one separately."""
         joints, lengths = self._canonical(motions)
         heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
         last = torch.tensor(lengths).cumsum(0) - 1
@@ -234,7 +234,7 @@ class HumanML(Representation):
         )
 
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
-        """Returns the x and z (N, 2) of the direction that the hips and shoulders face.
+        """Returns the x and z components (N, 2) of the direction that the hips and shoulders face.
 
         The direction is the cross product of the vertical and the direction to the right. The
         vector is shorter if the body lies on its side. `hips` is the weight of the hips.

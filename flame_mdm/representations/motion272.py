@@ -121,7 +121,7 @@ class Motion272(Representation):
         return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns rotations (..., F, 3, 3) to body coordinates and ground positions (..., F, 3).
+        """Returns rotations (..., F, 3, 3) to body coordinates, and ground positions (..., F, 3).
 
         The ground position is the position of the root with y = 0.
         """

@@ -37,7 +37,7 @@ class Rifke(Representation):
 
     Args:
         fps: frames per second.
-        units_per_metre: units of the features per meter. KIT's unit is 1/640 meters. Input
+        units_per_metre: units of the features per meter. KIT's unit is 1/640 meter. Input
             and output joint positions are in meters.
 
     Example:
@@ -89,7 +89,7 @@ class Rifke(Representation):
         )
 
     def floor(self, joints: Tensor) -> Tensor:
-        """Estimates the height of the floor from joint positions (T, 21, 3), all in KIT's unit.
+        """Estimates the height of the floor from joint positions (T, 21, 3), both in KIT's unit.
 
         The estimate is a soft minimum, over time, of the height of the lowest foot.
         """

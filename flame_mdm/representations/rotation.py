@@ -137,9 +137,9 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 
 
 def _shorter(normalized: Tensor) -> Tensor:
-    """Returns a bool tensor (..., 1) that is True where a normalized vector is shorter than 1.
+    """Returns a bool tensor (..., 1) that is True where a normalized vector has a norm below 1.
 
-    In this case, the original vector was about 0.
+    In this case, the original vector was close to 0.
     """
     return (
         torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
@@ -184,7 +184,7 @@ def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
 
 
 def standardize(quaternion: Tensor) -> Tensor:
-    """Returns q or -q (..., 4), whichever has w >= 0. Both are the same rotation.
+    """Returns q or -q (..., 4), whichever has w >= 0. Both represent the same rotation.
 
     Example:
         >>> standardize(torch.tensor([-1.0, 0.0, 0.0, 0.5])).tolist()

@@ -41,8 +41,8 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     first 24 of SMPL+H's 52 joints are used, so the hands are its left_index1 and left_index2.
 
     Raises:
-        UserError: If the motion has the wrong shape, for example 24 rotation matrices, or if a
-            number is not finite.
+        UserError: If the motion has the wrong shape, for example 24 rotation matrices, or if it
+            contains NaN or infinite values.
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:

@@ -165,7 +165,7 @@ export class Reader {
     const understood = understand(sentence);
     const shown = `'${text.length > 60 ? `${text.slice(0, 59)}…` : text}'`;
     if (understood.isForeign) {
-      throw new NotUnderstood(`${shown}: prompts are understood in English only. Write the prompt in English`);
+      throw new NotUnderstood(`${shown}: only English prompts are supported. Write the prompt in English`);
     }
     const asTyped = { steps: [], captions: [text], texts: [text], changes: [], ignored: [] };
     if (!understood.steps.length) {

@@ -37,7 +37,7 @@ A caption that states the value contains one of these parts.
 
 
 class Abilities:
-    """Actions and attributes of a model whose captions each name one action from a list.
+    """Actions and attributes known to a model whose captions each name one action from a list.
 
     Args:
         facts: facts about the model: "actions", "vocabulary" and, if known, "captions".
@@ -109,7 +109,7 @@ class Abilities:
         return False
 
     def choices(self, action: str) -> dict[str, list[Value]]:
-        """Returns, for each attribute of an action, the values that the model knows."""
+        """Returns the values that the model knows for each attribute of an action."""
         takes = actions()[action].takes
         listed = {
             name: [value for value in values if self.supports(action, name, value)]
@@ -123,7 +123,7 @@ class Abilities:
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:
-        """Returns captions of the three known actions that are nearest in meaning to a sentence.
+        """Returns captions of the three known actions that are closest in meaning to a sentence.
 
         The list is empty if none of the words has a known meaning.
         """

@@ -20,8 +20,8 @@ class Match:
     Attributes:
         phrase: the phrase.
         used: indices of the tokens that form the phrase, in increasing order.
-        is_weak: whether the phrase, such as "go", counts as an action only if the sentence has no
-            other action.
+        is_weak: whether the phrase counts as an action only if the sentence has no other action, as
+            is the case for "go".
     """
 
     phrase: Phrase

@@ -1,4 +1,4 @@
-"""Meanings of words that are in no table: nearest actions, and detection of words for things."""
+"""Meanings of words outside the tables: similar actions, and detection of words for things."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,7 +9,7 @@ from flame_mdm.conditions.language.tables import actions, words_of
 from flame_mdm.conditions.language.vectors import word_table
 
 SIMILAR = 0.65
-"""Minimum similarity at which a word is read as the action that is nearest in meaning.
+"""Minimum similarity at which a word is read as the action that is closest in meaning.
 
 docs/language.md reports the precision and recall at this threshold.
 """
@@ -17,7 +17,7 @@ NEIGHBORS = 5  # number of nearest listed words that decide whether a word names
 
 
 def nearest_actions(word: str) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to a word, nearest first.
+    """Returns the actions with their similarities to a word, most similar first.
 
     The result is empty if the vector table does not contain the word.
     """
@@ -26,7 +26,7 @@ def nearest_actions(word: str) -> list[tuple[str, float]]:
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to the mean of several words, nearest first."""
+    """Returns the actions with their similarities to the mean of some words, most similar first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 
@@ -54,7 +54,7 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 
 
 def is_thing(word: str) -> bool:
-    """Returns whether a word names a thing, judging by the listed words that are nearest to it."""
+    """Returns whether a word names a thing, judging by the listed words with similar meanings."""
     vector = word_table().vector(word)
     if vector is None:
         return False
@@ -68,7 +68,8 @@ def is_thing(word: str) -> bool:
 def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
     """Returns the actions with their scores, highest score first.
 
-    The score is the mean of two similarities: to the nearest word of the action, and to its center.
+    The score is the mean of the similarity to the action's closest word and the similarity to the
+    action's center.
     """
     names, rows, vectors = _action_vectors()
     words = vectors @ vector
@@ -81,9 +82,9 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 
 @cache
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns the names of the actions, and the single words that name them.
+    """Returns the names of the actions, and data about the single words that name them.
 
-    For each word, the index of its action and its vector are also returned.
+    The data consists of the index of each word's action, and the vector of each word.
     """
     table, weak = word_table(), words_of("weak")
     names = list(actions())
@@ -104,7 +105,7 @@ def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
 
 @cache
 def _centers() -> np.ndarray:
-    """Returns the mean vectors (N, D) of the words of all N actions, scaled to norm 1."""
+    """Returns an array (N, D) with the mean word vector of each action, scaled to norm 1."""
     names, rows, vectors = _action_vectors()
     centers = np.array([vectors[rows == row].sum(0) for row in range(len(names))])
     return centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-9)

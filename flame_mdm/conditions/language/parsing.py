@@ -65,9 +65,9 @@ def is_explained(word: str) -> bool:
 
 
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Returns the actions that are nearest in meaning to the unexplained words of a sentence.
+    """Returns the actions that are closest in meaning to the unexplained words of a sentence.
 
-    If all words are explained by the tables, all of them are used.
+    If the tables explain every word, all words are used.
     """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
@@ -228,7 +228,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause accompanies the previous action: "stands still, waving"."""
+        """Returns whether a clause accompanies the previous action ("stands still, waving")."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]

@@ -23,7 +23,7 @@ class Reading:
     """A sentence as a model reads it.
 
     Attributes:
-        understanding: the understood content of the sentence.
+        understanding: the content that is understood in the sentence.
         steps: the actions to sample, in order. The model knows all of them.
         captions: the caption that the model reads for each step.
         texts: the words of the sentence that describe each step.
@@ -96,7 +96,7 @@ class Reader:
         understood = understand(sentence)
         if understood.is_foreign:
             raise UserError(
-                f"{_shown(text)}: prompts are understood in English only. Write the prompt in English"
+                f"{_shown(text)}: only English prompts are supported. Write the prompt in English"
             )
         as_typed = Reading(understood, (), (text,), (text,))
         if not understood.steps:
@@ -198,7 +198,7 @@ class Reader:
         return None, {}
 
     def _possible(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns the steps that the model can sample for a step.
+        """Returns steps that the model can sample in place of the given step.
 
         If the model does not know simultaneous actions, the actions are sampled one after the
         other.
@@ -238,7 +238,7 @@ class Reader:
 class NotUnderstood(UserError):
     """Error for a sentence without an action that the model knows.
 
-    `nearest` contains captions of the known actions that are nearest in meaning.
+    `nearest` contains captions of the known actions that are closest in meaning.
     """
 
     def __init__(self, message: str, nearest: Sequence[str]):
@@ -254,7 +254,7 @@ class NotUnderstood(UserError):
 
 @dataclass
 class _Notes:
-    """Lines about changes, and words without effect, that are collected during reading."""
+    """Lines about changes, and words without effect, collected while a sentence is read."""
 
     changes: list[str]
     ignored: list[str] = field(default_factory=list)
@@ -295,14 +295,14 @@ def _shown(text: str) -> str:
 def _caption(step: Step, words: str, special: Set[str]) -> str:
     """Returns the caption of a step.
 
-    If a word is not in the tables but in the model's vocabulary, the words themselves are used as
+    If a word is in the model's vocabulary but not in the tables, the words themselves are used as
     the caption.
     """
     return words if special & set(words.lower().split()) else caption(step)
 
 
 def _without_style(text: str) -> tuple[str, str]:
-    """Splits "in limp style", which adapters teach, off the end of a sentence."""
+    """Splits a style that adapters teach, such as "in limp style", off the end of a sentence."""
     before, separator, style = text.rstrip(" .").rpartition(" in ")
     if separator and style.endswith(" style") and style.count(" ") == 1:
         return before, f" in {style}"

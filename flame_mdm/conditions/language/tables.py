@@ -81,14 +81,14 @@ def word_values(key: str) -> dict[str, str]:
 
 @cache
 def actions() -> dict[str, ActionEntry]:
-    """Returns the actions by name."""
+    """Returns a mapping from names to actions."""
     content = read_package_yaml(Path(__file__).with_name("actions.yaml"))
     return {name: _entry(name, values) for name, values in content.items()}
 
 
 @cache
 def phrases_by_first_word() -> dict[str, list[Phrase]]:
-    """Returns the phrases that name actions, by their first word. Longer phrases come first."""
+    """Returns the phrases that name actions, grouped by first word. Longer phrases come first."""
     listed_at: dict[str, list[Phrase]] = {}
     for entry in actions().values():
         for phrase in entry.phrases:

@@ -25,7 +25,7 @@ class Token:
 
     Attributes:
         typed: the word as typed.
-        word: the word in lower case, after typos are corrected.
+        word: the word in lower case, with typos corrected.
         start, end: position of the token in the sentence.
     """
 
@@ -103,7 +103,7 @@ def is_english(word: str) -> bool:
 
 
 def corrected(tokens: Sequence[Token]) -> list[Token]:
-    """Returns the tokens with corrected typos.
+    """Returns the tokens with typos corrected.
 
     An unknown word is a typo if it is similar to only a few known words.
     """
@@ -114,7 +114,7 @@ def corrected(tokens: Sequence[Token]) -> list[Token]:
 
 
 def corrected_to_action(tokens: Sequence[Token], free: Collection[int]) -> list[Token]:
-    """Replaces one rare word by a word for an action that differs from it in one letter.
+    """Replaces one rare word with a word for an action if the two words differ by one letter.
 
     This function is used for sentences in which no action is understood, such as "doge to the
     left".

@@ -46,7 +46,7 @@ class Understanding:
         unknown: words that are not understood, as typed.
         corrected: words that were read as other words, as a mapping from typed to corrected words.
         is_foreign: whether the sentence is not in English.
-        nearest: if no action is understood, the three actions that are nearest in meaning.
+        nearest: the three actions that are closest in meaning, if no action is understood.
     """
 
     text: str

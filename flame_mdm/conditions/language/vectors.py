@@ -30,18 +30,18 @@ class WordTable:
         return word in self._rows
 
     def rank(self, word: str) -> int | None:
-        """Returns the frequency rank of a word or of its base form, or None if both are missing."""
+        """Returns the frequency rank of a word or its base form, or None if neither is listed."""
         return next((self._rows[form] for form in base_forms(word) if form in self._rows), None)
 
     def vector(self, word: str) -> np.ndarray | None:
-        """Returns the vector (D,) of a word or of its base form, or None if both are missing."""
+        """Returns the vector (D,) of a word or its base form, or None if neither is listed."""
         row = self.rank(word)
         return None if row is None else self.vectors[row]
 
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
-        """Returns the mean vector (D,) of words, scaled to norm 1, or None if all are missing.
+        """Returns the mean vector (D,) of words, scaled to norm 1, or None if none is listed.
 
-        Frequent words have less weight, as in smooth inverse frequency (Arora et al. 2017). Their
+        Frequent words have less weight, as in smooth inverse frequency (Arora et al. 2017). Word
         frequencies are estimated with Zipf's law.
         """
         rows = [row for word in words if (row := self.rank(word)) is not None]
@@ -55,7 +55,7 @@ class WordTable:
 
 @cache
 def word_table() -> WordTable:
-    """Returns the table of word vectors that the package contains."""
+    """Returns the table of word vectors that is included in the package."""
     arrays = read_npz(FILE)
     words = arrays["words"].tobytes().decode().split("\n")
     # The table has 8 bits per number. The lengths of the vectors are not stored, because all of

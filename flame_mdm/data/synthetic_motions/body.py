@@ -1,4 +1,4 @@
-"""The body of the synthetic motions: curves that are set by actions, and its kinematics.
+"""The body of the synthetic motions: its kinematics, and the curves that actions set.
 
 Joint angles move the upper body by forward kinematics. The legs follow planned footprints by
 two-bone inverse kinematics, so that a foot on the ground does not move at all. Hands that reach for
@@ -51,7 +51,7 @@ def pulse(t: np.ndarray, start: float, top: float, leave: float, end: float) -> 
 
 
 def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 3, 3) about axis x, y or z (0, 1, 2) by angles (...) in radians."""
+    """Returns rotations (..., 3, 3) about x, y or z (0, 1, 2) by angles (...) in radians."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., axis, axis] = 1
@@ -64,8 +64,8 @@ def rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 class Body:
     """Curves over time that describe a body. Actions change them.
 
-    Initially, the body stands still and breathes. Angles are in radians. The first axis of feet and
-    arms is the side: 0 = left, 1 = right.
+    Initially, the body stands still and breathes. Angles are in radians. The first axis of the
+    arrays for feet and arms is the side: 0 = left, 1 = right.
     """
 
     def __init__(
@@ -114,9 +114,9 @@ class Body:
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
 
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
-        """Blends an arm by `weight` (F,) into a pose.
+        """Blends the current pose of an arm with another pose, whose weight is `weight` (F,).
 
-        The pose consists of four angles: forward, sideways, outward rotation, and elbow.
+        The other pose consists of four angles: forward, sideways, outward rotation, and elbow.
         """
         for angle, target in enumerate(pose):
             self.arms[side, angle] += weight * (target - self.arms[side, angle])
@@ -128,7 +128,7 @@ class Body:
         target: Sequence[float | np.ndarray] | np.ndarray,
         frame: str = "world",
     ) -> None:
-        """Moves a wrist by `weight` (F,) from its position to a point (3,) or (F, 3) in meters.
+        """Moves a wrist toward a point (3,) or (F, 3), in meters, by the fraction `weight` (F,).
 
         If the weight is 0, the angles of the arm determine the position of the wrist. `frame` is
         "world", "chest" or "head". For chest and head, the point is relative to this joint, with x
@@ -220,7 +220,7 @@ class Body:
 def bent(
     start: np.ndarray, end: np.ndarray, upper: float, lower: float, toward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the middle and the end (F, 3) of a limb of two bones that reaches for `end`.
+    """Returns the middle and the end (F, 3) of a two-bone limb that reaches for `end`.
 
     The limb bends in the direction `toward` (F, 3).
     """
@@ -250,7 +250,7 @@ def step(
     lift: float = 0.09,
     heel: float = 0.3,
 ) -> None:
-    """Moves a foot by (x, y, z) in meters between two times.
+    """Moves a foot by (x, y, z), in meters, between two points in time.
 
     The heel leaves the floor first; `heel` is its angle in radians. If the foot lands at another
     height (y is not 0), its horizontal motion begins later.

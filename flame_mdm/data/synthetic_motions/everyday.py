@@ -7,7 +7,7 @@ from flame_mdm.data.synthetic_motions.gestures import seat
 
 
 def hold(rng: np.random.Generator, t: np.ndarray, seconds: float = 0.5) -> np.ndarray:
-    """Returns the weight (F,) of a pose that begins early and lasts until the clip's end."""
+    """Returns the weight (F,) of a pose that begins early and lasts until the end of the clip."""
     start = rng.uniform(0.05, 0.2)
     return pulse(t, start, start + rng.uniform(0.9, 1.15) * seconds, t[-1] - seconds, t[-1])
 
@@ -267,7 +267,7 @@ def talk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def stay_seated(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Sits during the whole clip and looks to the side once."""
+    """Sits throughout the clip and looks to the side once."""
     seat(body, np.ones_like(t), np.zeros_like(t))
     body.head[1] += rng.uniform(-0.4, 0.4) * pulse(t, 0.3, 0.9, 1.4, 2.0)
 

@@ -38,7 +38,7 @@ def stretch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attr
 
 
 def lean(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Leans the trunk to one side and comes back."""
+    """Leans the trunk to one side and straightens up again."""
     sign = 1 if requested["direction"] == "left" else -1
     start = rng.uniform(0.05, 0.25)
     aside = pulse(t, start, start + rng.uniform(0.7, 0.9), t[-1] - 0.75, t[-1])

@@ -47,7 +47,7 @@ def raise_arms(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 
 
 def punch(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Punches ahead from a guard, `count` times."""
+    """Punches forward from a guard position, `count` times."""
     (side,) = SIDES[str(requested["side"])]
     body.ankles[..., 2] += rng.uniform(0.04, 0.1) * rng.choice([-1, 1]) * SIGN[:, None]
     body.position[:, 1] -= 0.03
@@ -174,7 +174,7 @@ def leap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Kicks ahead with one leg while standing on the other, `count` times."""
+    """Kicks forward with one leg while standing on the other, `count` times."""
     (side,) = SIDES[str(requested["side"])]
     high = rng.uniform(1.15, 1.45)
     kicks = events(rng, t, int(requested["count"]), 1.25)
@@ -211,7 +211,7 @@ def kick(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Squats with the arms ahead, `count` times."""
+    """Squats with the arms stretched forward, `count` times."""
     depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.9)
     for start, seconds in events(rng, t, int(requested["count"]), 1.9):
         down = pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)

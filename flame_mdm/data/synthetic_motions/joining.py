@@ -32,7 +32,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
         first: a body at evenly spaced times.
         second: a body at times with the same spacing.
         overlap: seconds by which the second motion begins before the end of the first motion.
-        blend: seconds after the end of the first motion until the difference is faded out.
+        blend: duration of the fade-out in seconds, from the end of the first motion.
     """
     spacing = second.t[1] - second.t[0]
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1

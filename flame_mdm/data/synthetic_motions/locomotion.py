@@ -25,7 +25,7 @@ It maps fractions (N,) of the path and its length in meters to x (N,), z (N,) an
 
 @dataclass(frozen=True)
 class Gait:
-    """Parameters of steps, in seconds, meters and radians."""
+    """Parameters of footsteps, in seconds, meters and radians."""
 
     # Approximate time from one footprint to the next
     step: float

@@ -56,7 +56,7 @@ def crouch_walk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: 
 
 
 def limp(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Walks with a stiff, sore leg: the trunk leans over it, and its foot is hardly lifted."""
+    """Walks with a stiff, sore leg: the trunk leans over the leg, and its foot is barely lifted."""
     (side,) = SIDES[str(requested["side"])]
     sign = SIGN[side]
     gait = Gait(rng.uniform(0.52, 0.6), 0.82, 0.12, 0.35, 0.1, 0.09)
@@ -258,7 +258,7 @@ def climb_stairs(
 
 
 def _smooth(count: np.ndarray) -> np.ndarray:
-    """Returns a count (F,) of steps that grows nearly evenly, but slows between two steps."""
+    """Returns a step count (F,) that grows almost evenly, but more slowly between two steps."""
     return count - 0.05 * np.sin(2 * np.pi * count)
 
 

@@ -6,7 +6,7 @@ free. All values of a free slot are 0.
 
 Positions are in meters relative to the first predicted frame, whose root is at x = z = 0 and faces
 +z. y is the height above the floor. "traj" is the position of the pelvis projected onto the floor
-(y = 0). The x of "heading" is the direction that the hips and shoulders face, in radians: 0 = +z,
+(y = 0). For "heading", x is the direction that the hips and shoulders face, in radians: 0 = +z,
 positive toward +x.
 """
 
@@ -94,7 +94,7 @@ class TargetConditions:
         self.drop_prob, self.weight, self.heading_modulo_pi = drop_prob, weight, heading_modulo_pi
 
     def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns the values (B, 8, 3) of all slots at the ends of motions.
+        """Returns the values (B, 8, 3) of all slots in the last frames of motions.
 
         Args:
             joints: (B, F, J, 3), positions in meters.
@@ -143,9 +143,9 @@ class TargetConditions:
 
 
 def heading(joints: Tensor) -> Tensor:
-    """Returns the direction (B,) that a body faces, in radians.
+    """Returns the direction (B,), in radians, that a body faces.
 
-    `joints` (B, 4, 3) are the right hip, the left hip, the right shoulder and the left shoulder.
+    `joints` (B, 4, 3) contains the right hip, left hip, right shoulder and left shoulder.
     """
     right_hip, left_hip, right_shoulder, left_shoulder = joints.unbind(1)
     right = right_hip - left_hip + right_shoulder - left_shoulder
@@ -154,6 +154,6 @@ def heading(joints: Tensor) -> Tensor:
 
 
 def requested(locations: Tensor, slots: Tensor) -> Tensor:
-    """Returns the target (B, 8, 4) that requests `slots` (B, 8) bool at `locations` (B, 8, 3)."""
+    """Returns targets (B, 8, 4) from `locations` (B, 8, 3) and a bool mask `slots` (B, 8)."""
     valid = slots[..., None].to(locations)
     return torch.cat([locations * valid, valid], -1)

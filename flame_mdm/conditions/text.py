@@ -29,7 +29,7 @@ CAPTIONS_AT_ONCE = 64
 class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
-    A frozen language model is neither in the state dict nor among the parameters. It is loaded only
+    A frozen language model is not part of the state dict or the parameters. It is loaded only
     if a caption is missing from the cache. Its tokens are always rounded to float16, even without a
     cache.
 
@@ -263,7 +263,7 @@ class PretrainedText(ConditionEncoder):
     def _look_up(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the same as `_encode`, but from the cache if it contains all captions."""
+        """Returns the results of `_encode`, read from the cache if it contains all captions."""
         encoded, distinct = self._cache, set(captions)
         if encoded is None or not encoded.rows.keys() >= distinct:
             encoded = self._encode_frozen(sorted(distinct, key=len), device)

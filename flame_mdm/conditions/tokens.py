@@ -94,7 +94,7 @@ class LearnedTokens(ConditionEncoder):
         self._rows: dict[str, np.ndarray] = {}  # rows (T, 2) of the captions encoded so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
-        """Returns the two rows of the table for the start token and each word of a caption."""
+        """Returns two table rows each for the start token and for every word of a caption."""
         words = vocabulary.words(caption)
         if self.seen:
             words = [form for word in words if (form := vocabulary.known_form(word, self.seen))]
@@ -104,9 +104,9 @@ class LearnedTokens(ConditionEncoder):
         """Trains the encoder with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
         Pooled vectors of captions for the same clip are pulled together, and pooled vectors of
-        different clips are pushed apart. Each step compares two captions from each of `PAIRS`
-        clips. Without this training, a small model learns many words slowly, because it learns them
-        only from the motion loss. Clips that have only one caption are not used.
+        different clips are pushed apart. Each training step compares two captions from each of
+        `PAIRS` clips. Without this training, a small model learns many words slowly, because it
+        learns them only from the motion loss. Clips that have only one caption are not used.
         """
         groups, device = (
             [captions for captions in groups if len(set(captions)) > 1],

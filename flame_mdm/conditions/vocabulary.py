@@ -61,11 +61,11 @@ def words(text: str) -> list[str]:
 
 
 def hashed(word: str, buckets: int) -> tuple[int, int]:
-    """Returns the two rows for a word in a table of `buckets` vectors.
+    """Returns the indices of a word's two rows in a table of `buckets` vectors.
 
     The vector of the word is the sum of both rows.
 
-    The numbers of the rows are two parts of the word's hash (Svenstrup et al. 2017, "Hash
+    The indices are two parts of the word's hash (Svenstrup et al. 2017, "Hash
     embeddings"). The model cannot distinguish two words if both parts are equal. The hash (CRC-32)
     is the same on every machine.
     """
@@ -139,7 +139,7 @@ def check_known(text: str, facts: Mapping[str, Any]) -> None:
     """Checks that a model knows at least one content word of the text.
 
     Raises:
-        UserError: If the model knows no content word of the text.
+        UserError: If the model does not know any content word of the text.
     """
     if facts.get("vocabulary") and unknown_words(text, facts) == _content(text):
         instead = _suggested(text, facts) or " Use words of its training captions"
@@ -208,8 +208,8 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
     Text is split at sentence boundaries and at "then". With `verbs`, it is also split at each comma
     that is followed by a verb. After such a comma, an "and" before a verb also splits the text.
     Otherwise, "and" does not split the text: "raises both hands and waves" is one action. A part
-    without a verb is joined with its neighbor. A style at the end, such as "in limp style", is
-    added to all parts. Adapters teach such styles.
+    without a verb is joined with a neighboring part. A style at the end, such as "in limp style",
+    is added to all parts. Adapters teach such styles.
 
     Args:
         text: the sentence.

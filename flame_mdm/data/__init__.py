@@ -109,9 +109,9 @@ class MotionSource(ABC):
 
     @cached_property
     def excluded(self) -> Counter[str]:
-        """Number of clips or labels left out for each reason, as saved in the store.
+        """Number of clips or labels that are left out for each reason, as saved in the store.
 
-        It is complete once `clips` is exhausted.
+        The numbers are complete once `clips` is exhausted.
         """
         return Counter()
 
@@ -219,7 +219,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice for the case that a split contains no clips. The advice begins with a space.
+    """Returns advice for a split that contains no clips. It begins with a space.
 
     The advice is "" for published data sets, because their splits are fixed.
     """
@@ -230,7 +230,7 @@ def required(path: Path, get_it: str) -> Path:
     """Returns `path` if it exists.
 
     Raises:
-        FileNotFoundError: If it does not exist. The message ends with the advice `get_it`.
+        FileNotFoundError: If `path` does not exist. The message ends with the advice `get_it`.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: not found; {get_it}")
@@ -253,8 +253,8 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 
     Args:
         name: name of a motion or of its source.
-        val: percentage of all names that are held out for validation.
-        test: percentage of all names that are held out for testing.
+        val: percentage of names to hold out for validation.
+        test: percentage of names to hold out for testing.
     """
     share = (name_hash(name) >> 128) % 100
     return "train" if share < 100 - val - test else "val" if share < 100 - test else "test"

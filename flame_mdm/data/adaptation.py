@@ -113,7 +113,7 @@ def styled(caption: str, name: str) -> str:
 def check_clips(path: str | Path, fps: float) -> None:
     """Checks the motions in a folder before training.
 
-    Prints the skeletons of the motions, and the parts of them that were left out.
+    Prints the skeletons of the motions, and which of their parts were left out.
 
     Raises:
         UserError: If a motion cannot be read, its floor rises, or its body floats.

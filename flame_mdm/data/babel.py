@@ -64,9 +64,9 @@ class Babel(MotionSource):
     label is left out if the motion is too short for the clip.
 
     Both splits use BABEL's entire train part for training, and 20 % of its val part for testing.
-    The project's own split draws 20 % of the motions, not of the clips, so that no motion is in
-    both val and test. FLAME's split uses every fifth clip for testing, so windows in val overlap
-    with windows in test.
+    In the project's own split, 20 % of the motions (not of the clips) are drawn, so that no motion
+    is in both val and test. FLAME's split uses every fifth clip for testing, so windows in val
+    overlap with windows in test.
 
     Args:
         path: folder of BABEL v1.0.

@@ -140,9 +140,9 @@ class Bandai(MotionSource):
         mirror: whether a mirrored copy follows each clip of the training split.
         workers: number of processes; 0 = one per core.
         exclude: file names (without extension) of the takes to leave out.
-        split: "takes" holds out takes whose combinations of content and style occur in training.
-            "compositional" holds out the combinations in `HELD_OUT`, so that their contents and
-            styles occur in training only in other combinations.
+        split: with "takes", the takes that are held out have combinations of content and style that
+            occur in training. With "compositional", the combinations in `HELD_OUT` are held out, so
+            that their contents and styles occur in training only in other combinations.
     """
 
     name = "bandai"
@@ -173,7 +173,7 @@ class Bandai(MotionSource):
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
 
     def counts(self) -> dict[str, int]:
-        """Returns the numbers of takes, in total and per data set."""
+        """Returns the number of takes, in total and per data set."""
         one, two = ([take.dataset for take in self.takes].count(number) for number in (1, 2))
         return {"takes": one + two, "takes of data set 1": one, "takes of data set 2": two}
 

@@ -358,7 +358,7 @@ class _Part:
 
 
 def _parts(table: Path) -> dict[str, _Part]:
-    """Returns the parts of recordings that a table lists, by their names.
+    """Maps names to the parts of recordings that a table lists.
 
     Rows for the same part contain captions for the same clip.
     """
@@ -475,9 +475,9 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording with `frames` frames.
 
-    Durations have priority: first KIT-ML's `seconds`, then HumanML3D's `last` frame at 20 fps. The
-    next source is CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has the
-    lowest priority, because conversions state 120 for nearly all recordings.
+    KIT-ML's `seconds` have the highest priority, followed by HumanML3D's `last` frame at 20 fps,
+    and by CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has the lowest
+    priority, because conversions state 120 for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -564,7 +564,7 @@ def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
 
 
 def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.ndarray] | str:
-    """Returns the motions of a recording from its first readable file, or the first error."""
+    """Returns the motions in the first readable file, or the first error if there is none."""
     files, evidence, items = task
     errors = []
     for file in files:

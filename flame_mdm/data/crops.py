@@ -67,7 +67,7 @@ class Crop(ABC):
 
 @dataclass(frozen=True)
 class Units(Crop):
-    """The rule for HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames.
+    """The rule for HumanML3D and KIT (Guo et al. 2022): lengths are multiples of `unit` frames.
 
     With probability 1/3, the sample is one unit shorter than the clip allows. If a clip is longer
     than `max_frames`, the sample is a window at a random position. Without a generator, the longest
@@ -96,7 +96,7 @@ class Units(Crop):
 
 @dataclass(frozen=True)
 class Whole(Crop):
-    """FLAME's rule: the entire clip, truncated after `max_frames`."""
+    """FLAME's rule: a sample is an entire clip, truncated after `max_frames`."""
 
     min_frames: int = 1
     max_frames: int = 471
@@ -109,7 +109,7 @@ class Whole(Crop):
 
 @dataclass(frozen=True)
 class Fixed(Crop):
-    """The rule for ACTOR's action data sets: always `frames` frames.
+    """The rule for ACTOR's action data sets: every sample consists of `frames` frames.
 
     Short clips repeat their last frame. Long clips are cropped to a window. As in ACTOR's code, the
     window never starts at the last possible frame. Without a generator, the first window is used.
@@ -183,12 +183,12 @@ class Clips(Dataset[Sample]):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draws the first frame, the number of frames and the caption index for each of B clips.
 
-        The numbers depend only on the seed, the batch and the index of the clip. In evaluation
+        The results depend only on the seed, the batch and the index of the clip. In evaluation
         (batch -1), they are always the same.
 
         Args:
             indices: (B,) indices of the clips.
-            batch: number of the batch, or (B,) the batch number of each clip.
+            batch: number of the batch, or an array (B,) with the batch number of each clip.
         """
         rows = np.asarray(indices)
         batches = [batch] if isinstance(batch, int) else batch
@@ -200,7 +200,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """Index (clips,) of each clip's caption in evaluation, derived from the id of the clip."""
+        """Index (clips,) of each clip's caption in evaluation, derived from the clip's id."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

@@ -97,7 +97,7 @@ class MotionDataModule(LightningDataModule):
         name: name of the data set. The name of its folder in `root` starts with this name.
         batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 = load in the training process.
-        crop: rule for the frames of a sample and the minimum length of a clip.
+        crop: rule that determines the frames of a sample and the minimum length of a clip.
         seed: seed for the order of the clips, their crops and their captions.
         resident: whether the data set is kept on the training device. The same batches are then
             gathered on the device, without workers. "auto" = only if the data set takes at most a

@@ -41,7 +41,7 @@ MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
-    """A motion file and the number of one of its animations, or None if it has only one."""
+    """A motion file, and the number of an animation in it, or None if it contains only one."""
 
     path: Path
     animation: str | None = None
@@ -223,7 +223,7 @@ class Folder(MotionSource):
     def findings(self) -> list[str]:
         """Returns lines about the motions read so far.
 
-        The lines state the skeletons of the motions, and which parts of them were left out.
+        The lines state the skeletons of the motions, and which of their parts were left out.
         """
         skeletons = [
             f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
@@ -326,7 +326,7 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Split of each motion, which is stated in the table or drawn as in `drawn_splits`."""
+        """Maps motions to splits, which are stated in the table or drawn as in `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 

@@ -16,7 +16,7 @@ Use = Literal["any", "research"]
 
 @cache
 def known_licenses() -> dict[str, dict[str, str]]:
-    """Returns the content of `licenses.yaml`: the permitted `use` and the `terms` by license."""
+    """Returns the permitted `use` and the `terms` of each license in `licenses.yaml`."""
     return read_package_yaml(Path(__file__).with_name("licenses.yaml"))
 
 
@@ -106,7 +106,7 @@ class Mixture(MotionSource):
         return [line for part in self.parts.values() for line in part.failure_lines()]
 
     def changed(self, store: Path) -> list[str]:
-        """Returns one line for each part with changed files."""
+        """Returns one line for each part whose files have changed."""
         return [line for part in self.parts.values() for line in part.changed(store)]
 
     def suit(self, representation: Representation) -> None:

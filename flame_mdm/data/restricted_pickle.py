@@ -1,9 +1,10 @@
 """Restricted reader for pickles.
 
 The reader supports arrays, numbers, text, lists, tuples, and dictionaries with text keys. A pickle
-can name any function and have it called when it is loaded. This reader never calls these functions:
-it only records the arguments and the state of each object, and creates arrays from the recorded
-bytes. NumPy's own functions are not used for this, because a wrong byte in a dtype makes them crash.
+can name any function, which is then called when the pickle is loaded. This reader never calls these
+functions: it only records the arguments and the state of each object, and creates arrays from the
+recorded bytes. NumPy's own functions are not used for this purpose, because a wrong byte in a dtype
+makes them crash.
 
 Python's C unpickler allocates as much memory as a file declares, even if the file has only ten
 bytes. Therefore, this reader is based on the Python version of the unpickler, and never reads more

@@ -13,7 +13,7 @@ from flame_mdm.representations.skeleton import SMPL22
 def standing(representation: Representation, frames: int) -> Motion:
     """Returns a motion of a person standing still, with its features in a representation.
 
-    The motion is generated like the synthetic data set, so no data is required.
+    The motion is generated like the motions of the synthetic data set, so no data is required.
     """
     # Some representations have one row per pair of neighboring frames, so one frame is added.
     body = Body(np.random.default_rng(0), np.zeros(frames + 1))

@@ -159,7 +159,7 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns the number of clips, the minutes and the actions for each license.
+        """Returns the number of clips, their total minutes and their actions for each license.
 
         The list is empty if the data set states no licenses. Copies of a clip are counted once.
         """

@@ -148,7 +148,7 @@ def _sentence(rng: np.random.Generator, attributes: Attributes) -> tuple[str, se
 def _template(rng: np.random.Generator, attributes: Attributes) -> str:
     """Returns a template for captions.
 
-    For simultaneous actions, it combines the templates of both actions.
+    For simultaneous actions, the result combines the templates of both actions.
     """
     grammar = content()
     if "while" not in attributes:

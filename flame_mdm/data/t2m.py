@@ -125,7 +125,7 @@ def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
 
 
 def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
-    """Returns the split of each name, in the order of the lists.
+    """Maps each name to its split, in the order of the lists.
 
     Raises:
         UserError: If a name is in two splits.

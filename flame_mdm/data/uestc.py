@@ -40,7 +40,7 @@ NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 
 class Video(NamedTuple):
-    """Fields in a video's file name.
+    """The fields of a video's file name.
 
     `index` is the position of the video in the published lists.
     """

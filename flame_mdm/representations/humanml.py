@@ -147,7 +147,7 @@ class HumanML(Representation):
         return list(rows.split([length - 1 for length in lengths]))
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes the turn, root and positions in features (..., F, D).
+        """Decodes the turn, root and position columns of features (..., F, D).
 
         Returns the joint positions (..., F, J, 3) in meters. The decoding is differentiable.
         """
@@ -276,7 +276,10 @@ class HumanML(Representation):
         return rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(relative), "columns")
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns heading (..., F) and position (..., F, 3) of the root, in the features' unit."""
+        """Returns the heading (..., F) and the position (..., F, 3) of the root.
+
+        The position is in the features' unit.
+        """
         turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
         heading = self.turn_unit * turn
         x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)

@@ -98,7 +98,7 @@ class Motion272(Representation):
         return torch.cat([turn, features[..., self.slices["rotations"]].unflatten(-1, (22, 6))], -2)
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes the velocity, turn and positions in features (..., F, 272).
+        """Decodes the velocity, turn and position columns of features (..., F, 272).
 
         Returns the joint positions (..., F, 22, 3) in meters. The decoding is differentiable.
         """

@@ -221,7 +221,7 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
 def _scaled(vectors: Tensor) -> Tensor:
     """Scales vectors so that their largest absolute entry is 1. Zero vectors remain 0.
 
-    The squares of tiny vectors then do not underflow.
+    This prevents the squares of tiny vectors from underflowing.
     """
     largest = vectors.abs().amax(-1, keepdim=True)
     return vectors / torch.where(largest > 0, largest, 1.0)

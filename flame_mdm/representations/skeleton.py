@@ -49,7 +49,7 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """For each joint, the joint relative to which HumanML3D expresses its rotation.
+        """For each joint, the joint to which its rotation is relative in HumanML3D.
 
         This is the parent or, at the start of a chain, the root.
         """

@@ -37,8 +37,9 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
     """Splits a raw SMPL motion (F, 3 + 3 K) into a translation and rotation matrices.
 
     The motion consists of a translation in meters, followed by the axis-angle vectors of K = 24, 52
-    or 55 joints. The results are (F, 3) and (F, 24, 3, 3), both float64. As in FLAME's code, the
-    first 24 of SMPL+H's 52 joints are used, so the hands are its left_index1 and left_index2.
+    or 55 joints. The results have the shapes (F, 3) and (F, 24, 3, 3), and are float64. As in
+    FLAME's code, the first 24 of SMPL+H's 52 joints are used, so the hands are its left_index1 and
+    left_index2.
 
     Raises:
         UserError: If the motion has the wrong shape, for example 24 rotation matrices, or if it

@@ -51,7 +51,7 @@ class Abilities:
 
     @cached_property
     def actions(self) -> list[str]:
-        """Actions that the model knows, by their names in `actions.yaml`."""
+        """Names of the actions that the model knows, as in `actions.yaml`."""
         listed: dict[str, None] = {}
         for name in self.names:
             plain = name.replace("_", " ").lower()

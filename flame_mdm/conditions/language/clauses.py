@@ -107,7 +107,7 @@ def _clauses(tokens: Sequence[Token], matches: Sequence[Match]) -> Iterator[Clau
 
 
 def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
-    """Returns the words of the connector at a token, or () if no connector begins there."""
+    """Returns the words of the connector that begins at a token, or () if there is none."""
     for words in CONNECTORS:
         if tuple(token.word for token in tokens[number : number + len(words)]) != words:
             continue

@@ -32,7 +32,7 @@ def nearest_to(words: list[str]) -> list[tuple[str, float]]:
 
 
 def similarity(action: str, other: str) -> float:
-    """Returns the similarity of two actions: the cosine between the means of their words."""
+    """Returns the cosine similarity between the mean word vectors of two actions."""
     names, _, _ = _action_vectors()
     first, second = names.index(action), names.index(other)
     centers = _centers()

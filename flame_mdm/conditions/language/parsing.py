@@ -261,6 +261,6 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Removes duplicates from a step, and "stands still" if the step has another action."""
+    """Removes duplicates from a step, and "stands still" if the step contains another action."""
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

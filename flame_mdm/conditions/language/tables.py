@@ -122,7 +122,7 @@ def _phrase(text: str, action: str) -> Phrase:
 
 
 def _like(text: str) -> Phrase:
-    """Parses another action and its required attributes, such as "walk speed=slow"."""
+    """Parses a similar action and its required attributes, such as "walk speed=slow"."""
     parts = text.split()
     name = " ".join(part for part in parts if "=" not in part)
     return Phrase((name,), name, dict(part.split("=") for part in parts if "=" in part))

@@ -296,7 +296,7 @@ def test_wrong_input_is_explained(tiny, tmp_path, subtests):
         (
             tiny,
             ["dataset-1_walk_hapy_001"],
-            "data.source.exclude: .* has no dataset-1_walk_hapy_001",
+            "data.source.exclude: .* does not contain dataset-1_walk_hapy_001",
         ),
         (tmp_path / "notes.txt", [], "notes.txt: neither a folder nor a zip or tar archive"),
         (

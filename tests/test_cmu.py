@@ -308,7 +308,7 @@ def test_wrong_folders_get_one_line(folder, subtests):
         (folder / "clone/HumanML3D" / name).unlink()
     with pytest.raises(FileNotFoundError, match=r"train\.txt: not found; clone https"):
         source(folder).count()
-    with pytest.raises(UserError, match=r"data\.source\.exclude: .* has no 99_99"):
+    with pytest.raises(UserError, match=r"data\.source\.exclude: .* does not contain 99_99"):
         _ = source(folder, exclude=["99_99"]).files
     (folder / "clone/kitml.json").write_text("[1]")
     with pytest.raises(UserError, match=r"kitml\.json: not KIT-ML's captions for AMASS"):

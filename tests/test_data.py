@@ -327,7 +327,9 @@ def test_workers_change_nothing(root):
 def test_a_store_of_another_representation_is_refused(root):
     data = module(root, CROPS[0])
     data.representation.name = "humanml-legacy-smpl22"
-    with pytest.raises(ValueError, match="the recipe has representation=humanml-legacy-smpl22"):
+    with pytest.raises(
+        ValueError, match="the recipe specifies representation=humanml-legacy-smpl22"
+    ):
         data.open()
 
 
@@ -495,14 +497,14 @@ def test_a_resumed_run_counts_the_batches_of_accumulated_steps(root, resident):
 def test_a_store_of_another_set_rate_or_version_is_refused(root, owner, name, value):
     data = module(root, CROPS[0])
     setattr(getattr(data, owner), name, value)
-    with pytest.raises(UserError, match=rf"the recipe has (dataset|{name})={value}"):
+    with pytest.raises(UserError, match=rf"the recipe specifies (dataset|{name})={value}"):
         data.open()
 
 
 def test_a_store_of_other_options_is_refused(root):
     data = module(root, CROPS[0])
     data.source.options = {**data.source.options, "seed": 2}
-    with pytest.raises(UserError, match="prepared with seed=1, but the recipe has seed=2"):
+    with pytest.raises(UserError, match="prepared with seed=1, but the recipe specifies seed=2"):
         data.open()
 
 

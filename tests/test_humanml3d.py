@@ -262,7 +262,7 @@ def motion(folder, name="000001"):
         ),
         (
             lambda f: np.save(motion(f), np.full((60, 263), math.nan)),
-            "clip 000001: .* frame 0 are not finite. Exclude",
+            "clip 000001: .* frame 0 contain NaN or infinite values. Exclude",
         ),
         (lambda f: motion(f).write_bytes(motion(f).read_bytes()[:-999]), r"000001\.npy: damaged"),
         (
@@ -297,7 +297,7 @@ def test_damaged_motions_can_be_excluded(folder, tmp_path):
     )
     assert not {"M000000", "000005"} & {clip.id for clip in store.clips}
     assert store.info["excluded"]["motions by data.source.exclude"] == 2
-    with pytest.raises(ValueError, match=r"data\.source\.exclude: .* has no 7"):
+    with pytest.raises(ValueError, match=r"data\.source\.exclude: .* does not contain 7"):
         HumanML3D(str(folder), exclude=["7"]).count()
 
 

@@ -397,7 +397,7 @@ def test_bad_motions_and_options(subtests):
         (
             HumanML(),
             bent.index_fill(0, torch.tensor([3]), math.inf),
-            "frame 3 contains numbers that are not finite",
+            "frame 3 contains NaN or infinite values",
         ),
         (SMPL(), raw[:, :69], r"\(4, 69\)"),
         (Rot6D(), raw[:0], r"\(0, 75\)"),

@@ -202,7 +202,7 @@ def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsy
     assert main(["prepare", *prepared(root, 61)]) == 0
     capsys.readouterr()
     before = tree(root)
-    message = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=120. Prepare it again"
+    message = f"error: {root / STORE}: prepared with clips=61, but the recipe specifies clips=120. Prepare it again"
     for line in (
         ["train", *words(run, root), "trainer.max_steps=2"],
         ["prepare", *prepared(root, 120)],

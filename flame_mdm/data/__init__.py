@@ -127,7 +127,7 @@ class MotionSource(ABC):
             UserError: If `exclude` contains a name that is not in the mapping.
         """
         if unknown := set(self.exclude) - named.keys():
-            raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
+            raise UserError(f"data.source.exclude: {path} does not contain {some(unknown)}")
         self.leave_out("motions by data.source.exclude", len(self.exclude))
         return {name: value for name, value in named.items() if name not in self.exclude}
 

@@ -206,7 +206,7 @@ class MotionDataModule(LightningDataModule):
             )
             advice = "Prepare it again with force=true, choose another data_root or data.name, or change the recipe"
             raise UserError(
-                f"{self.folder}: prepared with {there}, but the recipe has {here}. {advice}"
+                f"{self.folder}: prepared with {there}, but the recipe specifies {here}. {advice}"
             )
         self.representation.mean.copy_(torch.from_numpy(store.mean))
         self.representation.std.copy_(torch.from_numpy(store.std))

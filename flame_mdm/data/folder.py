@@ -137,8 +137,8 @@ class Folder(MotionSource):
         name = representation.name
         if needs_rotations(representation) and self.motion == "joints":
             raise UserError(
-                f"{name} encodes rotations. Add data.source.motion=smpl, which reads rotations "
-                "from the files, or fits them to joints"
+                f"{name} encodes rotations. Add data.source.motion=smpl to read rotations "
+                "from the files or to fit them to the joints"
             )
         if isinstance(representation, HumanML | Rifke) and self.motion == "smpl":
             raise UserError(f"{name} encodes joint positions. Remove data.source.motion=smpl")

@@ -86,7 +86,7 @@ class KITTemos(MotionSource):
                 or len(captions) != meta.get("nb_annotations")
             ):
                 raise UserError(
-                    f"{self.path}: {name}_annotations.json is damaged, or {name}_meta.json does not match"
+                    f"{self.path}: {name}_annotations.json is damaged or does not match {name}_meta.json"
                 )
             if captions:
                 texts[name] = captions

@@ -238,7 +238,7 @@ def _replaceable(folder: Path) -> list[Path]:
     if not (folder / "store.json").is_file():
         raise UserError(
             f"{folder}: exists, but is not a prepared data set, so it is not replaced. Choose another data_root or "
-            "data.name, or move that folder away"
+            "data.name, or move this folder elsewhere"
         )
     store = Store(folder)
     store.verify()
@@ -429,7 +429,8 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     if not np.isfinite(features).all():
         frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
         raise UserError(
-            f"clip {name}: the features of frame {frame} are not finite. Exclude the clip by name"
+            f"clip {name}: the features of frame {frame} contain NaN or infinite values. "
+            "Exclude the clip by name"
         )
     return features
 

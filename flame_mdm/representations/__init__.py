@@ -176,7 +176,7 @@ def check_finite(motion: Tensor, name: str = "motion") -> None:
     if not motion.isfinite().all():
         frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
         raise UserError(
-            f"{name}: frame {frame} contains numbers that are not finite. Exclude the motion"
+            f"{name}: frame {frame} contains NaN or infinite values. Exclude the motion"
         )
 
 

@@ -48,8 +48,8 @@ class TargetConditions:
             The heading error of a body that faces backwards is then 0.
 
     Raises:
-        UserError: If the skeleton lacks a joint, if a choice is unknown, or if the probability is
-            not in [0, 1].
+        UserError: If the skeleton lacks a required joint, if a choice is unknown, or if the
+            probability is not in [0, 1].
 
     Example:
         >>> from flame_mdm.representations.skeleton import SMPL22

@@ -149,7 +149,7 @@ class Amass:
 
     @cached_property
     def archives(self) -> dict[str, Path]:
-        """Maps each subset to its archive, which is recognized by its file name."""
+        """Maps each subset to its archive, which is identified by its file name."""
         paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
         return {
             subset: path

@@ -130,7 +130,7 @@ class Take(NamedTuple):
 
 
 class Bandai(MotionSource):
-    """Both data sets, converted to SMPL's skeleton, with captions for content and style.
+    """Both data sets, converted to SMPL's skeleton, with captions that state content and style.
 
     Args:
         path: a clone of the original repository, a folder that contains the BVH files at any

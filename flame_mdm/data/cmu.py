@@ -335,7 +335,7 @@ class CMU(MotionSource):
             )
 
     def counts(self) -> Mapping[str, float]:
-        """Returns how many HumanML3D clips and captions were read."""
+        """Returns the number of HumanML3D clips and captions that were read."""
         return self._counts
 
     def findings(self) -> list[str]:

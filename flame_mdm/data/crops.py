@@ -1,4 +1,4 @@
-"""Rules for cropping clips to training samples, and data sets of cropped clips.
+"""Rules that crop clips to training samples, and data sets of cropped clips.
 
 The rules follow the authors' code.
 """

@@ -35,7 +35,7 @@ Loader = DataLoader[Sample] | ResidentLoader
 
 
 class TrainingBatches(Sampler[list[Draw]]):
-    """An endless stream of batches of clips with similar lengths.
+    """An endless stream of batches, each with clips of similar lengths.
 
     Batch n depends only on n and the seed. Each pass over the data is shuffled and divided into
     groups of `BUCKETS` batches. Each group is sorted by length to reduce padding. Process `rank` of
@@ -103,8 +103,8 @@ class MotionDataModule(LightningDataModule):
             gathered on the device, without workers. "auto" = only if the data set takes at most a
             quarter of the free memory.
         pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
-            networks process only a few shapes. No batch is padded beyond the longest sample of the
-            crop rule.
+            networks process only a few shapes. No batch is padded beyond the maximum sample length
+            of the crop rule.
     """
 
     def __init__(

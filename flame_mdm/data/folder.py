@@ -204,7 +204,7 @@ class Folder(MotionSource):
         _check_upright(self.path, self._uprights)
 
     def _motions(self, fps: float) -> Iterator[tuple[str, np.ndarray]]:
-        """Yields the name and the motion of each readable file, and records the findings."""
+        """Yields the name and the motion in each readable file, and records findings about them."""
         self.failures = failures = list[str]()
         self._uprights, self._notes = defaultdict(list), Counter()
         attempts = in_order(
@@ -221,7 +221,7 @@ class Folder(MotionSource):
             yield name, attempt.motion
 
     def findings(self) -> list[str]:
-        """Returns lines about the motions read so far.
+        """Returns lines about the motions that have been read so far.
 
         The lines state the skeletons of the motions, and which of their parts were left out.
         """

@@ -46,7 +46,7 @@ class IndexedClip(NamedTuple):
         return "/" not in self.key
 
     def frames(self, count: int) -> slice:
-        """Returns the frames of the clip in a recording of `count` frames."""
+        """Returns the slice that selects the clip from a recording of `count` frames."""
         if self.humanact12:
             return slice(0, count)
         trimmed = FACTS["trimmed"].get(self.key.partition("/")[0], 0)

@@ -102,7 +102,7 @@ class Mixture(MotionSource):
         return [f"{name}: {line}" for name, part in self.parts.items() for line in part.findings()]
 
     def failure_lines(self) -> list[str]:
-        """Returns the failures of all parts."""
+        """Returns the lines to print about the failures of all parts."""
         return [line for part in self.parts.values() for line in part.failure_lines()]
 
     def changed(self, store: Path) -> list[str]:

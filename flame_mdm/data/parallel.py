@@ -38,7 +38,7 @@ def in_order(
     calls share one pool.
 
     Args:
-        function: called with each task. It must be picklable, like its tasks and results.
+        function: function to call with each task. It must be picklable, like its tasks and results.
         tasks: the arguments of the function.
         workers: number of processes. 1 = work in this process. 0 = start one process per core once
             the work has taken `PATIENCE` seconds.

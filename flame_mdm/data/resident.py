@@ -108,7 +108,7 @@ class ResidentLoader:
             yield from self._gathered(planned)
 
     def _gathered(self, planned: list[list[Draw]]) -> Iterator[MotionBatch]:
-        """Draws the crops of several batches at once, and yields the batches."""
+        """Draws the crops for several batches at once, and yields the batches."""
         rows = np.array([index for draws in planned for index, _ in draws])
         # All clips in a batch share the batch number of the first clip.
         numbers = [draws[0][1] for draws in planned for _ in draws]

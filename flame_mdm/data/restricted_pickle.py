@@ -1,4 +1,4 @@
-"""Restricted reader for pickles.
+"""Reader for pickles that does not run any code in them.
 
 The reader supports arrays, numbers, text, lists, tuples, and dictionaries with text keys. A pickle
 can name any function, which is then called when the pickle is loaded. This reader never calls these

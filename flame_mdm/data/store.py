@@ -79,7 +79,7 @@ class Entry:
 
 
 class Contents(Schema):
-    """The values in store.json that commands rely on."""
+    """The values in store.json that commands require."""
 
     format: Literal[1]
     dataset: str

@@ -220,7 +220,7 @@ class T2MFolder(MotionSource):
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the numbers that `published.yaml` lists.
+        """Returns the statistics that `published.yaml` lists.
 
         Motions, texts and words are counted without mirrored copies.
         """

@@ -45,7 +45,7 @@ class Frames:
 class Representation(nn.Module, ABC):
     """Base class for representations, which convert motions to features and back.
 
-    Mean and std are buffers, so that sampling does not require the data set.
+    The mean and std are buffers, so that sampling does not require the data set.
 
     Args:
         name: name that is used in stores and checkpoints. Features of representations with

@@ -21,7 +21,7 @@ The published value is 20 frames at 20 fps.
 
 
 class HumanML(Representation):
-    """Features of Guo et al. 2022 (HumanML3D).
+    """The features of Guo et al. 2022 (HumanML3D).
 
     There are 263 features for 22 joints, 251 for KIT's 21 joints, and 12 J - 1 for J joints. A
     motion of T frames is encoded as T - 1 rows. Columns by name, in `slices`:
@@ -64,9 +64,10 @@ class HumanML(Representation):
         bone_lengths: for each of the J joints, the length of the bone that ends there, in the
             features' unit. All motions are retargeted to these lengths. None = each motion keeps
             its own lengths.
-        units_per_metre: units of the features per meter.
+        units_per_metre: number of the features' length units per meter.
         contact_threshold: squared displacement of a foot per frame, in the features' unit, below
-            which the foot is in contact. HumanML3D uses 0.002, and KIT uses 0.05.
+            which the foot is considered to be in contact with the floor. HumanML3D uses 0.002, and
+            KIT uses 0.05.
 
     Raises:
         UserError: If the skeleton is unknown, or if `bone_lengths` do not fit the skeleton.

@@ -1,9 +1,9 @@
 """The body of the synthetic motions: its kinematics, and the curves that actions set.
 
-Joint angles move the upper body by forward kinematics. The legs follow planned footprints by
-two-bone inverse kinematics, so that a foot on the ground does not move at all. Hands that reach for
-something also use inverse kinematics. Bone lengths are close to HumanML3D's reference skeleton (Guo
-et al. 2022).
+Forward kinematics computes the upper body from joint angles. The legs follow planned footprints
+through two-bone inverse kinematics, so that a foot on the ground does not move at all. Hands that
+reach for something also use inverse kinematics. The bone lengths are similar to those of
+HumanML3D's reference skeleton (Guo et al. 2022).
 """
 
 from collections.abc import Sequence
@@ -108,7 +108,7 @@ class Body:
         self.position[:, [0, 2]] -= self.position[0, [0, 2]]
 
     def _drift(self, rng: np.random.Generator, size: float, *shape: int) -> np.ndarray:
-        """Returns slow smooth noise (*shape, F): two waves of 0.1 to 0.7 Hz."""
+        """Returns slow, smooth noise (*shape, F): the sum of two waves of 0.1 to 0.7 Hz."""
         frequency, phase = rng.uniform(0.1, 0.7, (2, *shape, 1)), rng.random((2, *shape, 1))
         weight = rng.normal(0, size, (2, *shape, 1))
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
@@ -237,7 +237,7 @@ def bent(
 
 
 def beat(t: np.ndarray, frequency: float, phase: float = 0.0) -> np.ndarray:
-    """Returns a sine wave with a frequency in hertz and a phase in turns."""
+    """Returns a sine wave with a frequency in hertz and a phase in cycles."""
     return np.sin(2 * np.pi * (frequency * t + phase))
 
 

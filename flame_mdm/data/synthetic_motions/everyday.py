@@ -45,7 +45,7 @@ def look_around(body: Body, rng: np.random.Generator, t: np.ndarray, requested: 
 
 
 def point(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Points ahead with a straight arm."""
+    """Points forward with a straight arm."""
     (side,) = SIDES[str(requested["side"])]
     start = rng.uniform(0.1, 0.3)
     out = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.55, t[-1])
@@ -153,7 +153,7 @@ def phone(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def type_keys(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Sits at a desk and moves both hands up and down in turn over a keyboard."""
+    """Sits at a desk and alternately moves the hands up and down over a keyboard."""
     still = np.ones_like(t)
     seat(body, still, 0 * still)
     body.reaches.clear()
@@ -168,7 +168,7 @@ def type_keys(body: Body, rng: np.random.Generator, t: np.ndarray, requested: At
 
 
 def wipe(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Wipes a window or a wall in circles."""
+    """Wipes a window or a wall with circular movements."""
     (side,) = SIDES[str(requested["side"])]
     sign, frequency = SIGN[side], rng.uniform(0.8, 1.1)
     on = hold(rng, t)
@@ -183,7 +183,7 @@ def wipe(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def knock(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Raises a fist in front of the shoulder and strikes a door."""
+    """Raises a fist in front of the shoulder and knocks on a door."""
     (side,) = SIDES[str(requested["side"])]
     sign, count = SIGN[side], int(requested["count"])
     period, first = rng.uniform(0.38, 0.44), rng.uniform(0.55, 0.65)
@@ -254,7 +254,7 @@ def touch_face(body: Body, rng: np.random.Generator, t: np.ndarray, requested: A
 
 
 def talk(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Speaks with both hands in front of the body."""
+    """Gestures with both hands in front of the body, as people do when they speak."""
     on = hold(rng, t)
     for side, sign in enumerate(SIGN):
         slow = beat(t, rng.uniform(0.5, 0.8), rng.random())

@@ -1,4 +1,4 @@
-"""Exercises: stretching, leaning, jumping jacks, push-ups, hops on one leg, and kneeling."""
+"""Exercises: stretching, leaning, jumping jacks, push-ups, hopping on one leg, and kneeling."""
 
 import numpy as np
 
@@ -54,7 +54,7 @@ def lean(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 def jumping_jacks(
     body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes
 ) -> None:
-    """Jumps with the feet apart while the arms swing overhead, and then jumps back."""
+    """Jumps into a wide stance while the arms swing overhead, and then jumps back."""
     wide = rng.uniform(0.2, 0.26)
     for start, seconds in events(rng, t, int(requested["count"]), 1.05):
         air = min(0.26, 0.3 * seconds)

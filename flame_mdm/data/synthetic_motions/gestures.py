@@ -1,4 +1,4 @@
-"""Motions in place: gestures of the arms and the head, jumps, kicks, bends, sitting and lying."""
+"""Motions in place: arm and head gestures, jumping, kicking, bending, sitting and lying down."""
 
 import numpy as np
 
@@ -118,7 +118,7 @@ def salute(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def nod(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Lowers and lifts the head, `count` times."""
+    """Lowers and raises the head, `count` times."""
     deep = rng.uniform(0.8, 0.95)
     for start, seconds in events(rng, t, int(requested["count"]), 0.9):
         down = pulse(t, start, start + 0.4 * seconds, start + 0.5 * seconds, start + 0.9 * seconds)
@@ -224,7 +224,7 @@ def squat(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def bow(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Bends the trunk forward and straightens up."""
+    """Bends the trunk forward and straightens up again."""
     start, end = rng.uniform(0.15, 0.35), t[-1] - rng.uniform(0.1, 0.25)
     middle, half = (start + end) / 2, rng.uniform(0.1, 0.25)
     down = pulse(t, start, middle - half, middle + half, end)
@@ -259,7 +259,7 @@ def seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:
     Args:
         body: the body to seat.
         seated: (F,) progress from standing (0) to sitting (1).
-        bent: (F,) lean of the trunk.
+        bent: (F,) forward lean of the trunk.
     """
     body.position[:, 1] += seated * (CHAIR - body.position[:, 1])
     body.position[:, 2] -= 0.36 * seated

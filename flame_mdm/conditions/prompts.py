@@ -14,16 +14,16 @@ class ReadPrompt:
     """A prompt as a model reads it.
 
     Attributes:
-        parts: the words of each part, and its duration in seconds, or None if the prompt states
-            none.
+        parts: the words of each part, and its duration in seconds, or None if the prompt does not
+            specify a duration.
         captions: the caption that the model reads for each part.
         unknown: words that never occur in the training captions, or that the model does not read.
         summary: one line that states how the prompt was understood, or "" if the model's captions
             may describe several actions.
         changes: lines about differences between the prompt and the sampled motion.
-        fitting: for each part, a duration in seconds that suits its stated number of repetitions,
-            or None if it states no number. The tuple is empty if the captions do not describe
-            single actions.
+        fitting: for each part, a duration in seconds that suits its specified number of
+            repetitions, or None if it does not specify a number. The tuple is empty if the captions
+            do not describe single actions.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -48,7 +48,7 @@ def read_prompt(
     Args:
         prompt: the text as typed by the user.
         parts: the words of each part of the prompt, as in "walks @3 | sits", and its duration in
-            seconds, or None if the prompt states none.
+            seconds, or None if the prompt does not specify a duration.
         facts: facts about the model, such as its "vocabulary", "actions" and "captions".
         max_words: maximum number of words that the model reads in a caption; None = no limit.
         splits: whether a sentence with several actions is split into one part per action. This

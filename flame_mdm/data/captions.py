@@ -55,7 +55,7 @@ def known_split(split: str) -> Split:
 def drawn_splits(
     sources: Mapping[str, str], stated: Mapping[str, Split | None]
 ) -> dict[str, Split]:
-    """Returns the split of each motion, which is either stated in the table or drawn.
+    """Returns the split of each motion, which is either specified in the table or drawn.
 
     Splits are drawn with a hash of the source, so that all motions from the same source are in the
     same split. If no motion is drawn for training, the source with the highest hash in the largest
@@ -63,8 +63,9 @@ def drawn_splits(
     same way.
 
     Args:
-        sources: source of each motion, by name.
-        stated: split of each motion, by name, or None if the table states no split for the motion.
+        sources: maps the name of each motion to its source.
+        stated: maps the name of each motion to its split, or to None if the table does not specify
+            one.
     """
     of_sources: dict[str, Split] = {sources[name]: split for name, split in stated.items() if split}
     free = sorted(set(sources.values()) - set(of_sources))

@@ -110,9 +110,9 @@ class CMU(MotionSource):
     The clips are HumanML3D's clips, recordings with KIT-ML's captions, or motions with the user's
     captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
     in the split of the HumanML3D clips that are cut from it. If these clips are in several splits,
-    the test split has priority, followed by val. If HumanML3D has no clip of the recording, the
-    subject determines the split. If there is a table `captions.csv`, only its captions are used,
-    and each part of a recording that it lists is one clip.
+    the test split has priority, followed by val. If HumanML3D contains no clip of the recording,
+    the subject determines the split. If there is a table `captions.csv`, only its captions are
+    used, and each part of a recording that it lists is one clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -182,7 +182,7 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips from CMU recordings, and their captions and splits by name.
+        """HumanML3D's clips from CMU recordings, and mappings from names to captions and splits.
 
         All of them are empty if the user provides captions.
         """
@@ -383,7 +383,7 @@ def _parts(table: Path) -> dict[str, _Part]:
 def _own_items(parts: Mapping[str, _Part]) -> dict[str, list[Item]]:
     """Returns the parts of each recording.
 
-    Splits that the table does not state are drawn by source or, for parts without a source, by
+    Splits that the table does not specify are drawn by source or, for parts without a source, by
     subject.
     """
     sources = {

@@ -62,8 +62,8 @@ class Folder(MotionSource):
     """Motions and captions in a folder.
 
     Motions are positions of SMPL's 22 joints, or raw motions of the SMPL representation. If the
-    table states no splits, 85 % of the sources are used for training, 5 % for validation and 10 %
-    for testing, selected by a hash of their names.
+    table does not specify splits, 85 % of the sources are used for training, 5 % for validation and
+    10 % for testing, selected by a hash of their names.
 
     Args:
         path: the folder. Motions may be in subfolders.
@@ -76,7 +76,7 @@ class Folder(MotionSource):
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about as many. Each clip
             occurs at most 16 times. 0 = clips are not repeated.
-        license: license of motions for which the table states no license. This is a key in
+        license: license of motions for which the table does not specify a license. This is a key in
             `licenses.yaml`, or "" if the license is unknown.
         prefixes: words to insert before captions. Each word is mapped to the actions whose captions
             it precedes. A model can then distinguish these motions from motions with the same
@@ -152,7 +152,7 @@ class Folder(MotionSource):
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
-        """Returns the licenses in the table, including `license` if a row states no license."""
+        """Returns the licenses in the table, including `license` if a row does not specify any."""
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
@@ -326,7 +326,7 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Maps motions to splits, which are stated in the table or drawn as in `drawn_splits`."""
+        """Maps motions to splits, which are specified in the table or drawn (`drawn_splits`)."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 

@@ -149,7 +149,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Files with HumanAct12's joint positions, by file name.
+        """Maps names to the files with HumanAct12's joint positions.
 
         The dictionary is empty if the files are missing.
         """

@@ -66,7 +66,7 @@ class Mixture(MotionSource):
         return known_licenses().get(license, {}).get("use") == "any"
 
     def check_licenses(self) -> None:
-        """Raises `UserError` if a license forbids the use stated in the recipe."""
+        """Raises `UserError` if a license forbids the use that is specified in the recipe."""
         if self.use == "research":
             return
         for name, part in self.parts.items():

@@ -161,7 +161,8 @@ class Store:
     def licenses(self) -> list[dict[str, Any]]:
         """Returns the number of clips, their total minutes and their actions for each license.
 
-        The list is empty if the data set states no licenses. Copies of a clip are counted once.
+        The list is empty if the data set does not specify licenses. Copies of a clip are counted
+        once.
         """
         frames: dict[str, dict[int, int]] = {}
         actions: dict[str, set[str]] = {}

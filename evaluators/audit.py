@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluator audit: perturbs real motions in grades, and measures them like generated motions."""
+"""Evaluator audit: perturbs real motions at several grades, and measures the results."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _measured(
     texts: Sequence[Text],
     bar: ProgressBar,
 ) -> dict[str, Any]:
-    """Returns the parts of a card: the metrics, and the values of each perturbation at each grade."""
+    """Returns the parts of a card: metrics, and values for each perturbation at each grade."""
     base = measure(measure.inputs[BASE], texts)
     scores, listed = [measure.scores(measure.inputs[BASE], texts)], []
     for perturbation in perturbations:
@@ -262,7 +262,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that reads requested attributes exactly, or None if there is none."""
+        """Name of the value that judges requested attributes exactly, or None if there is none."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -270,7 +270,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Values that judge motion-text pairs by features: 1, or -1 if lower is better, by name."""
+        """Values that judge motion-text pairs by features: {name: 1, or -1 if lower is better}."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):

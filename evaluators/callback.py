@@ -106,7 +106,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Adds a value for the selection of checkpoints, and its curves for dashboards."""
+        """Adds a value for checkpoint selection, and its curves for dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name

@@ -101,7 +101,7 @@ class Evaluator:
     def extract(self, motions: Motions) -> Rows:
         """Computes the metric inputs for motions. All processes must pass the same motions.
 
-        Raises `UserError` if a motion is not finite.
+        Raises `UserError` if a motion contains NaN or infinity.
         """
         rows: Rows = {"keys": keys_of(motions.ids), **motions.inputs}
         # Batches of similar lengths need little padding.
@@ -153,7 +153,7 @@ class Evaluator:
     def reference(self) -> Rows | None:
         """Returns the features of the extractor's own real motions, or None if it has none.
 
-        Without such motions, sets are compared with motions of the data set.
+        Without such motions, sets are compared with motions from the data set.
         """
         features = self.extractor and self.extractor.reference()
         if features is None:
@@ -168,7 +168,9 @@ class Evaluator:
     ) -> tuple[list[Tensor], dict[str, Tensor]]:
         for i in indices:
             if not np.isfinite(motions.features[i]).all():
-                raise UserError(f"motion {motions.ids[i]} is not finite. Did the model diverge?")
+                raise UserError(
+                    f"motion {motions.ids[i]} contains NaN or infinity. Did the model diverge?"
+                )
         where = self.representation.mean.device
         lengths = [len(motions.features[i]) for i in indices]
         x = pad_sequence(
@@ -279,7 +281,7 @@ class Evaluator:
         return self.declared[metric].unit_of(part)
 
     def compares_sets(self, name: str) -> bool:
-        """Returns whether a value compares a set of motions with a set of real motions."""
+        """Returns whether a value is computed by comparing a set of motions with real motions."""
         return isinstance(self.declared[name.partition("/")[0]], TwoSets)
 
     def reads(self, name: str) -> bool:

@@ -2,8 +2,8 @@
 """Graded perturbations of real motions for audits: changes that a metric should detect or ignore.
 
 Each function takes joint positions (F, J, 3) in meters, y up, and keeps the number of frames unless
-its docstring states otherwise. All random draws come from a generator that is passed, so that the
-grades of a perturbation share their draws.
+its docstring states otherwise. All random draws come from a generator that is passed as an
+argument, so that the grades of a perturbation share their draws.
 """
 
 from __future__ import annotations
@@ -127,9 +127,9 @@ def crop(joints: Joints, percent: float) -> Joints:
 def drop_repetition(joints: Joints, count: int) -> Joints:
     """Cuts one of `count` repetitions out of a motion, which shortens it.
 
-    The cut joins the two frames with the most similar poses among those whose distance in time
-    differs by at most 20 % from one period. The second part continues at the position where the
-    first part ends.
+    The cut joins the two frames with the most similar poses among all pairs of frames that are
+    about one period apart (within 20 %). The second part continues at the position where the first
+    part ends.
     """
     poses = joints - joints[:, :1] * GROUND
     change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
@@ -203,7 +203,7 @@ class Perturbation:
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the indices (N,) of motions in the order of perturbation, equal at all grades."""
+        """Returns the indices (N,) of motions in the order in which all grades perturb them."""
         return scene.draws("order", self.name).permutation(len(scene))
 
 
@@ -304,7 +304,8 @@ class ReplacedCaptions(Perturbation):
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
         """Returns a perturbation for each kind of wrong captions.
 
-        The largest grade is the share of motions that have a wrong caption of this kind.
+        At the largest grade, every caption for which there is a wrong caption of this kind is
+        replaced.
         """
         offered = []
         for kind in scene.wrong if captioned else ():
@@ -340,7 +341,7 @@ class DroppedActions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns as many motions as before, all of the remaining actions, with their texts."""
+        """Returns the same number of motions with texts, but only of the remaining actions."""
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]

@@ -36,7 +36,7 @@ class Plan:
             not come from a model, they are None, None and {}.
         clips, representation: the evaluated split of `data`, and the representation on its
             device.
-        skeleton: where the bone lengths come from if joints are computed from SMPL's rotations.
+        skeleton: source of the bone lengths if joints are computed from SMPL's rotations.
             None = the data has joint positions.
         protocol, changed: the protocol with the requested numbers of motions and replications, and
             the options that were changed.

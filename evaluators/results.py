@@ -47,7 +47,7 @@ class Scores:
 class Outcome:
     """Scores of one part of an evaluation.
 
-    The parts are: real motions, generated motions, and several motions per prompt.
+    The parts are real motions, generated motions, and several motions per prompt.
     """
 
     # Scores by replication

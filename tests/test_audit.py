@@ -200,7 +200,7 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
         None, None, rewarded=False, monotone=False
     )
     assert findings(card) == [
-        "No metric notices these perturbations: still.",
+        "No metric detects the following perturbations: still.",
         "jitter rates these perturbations better than real motions: noise.",
     ]
 

@@ -593,7 +593,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"num_inference_steps": [0, 1.5]}, "expected a number of steps, or a list"),
         (
             {"eta": 1.0},
-            "eta=1.0: the sampler ancestral has no such option. Its options are guidance_scale",
+            "eta=1.0: the sampler ancestral does not support this option. It supports guidance_scale",
         ),
         ({"sampler": "ddim", "eta": 1.5}, "0 to 1"),
         ({"sampler": 3}, "sampler=3: expected the name"),

@@ -64,7 +64,7 @@ class Extractor(ABC):
     def reference(self) -> Tensor | None:
         """Features (N, E) of the network's own real motions, with which sets are compared.
 
-        None = sets are compared with motions of the data set.
+        None = sets are compared with motions from the data set.
         """
         return None
 

@@ -42,7 +42,7 @@ class ActionGRU(nn.Module):
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) of joint positions, y down, relative to the initial pelvis."""
+        """Returns features (B, 30) of joint positions (y down) relative to the initial pelvis."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))

@@ -48,8 +48,8 @@ class MotionCLIP(nn.Module):
         text_features: C, the number of features of the pooled condition.
         embedding_dim: E, the number of features in the joint space.
         blind_features: number of features at the beginning of each frame that are set to 0.
-            FLAME's code sets the first 3, the translation of the root, to 0, so that scores do not
-            depend on position and height.
+            FLAME's code sets the first 3 features (the translation of the root) to 0, so that
+            scores do not depend on position and height.
         roughness: whether absolute second differences over time, which reveal noise, are used as
             additional inputs.
     """
@@ -205,9 +205,9 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
         """Imports the weights of FLAME's released motion-CLIP into a task with the same sizes.
 
-        The weights have the authors' names. They include the pooler of the text encoder, because it
-        was initialized at random in the authors' training. Raises `ValueError` if weights or sizes
-        do not match.
+        The weights have the names of the authors' code. They include the pooler of the text
+        encoder, because it was initialized at random in the authors' training. Raises `ValueError`
+        if weights or sizes do not match.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)

@@ -15,7 +15,10 @@ TEMPORAL_KERNEL = 9
 
 
 def adjacency(parents: Sequence[int]) -> Tensor:
-    """Returns matrices (3, V, V) that gather from a vertex, its neighbors, and its neighbors nearer the root.
+    """Returns the matrices (3, V, V) of a graph convolution.
+
+    They gather from a vertex itself, its neighbors that are not nearer the root, and its neighbors
+    that are nearer the root.
 
     Entry (v, w) is the weight of vertex v in the sum for vertex w, divided by the number of
     vertices that contribute to w. In the authors' code, all vertices beyond distance 1 from the
@@ -81,7 +84,7 @@ class STGCN(nn.Module):
 
 
 class _Block(nn.Module):
-    """A graph convolution followed by a temporal convolution, on (B, C, F, V)."""
+    """A graph convolution followed by a temporal convolution, for inputs (B, C, F, V)."""
 
     def __init__(self, in_channels: int, width: int, partitions: int, stride: int, residual: bool):
         super().__init__()

@@ -263,7 +263,10 @@ def read_statistics(folder: Path) -> list[Tensor]:
 
 
 def load_t2m(folder: Path) -> T2MEvaluator:
-    """Loads the evaluator, or MARDM's evaluator for 67 or 64 features, from the folder of a `T2MExtractor`."""
+    """Loads the evaluator from the folder of a `T2MExtractor`.
+
+    If the folder's statistics have 67 or 64 features, this is MARDM's evaluator.
+    """
     mean, std = read_statistics(folder)
     network = T2MEvaluator(mean, std, used_features=len(mean) if len(mean) in (67, 64) else None)
     path = folder / "finest.tar"

@@ -23,7 +23,7 @@ from flame_mdm.representations import Representation
 
 
 class _MovementDecoder(nn.Module):
-    """Inverse of the movement encoder: two transposed convolutions decode a vector to 4 frames."""
+    """Inverse of the movement encoder: two transposed convolutions from a vector to 4 frames."""
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -35,7 +35,7 @@ class _MovementDecoder(nn.Module):
         self.out_net = nn.Linear(out_features, out_features)
 
     def forward(self, latents: Tensor) -> Tensor:
-        """Decodes vectors (B, N, latent) to frames (B, 4 N, out_features)."""
+        """Decodes vectors (B, N, latent) into frames (B, 4 N, out_features)."""
         return self.out_net(self.main(self.in_net(latents).transpose(1, 2)).transpose(1, 2))
 
 

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
     """Creates metrics, by name, from mappings with a `_target_`.
 
-    Each metric receives those `options` that it accepts.
+    Each metric receives the `options` that it accepts.
     """
     metrics: dict[str, SampleMetric] = {}
     for name, config in configs.items():

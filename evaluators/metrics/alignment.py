@@ -154,8 +154,8 @@ class MotionsForText(RPrecision):
 
     The authors' code drops an incomplete last pool. In this implementation, the last 32 motions are
     ranked for the texts of an incomplete last pool, so that every text counts once. The authors'
-    code also computes distances in float32. Therefore, a motion with the same features as its text
-    may rank last (square root of a negative number).
+    code also computes distances in float32, where rounding may lead to the square root of a
+    negative number. Therefore, a motion with the same features as its text may rank last.
 
     Args:
         pool: number of motions in a pool, including the text's own motion.
@@ -283,9 +283,9 @@ def pointwise_mutual_information(
         (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr
         S_z^-1 S_z') / 2
 
-    where x is the motion, y is the text, and z is both. The covariances of generated motions,
-    marked by ', are about the means of the real motions. S + eps I is inverted instead of S. The
-    denominators are N - 1 and M - 1.
+    where x is the motion, y is the text, and z is both. The covariances of generated motions
+    (marked by ') are computed around the means of the real motions. S + eps I is inverted instead
+    of S. The denominators are N - 1 and M - 1.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
     value = real.new_zeros(len(generated))

@@ -60,7 +60,7 @@ UNDECIDED = MORE.keys() - CHECKED.keys()
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads the attributes of one clip.
 
-    The rules are tried in this order: motions that lower the body, jumps, walks and runs,
+    The rules are tried in this order: motions that lower the body, jumps, walking and running,
     whole-body actions, and gestures of the arms and the head.
 
     Args:
@@ -151,8 +151,8 @@ def read_all(joints: np.ndarray, fps: float) -> dict[str, Any]:
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
     """Returns whether the joints form a body, that is, whether limbs and movements are plausible.
 
-    Limbs must be 15 to 60 cm long and vary by less than 25 %. Joints must move smoothly, within 2
-    cm of a smooth curve.
+    Limbs must be 15 to 60 cm long, and their lengths must vary by less than 25 %. Joints must move
+    smoothly, within 2 cm of a smooth curve.
     """
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
@@ -190,7 +190,7 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Detects walks and runs: the body moves by more than 33 cm, and both ankles rise by 4 cm."""
+    """Detects walking and running: the body moves more than 33 cm, and both ankles rise 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
@@ -293,16 +293,16 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
     """Returns whether each requested attribute or combination of attributes was read from a motion.
 
-    Actions in `CHECKED` are read by their own checks. Returns {} for actions without a rule.
+    Actions in `CHECKED` have their own checks. Returns {} for actions without a rule.
 
     Args:
         seen: the attributes that `read_all` or `read_attributes` returned.
         requested: the attributes of the request.
 
     Returns:
-        Whether each attribute is right, by name. `action_and_side` states whether both are right
-        or, if no side was requested, whether the action is right. `all` states whether every
-        requested attribute is right.
+        Whether each attribute is correct, by name. `action_and_side` states whether both are
+        correct or, if no side was requested, whether the action is correct. `all` states whether
+        every requested attribute is correct.
     """
     if requested["action"] in UNDECIDED or requested.keys() & set(UNREAD):
         return {}
@@ -338,7 +338,7 @@ class AttributeAccuracy(Timed, MotionMean):
     names = (*ATTRIBUTES, "action_and_side", "all")
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns, as JSON in `seen` (N,), the attributes that `read_all` finds in each motion."""
+        """Returns `seen` (N,): the attributes that `read_all` finds in each motion, as JSON."""
         seen = [json.dumps(read_all(joints.numpy(), self.fps)) for joints in motions["joints"]]
         return {"seen": np.array(seen)}
 
@@ -365,7 +365,7 @@ class AttributeAccuracy(Timed, MotionMean):
             joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
             mask: (B, F) bool, True = real frame.
             requested: B mappings from names of `ATTRIBUTES` to values, such as {"action": "walk",
-                "speed": "slow"}. Requests that no rule can read are not counted.
+                "speed": "slow"}. Requests for which there is no rule are not counted.
             keys: (B,) int64, unique keys of the motions.
         """
         rows = []

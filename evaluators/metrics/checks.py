@@ -79,7 +79,7 @@ class View:
         return ((joints - origin)[..., [0, 2]] * self.left[:, None]).sum(-1)
 
     def path(self) -> np.ndarray:
-        """Returns how far (F, 2) the pelvis is to the left and in front of its starting point.
+        """Returns how far the pelvis is to the left of and in front of its starting point, (F, 2).
 
         The directions are relative to the heading in the first frame.
         """
@@ -158,7 +158,7 @@ def _slash(view: View) -> Shown:
 
 
 def _hop(view: View) -> Shown:
-    """Detects hops on one foot and counts the flights.
+    """Detects hops on one foot, and counts how often this foot leaves the floor.
 
     The other foot must be 12 cm higher for 0.4 seconds.
     """
@@ -181,7 +181,7 @@ def _jumping_jacks(view: View) -> Shown:
 
 
 def _push_ups(view: View) -> Shown:
-    """Counts how often the neck of a level body sinks by 13 cm."""
+    """Counts how often the neck sinks by 13 cm while the body is roughly horizontal."""
     neck = view.smooth[:, NECK, 1]
     downs = count_rises(np.percentile(neck, 95) - neck, 0.13, 0.07)
     return {"count": downs} if downs and np.median(tilt_of(view.smooth)) > 50 else {}
@@ -206,7 +206,7 @@ def _spin(view: View) -> Shown:
 
 
 def _dodge(view: View) -> Shown:
-    """Detects a path of more than 25 cm sideways or backward with a peak speed above 0.6 m/s."""
+    """Detects a sideways or backward path of more than 25 cm with a peak speed above 0.6 m/s."""
     path = view.path()
     speed = np.linalg.norm(np.gradient(path, 1 / view.fps, axis=0), axis=-1)
     aside, ahead = path[-3:].mean(0)
@@ -218,7 +218,10 @@ def _dodge(view: View) -> Shown:
 
 
 def _strafe(view: View) -> Shown:
-    """Detects a path of more than 33 cm sideways, at least twice as far as forward or backward."""
+    """Detects a path that leads mostly to one side, for more than 33 cm.
+
+    The sideways distance must be at least twice the distance forward or backward.
+    """
     aside, ahead = view.path()[-3:].mean(0)
     if abs(aside) < max(0.33, 2 * abs(ahead)):
         return {}
@@ -229,7 +232,7 @@ def _limp(view: View) -> Shown:
     """Determines the leg on which a walking person sinks while the other foot is in the air.
 
     The correlation between the height of the pelvis and the difference between the feet's heights
-    must exceed 0.35. In an even walk, it is about 0.
+    must exceed 0.35. For an even gait, this correlation is about 0.
     """
     right_up = view.smooth[:, ANKLES[1], 1] - view.smooth[:, ANKLES[0], 1]
     low = -view.smooth[:, PELVIS, 1]

@@ -64,7 +64,7 @@ class ClaimAccuracy(Timed, MotionMean):
             keys: (B,) int64, unique keys of the motions.
 
         Raises:
-            UserError: If a real frame is not finite.
+            UserError: If a real frame contains NaN or infinity.
         """
         motions = self.real_frames(joints, mask)
         rows = [

@@ -61,7 +61,7 @@ class FrechetMotionDistance(TwoSets):
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the distance between sets in which each motion is repeated as often as drawn."""
+        """Computes the distance between sets in which motions are repeated as often as drawn."""
         generated, real = rows["generated"], rows["real"]
         values = []
         for times in map(torch.from_numpy, weights):
@@ -96,7 +96,7 @@ class KernelMotionDistance(TwoSets):
     Args:
         subsets: number of random subsets.
         subset_size: number of samples that a subset takes from each set. Each set must contain at
-            least as many.
+            least this number of samples.
         replace: whether to draw with replacement, as the code of MoDi and MDM does if there are
             more real motions than `subset_size`. Samples that are drawn twice increase the value.
         seed: seed of the draws.

@@ -237,7 +237,7 @@ class JointVariance(SampleMetric):
             keys: (B,) int64, unique keys of the motions.
 
         Raises:
-            UserError: If a real frame is not finite.
+            UserError: If a real frame contains NaN or infinity.
         """
         self.motions += self.real_frames(joints, mask)
         super().update(keys=keys, groups=groups)

@@ -55,8 +55,8 @@ class FootSkating(Timed, JointMean):
 class Penetration(JointMean):
     """Mean depth of the lowest joint below the floor, y = 0, in meters.
 
-    The mean is over all frames; depths up to 5 mm count as 0. Yuan et al. 2023 (PhysDiff) measure
-    the lowest vertex of a mesh instead. Lower is better.
+    The mean is taken over all frames; depths up to 5 mm count as 0. Yuan et al. 2023 (PhysDiff)
+    measure the lowest vertex of a mesh instead. Lower is better.
 
     Example:
         >>> metric, joints = Penetration(), torch.full((1, 3, 22, 3), -0.25)
@@ -79,8 +79,8 @@ class Penetration(JointMean):
 class Floating(Penetration):
     """Mean height of the lowest joint above the floor, y = 0, in meters.
 
-    The mean is over all frames; heights up to 5 mm count as 0. Jumps also count as floating. Lower
-    is better.
+    The mean is taken over all frames; heights up to 5 mm count as 0. Jumps also count as floating.
+    Lower is better.
 
     Example:
         >>> metric, joints = Floating(), torch.full((1, 3, 22, 3), 0.25)

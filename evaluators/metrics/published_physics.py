@@ -73,7 +73,7 @@ class MBenchQuality(PublishedPhysics):
       for relative positions. A higher value means more motion.
     - `ground_penetration`: mean depth of the toes that are deeper than 5 mm below the floor, or 0
       if there are none.
-    - `foot_sliding`: mean horizontal step of the toes in contact.
+    - `foot_sliding`: mean horizontal distance that a toe in contact moves per frame.
     - `foot_floating`: number of frames in which the body moves without the support of a foot,
       divided by the total number of frames. The value can exceed 1.
 
@@ -138,7 +138,7 @@ def mbench_contact(feet: Tensor) -> Tensor:
 
 
 def _speed(points: Tensor) -> Tensor:
-    """Returns how far (F, ...) points at positions (F, ..., 3) move to the next frame, in meters.
+    """Returns the distances (F, ...), in meters, that points (F, ..., 3) move to the next frame.
 
     The last distance is repeated. For a single frame, the result is empty.
     """
@@ -176,7 +176,7 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
 
 def _runs(aloft: Tensor) -> list[tuple[int, int]]:
-    """Returns the start and the exclusive end of each run of at least four True values (F,)."""
+    """Returns the start and (exclusive) end of each run of at least four True values in `aloft`."""
     runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
     return [(begin, end) for begin, end in runs if end - begin >= 4]
 
@@ -185,10 +185,10 @@ class KimodoQuality(PublishedPhysics):
     """Foot skating of Kimodo (7330e7e), in m/s, from joints and from predicted contacts.
 
     - `skate_from_height`: mean speed of toes that are lower than 5 cm.
-    - `skate_ratio`: fraction of the toes' steps that are faster than 0.2 m/s, among steps that
-      begin and end lower than 5 cm.
-    - `low`: mean fraction of steps that begin lower than 5 cm. If it is 0, the first two values are
-      also 0.
+    - `skate_ratio`: fraction of the toes' frame-to-frame movements that are faster than 0.2 m/s,
+      among movements that begin and end lower than 5 cm.
+    - `low`: mean fraction of the toes' movements that begin lower than 5 cm. If it is 0, the first
+      two values are also 0.
     - `skate_from_contacts`, `skate_max`: mean and maximum speeds of heels and toes in contact.
     - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15 m/s
       and lower than 10 cm). Higher is better.
@@ -237,7 +237,7 @@ class KimodoQuality(PublishedPhysics):
                 require contacts are not computed.
 
         Raises:
-            UserError: If a motion is not finite.
+            UserError: If a motion contains NaN or infinity.
         """
         motions = self.real_frames(joints, mask)
         labels = (
@@ -319,7 +319,7 @@ class KimodoConstraints(MotionMean):
             keys: (B,) int64, unique keys of the edits.
 
         Raises:
-            UserError: If an edited motion is not finite.
+            UserError: If an edited motion contains NaN or infinity.
         """
         motions = self.real_frames(joints, mask)
         parts = kept[mask].split(mask.sum(1).tolist())
@@ -355,11 +355,11 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
 class PhysicalFootContact(PublishedPhysics):
     """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration without a planted foot.
 
-    The score is the mean over frames of a product of three factors: the horizontal steps of both
-    feet, in meters per frame, and the acceleration of the root divided by its largest value.
-    Downward accelerations count as 0. The step of a foot is the smaller of the steps of its ankle
-    and its toe. Motions without acceleration have no value, whereas EDGE's code includes their NaN
-    in the mean. Lower is better.
+    The score is the mean over frames of a product of three factors: the horizontal movements of
+    both feet, in meters per frame, and the acceleration of the root divided by its largest value.
+    Downward accelerations count as 0. The movement of a foot is the smaller of the movements of its
+    ankle and its toe. Motions without acceleration have no value, whereas EDGE's code includes
+    their NaN in the mean. Lower is better.
 
     Args:
         fps: frames per second of the motions. For rates other than 30, `compute` raises
@@ -404,7 +404,7 @@ class TransitionJerk(SampleMetric):
     centered at the first frame after each change between kept and generated frames, provided that
     the motion contains the whole window. The jerk is averaged over windows, frame by frame. `peak`
     is the maximum of this mean curve. `area` is the sum of its absolute differences from
-    `JERK_OF_REAL_MOTIONS` and grows with the size of the window; it does not exist at frame rates
+    `JERK_OF_REAL_MOTIONS` and grows with the size of the window; it is undefined at frame rates
     without an entry there. `windows` is the number of windows.
 
     Args:
@@ -444,7 +444,7 @@ class TransitionJerk(SampleMetric):
             keys: (B,) int64, unique keys of the motions.
 
         Raises:
-            UserError: If a motion is not finite.
+            UserError: If a motion contains NaN or infinity.
         """
         parts = kept[mask].split(mask.sum(1).tolist())
         total = torch.zeros(len(keys), self.window - 3, dtype=torch.float64)

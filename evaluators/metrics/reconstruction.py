@@ -94,8 +94,8 @@ class PositionErrors(MotionMean):
                 required if `upsampling` is greater than 1.
 
         Raises:
-            UserError: If a motion is not finite or has fewer than two frames, or if required
-                `references` are missing.
+            UserError: If a motion contains NaN or infinity or has fewer than two frames, or if
+                required `references` are missing.
         """
         motions, real_motions = (
             self.real_frames(joints, mask),
@@ -324,7 +324,7 @@ class DisplacementErrors(EditErrors):
                 was generated.
 
         Raises:
-            UserError: If a motion is not finite, or has no generated frame.
+            UserError: If a motion contains NaN or infinity, or has no generated frame.
         """
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 
@@ -338,7 +338,7 @@ class DisplacementErrors(EditErrors):
 
 
 class KeptDrift(EditErrors):
-    """Distance in world coordinates, in meters, by which the kept part of an edit has moved.
+    """Distance in meters by which the kept part of an edit has moved in world coordinates.
 
     This metric was introduced in this project. `mean` is the distance averaged over the kept joints
     and frames of a motion, and then over motions. `largest` is the maximum over all of them. If
@@ -376,7 +376,7 @@ class KeptDrift(EditErrors):
             kept: (B, F, J) bool, True = the edit kept this joint in this frame.
 
         Raises:
-            UserError: If a motion is not finite.
+            UserError: If a motion contains NaN or infinity.
         """
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 

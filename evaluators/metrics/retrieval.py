@@ -84,7 +84,7 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
     """Returns the rank (N,) of the best correct candidate, 0 = first.
 
-    Candidates with equal similarities (N, M) share their mean rank.
+    Candidates with the same value in `similarity` (N, M) share their mean rank.
     """
     best = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
     return (similarity > best).sum(1) + ((similarity == best).sum(1) - 1) / 2

@@ -27,8 +27,8 @@ class Declared:
     Attributes:
         unit: unit of the values; "" = a number without a unit.
         units: by name, the units of those values whose unit differs from `unit`.
-        directions: by name, whether higher is better for those values to which `higher_is_better`
-            does not apply; None = neither direction is better.
+        directions: by name, whether higher is better, for values to which `higher_is_better` does
+            not apply; None = neither direction is better.
         summary: name of the value that summarizes the other values, or None if there is no such
             value.
         audited: names of the values that audits show; None = all values.
@@ -179,7 +179,7 @@ class SampleMetric(Declared, Metric):
     def rows(self, keys: str, *names: str) -> list[Tensor]:
         """Returns the stored rows, sorted by key, or [] if there are no rows.
 
-        The rows must be finite. Floating-point numbers are returned as float64.
+        The rows must not contain NaN or infinity. Floating-point numbers are returned as float64.
         """
         if not getattr(self, keys):
             return []
@@ -191,7 +191,7 @@ class SampleMetric(Declared, Metric):
                 values = values.double()
                 if bad := int((~values.isfinite().reshape(len(values), -1).all(1)).sum()):
                     raise self.error(
-                        f"{bad} of {len(values)} rows of {name!r} are not finite. Did the model diverge?"
+                        f"{bad} of {len(values)} rows of {name!r} contain NaN or infinity. Did the model diverge?"
                     )
             sorted_rows.append(values)
         return sorted_rows if len(order) else []
@@ -243,7 +243,7 @@ class SampleMetric(Declared, Metric):
         if not frames.sum().isfinite():
             bad = sum(not bool(motion.isfinite().all()) for motion in motions)
             raise self.error(
-                f"{bad} of {len(motions)} motions are not finite. Did the model diverge?"
+                f"{bad} of {len(motions)} motions contain NaN or infinity. Did the model diverge?"
             )
         return motions
 
@@ -331,7 +331,7 @@ class JointMean(MotionMean):
             keys: (B,) int64, unique keys of the motions.
 
         Raises:
-            UserError: If a real frame is not finite.
+            UserError: If a real frame contains NaN or infinity.
         """
         self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
 

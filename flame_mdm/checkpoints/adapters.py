@@ -141,7 +141,7 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
 
 
 def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[int, int]:
-    """Copies those trained weights of another model whose names and shapes match.
+    """Copies trained weights of another model if their names and shapes match.
 
     The statistics of the features are not copied, since they belong to the data.
 

@@ -60,7 +60,7 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: As in `flame_mdm.load`. Also if a part cannot be exported, or if the outputs of a
+        UserError: As in `flame_mdm.load`, and if a part cannot be exported, or if the outputs of a
             graph differ from PyTorch's.
     """
     try:
@@ -149,7 +149,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 def root_units(representation: HumanML) -> list[list[float]]:
     """Returns the mean and standard deviation of each of the first three features.
 
-    These are the turn of the root in radians, and its steps to the left and forward in meters.
+    These are the turn of the root in radians, and its movements to the left and forward in meters.
     """
     scale = representation.mean.new_ones(3)
     scale[0] = representation.turn_unit
@@ -194,7 +194,7 @@ class Probe:
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         """Records the coefficients p and q of a call, from two tiny inputs."""
         if len(self.records) == self.calls:
-            raise UserError("it chooses its own steps")
+            raise UserError("it chooses its own step sizes")
         # The clean estimate is p x + q y. An output y = 0 reveals p; an input x = 0 reveals q.
         row = []
         for self.output, x in ((0.0, x_t * 0 + TINY), (TINY, x_t * 0)):
@@ -288,8 +288,8 @@ class Call(nn.Module):
         self.condition, self.denoiser = model.condition, model.denoiser
         if model.conditioned_on == "text" and not isinstance(self.condition, LearnedTokens):
             raise UserError(
-                f"{type(self.condition).__name__}: a language model is not exported to ONNX. Export a model with "
-                "condition=learned, action or none"
+                f"{type(self.condition).__name__}: language models cannot be exported to ONNX. "
+                "Export a model with condition=learned, action or none"
             )
         self.features = model.representation.features
         self.scale = model.sampler_options.guidance_scale if model.condition.features else None

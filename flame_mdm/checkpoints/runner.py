@@ -251,7 +251,7 @@ class Sampler:
     def _session(self, name: str, threads: int) -> Any:
         """Opens a graph and returns its session.
 
-        The weights must be in the same file: a graph may not name other files to read.
+        The weights must be in the same file: a graph must not refer to other files.
         """
         import onnxruntime
 
@@ -295,7 +295,8 @@ class Sampler:
         For an unconditional model, the prompt is "". `sample` is the sample index, which
         distinguishes several motions for the same prompt. `seconds` is 3 by default, or the model's
         maximum if this is lower. For a model that continues frames, the maximum is 600. Raises
-        `ValueError` for an invalid length or an unknown action, or if the result is not finite.
+        `ValueError` for an invalid length or an unknown action, or if the result contains NaN or
+        infinity.
 
         `text` is the sentence that selects the noise, if it differs from the caption `prompt`:
         `flame_mdm.generate` draws noise for the sentence as typed.

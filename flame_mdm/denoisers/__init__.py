@@ -24,8 +24,8 @@ class Denoiser(nn.Module, ABC):
         num_heads: number of attention heads, which must divide `latent_dim`.
         dropout: probability of dropout after the positional encoding and inside the layers, from 0
             to 1 (exclusive).
-        project_condition: False adds the condition to the time embedding without a projection, as
-            MDM does with action embeddings. C must then equal `latent_dim`.
+        project_condition: whether to project the condition before it is added to the time
+            embedding. MDM does not project action embeddings. C must then equal `latent_dim`.
 
     Example:
         >>> import torch

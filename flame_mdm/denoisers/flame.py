@@ -28,11 +28,11 @@ class FLAME(Denoiser):
         num_heads: number of attention heads, which must divide `latent_dim`.
         dropout: probability of dropout inside the layers.
         max_frames: maximum length of a motion that ML can embed.
-        length_token: False omits ML (table 4, first row).
-        cross_attention: False builds a transformer encoder over ML, TS, CLS and frames (table 4,
-            first two rows).
+        length_token: whether to include ML, which the first row of table 4 omits.
+        cross_attention: whether to use a decoder with cross-attention. Otherwise, the network is a
+            transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
         condition_frames: whether to also add TS and CLS to every frame. A small network then learns
-            to follow the text in fewer steps.
+            to follow the text in fewer training steps.
         length_unit: ML embeds the length rounded down to a multiple of this number of frames,
             because the lengths of training windows are such multiples.
 

@@ -21,7 +21,8 @@ class MDMGRU(Denoiser):
         latent_dim: width of the layers.
         num_layers: number of layers of the GRU.
         dropout: probability of dropout after the positional encoding.
-        project_condition: False adds the condition to the time embedding without a projection.
+        project_condition: whether to project the condition before it is added to the time
+            embedding.
         recur_over_batch: whether to recur from sample to sample instead of from frame to frame, as
             MDM's released code does because its axes are swapped. This option is only for
             reproduction: results then depend on the order of the samples in the batch.

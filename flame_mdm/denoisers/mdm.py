@@ -24,14 +24,16 @@ class MDMEncoder(Denoiser):
         num_layers: number of layers.
         num_heads: number of attention heads, which must divide `latent_dim`.
         dropout: probability of dropout after the positional encoding and inside the layers.
-        project_condition: False adds the condition to the time embedding without a projection.
+        project_condition: whether to project the condition before it is added to the time embedding.
         max_tokens: maximum number of condition tokens between the time and the frames (30 in MFM
             with T5). 0 = no tokens; the pooled condition is added to the time instead. The
             positional encoding of the frames does not depend on the number of tokens.
-        mask_padding: False lets frames attend to padding, as in the released models of MDM and
-            MFM. Motions are then sampled with the padded length of training, and cropped.
+        mask_padding: whether to mask the padding in attention. In the released models of MDM and
+            MFM, frames attend to the padding; such models sample motions at the padded length of
+            the training data and crop them.
         condition_frames: whether to also add time + condition (or, with `max_tokens`, only the
-            time) to every frame. A small network then learns to follow the text in fewer steps.
+            time) to every frame. A small network then learns to follow the text in fewer training
+            steps.
 
     Example:
         >>> denoiser = MDMEncoder(6, 6, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0)
@@ -115,7 +117,7 @@ class MDMDecoder(Denoiser):
         num_layers: number of layers.
         num_heads: number of attention heads, which must divide `latent_dim`.
         dropout: probability of dropout after the positional encoding and inside the layers.
-        project_condition: False adds the condition to the time embedding without a projection.
+        project_condition: whether to project the condition before it is added to the time embedding.
         input_token: content of the token before the frames, if any. "condition" is time +
             condition, as in the paper's "+ input token" and in the released model. "time" is only
             the time, as in MDM's code since February 2025.
@@ -123,15 +125,15 @@ class MDMDecoder(Denoiser):
             them, as MDM does with DistilBERT.
         memory: how the time enters a memory of all tokens: "add" adds it to each token, and
             "concat" places it before them as a separate token.
-        mask_padding: False lets frames attend to padding, as in the released models without
-            `mask_frames`.
+        mask_padding: whether to mask the padding in attention. In the released models without
+            `mask_frames`, frames attend to the padding.
         context_frames: number of clean frames before the motion, in `Condition.prefix`.
         target_encoder: network that embeds `Condition.target`. Its output is added to the time
             embedding. "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
         condition_frames: whether to also add time + condition to every noisy frame. A small network
-            then learns to follow the text in fewer steps and can distinguish noisy frames from
-            clean ones.
+            then learns to follow the text in fewer training steps, and can distinguish noisy frames
+            from clean ones.
 
     Raises:
         UserError: If arguments contradict each other.

@@ -33,7 +33,8 @@ class MDMUNet(Denoiser):
         channels: width of each level. Each level has half the frame rate of the previous one.
         num_groups: number of groups of the group norms, which must divide all widths.
         dropout: probability of dropout inside the blocks.
-        project_condition: False adds the condition to the time embedding without a projection.
+        project_condition: whether to project the condition before it is added to the time
+            embedding.
 
     Example:
         >>> denoiser = MDMUNet(6, 6, 4, latent_dim=8, channels=[8, 16], num_groups=4, dropout=0.0)

@@ -177,15 +177,15 @@ class Process(nn.Module, ABC):
             Normalized motion (B, F, D). Frames past the end of a motion are 0.
 
         Raises:
-            UserError: If the process does not support the sampler, the number of steps or the
-                edit, or if the sampler does not have one of the options.
+            UserError: If the process does not support the sampler, the number of steps or the edit,
+                or if the sampler does not support one of the options.
         """
 
     def find_sampler(self, options: SamplerOptions) -> Sampler:
         """Returns the requested sampler.
 
         Raises:
-            UserError: If there is no such sampler, or if it does not have one of the options.
+            UserError: If there is no such sampler, or if it does not support one of the options.
         """
         name = options.sampler
         if name is None or name not in self.samplers:
@@ -197,7 +197,8 @@ class Process(nn.Module, ABC):
             if option not in names:
                 has = ", ".join(names)
                 raise UserError(
-                    f"{option}={value}: the sampler {name} has no such option. Its options are {has}"
+                    f"{option}={value}: the sampler {name} does not support this option. "
+                    f"It supports {has}"
                 )
         return self.samplers[name]
 

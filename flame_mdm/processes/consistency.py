@@ -1,4 +1,4 @@
-"""Consistency distillation: a student learns to replace many steps of its teacher by one call.
+"""Consistency distillation: a student learns to replace many steps of its teacher with one call.
 
 Let f(x_t, t) be a network's clean estimate at time t. Along a path of the teacher, f should be the
 same at all times (Song et al. 2023, "Consistency Models"). Because the teacher's steps are guided,

@@ -42,7 +42,8 @@ class GaussianDiffusion(Process):
             padding, as in FLAME's code. Short motions then have less weight. The denoiser must
             return 0 in the padding.
         clip_x0: whether to clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
-        timestep_sampling: distribution of the training steps (FLAME, tables 6 and 7).
+        timestep_sampling: distribution of the diffusion steps drawn for training (FLAME, tables 6
+            and 7).
         skip: whether to add a skip connection around the network, which requires the prediction
             "epsilon". The predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras
             et al. 2022, eq. 7, for data of variance 1). The output is then a velocity, but it is

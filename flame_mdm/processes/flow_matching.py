@@ -22,8 +22,8 @@ class FlowMatching(Process):
     Args:
         sigma_min: standard deviation of the noise that remains at t = 1 (Lipman et al. 2023, eq.
             20-23).
-        prediction: what the denoiser predicts: "velocity", the velocity of the path, as in MFM, or
-            "x0", the clean motion, from which the velocity is computed. A network that is narrower
+        prediction: what the denoiser predicts: the velocity of the path ("velocity", as in MFM), or
+            the clean motion ("x0"), from which the velocity is computed. A network that is narrower
             than the motion cannot represent the noise in the velocity.
         time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal",
             the logistic function of a normal variable, which favors the middle (Esser et al. 2024,
@@ -31,8 +31,8 @@ class FlowMatching(Process):
         quantize_time: whether to pass floor(1000 t) to the denoiser, as a row index of the time
             table, as in MFM's code.
         odeint_grid: whether to use float32 multiples of 1 / N as times, like torchdiffeq's Euler
-            steps in MFM's code. For some N, the table row of a time is then one lower than with N
-            equal steps. This never happens for N = 10, 20 or 30.
+            steps in MFM's code. For some N, `quantize_time` then rounds some times to a table row
+            that is one lower than with N equal steps. This never happens for N = 10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).
@@ -128,7 +128,9 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. A flow takes N >= 1 equal steps, except that "dopri5" chooses its own steps.
+        """See `Process.sample`.
+
+        A flow takes N >= 1 equal steps, except with "dopri5", which chooses its own step sizes.
 
         Only "consistency" adds noise. An edit with mode "trajectory" is applied before each step at
         a time <= `until`: the kept part is replaced by the straight path from its noise to the

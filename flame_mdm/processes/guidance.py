@@ -79,7 +79,7 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
 @dataclass
 class Positions:
-    """M coordinates of joint positions, in the world, that a motion should reach.
+    """M world coordinates of joints that a motion should reach.
 
     Attributes:
         frames: (M,) int64, indices of the frames.

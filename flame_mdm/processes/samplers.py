@@ -45,7 +45,7 @@ class Sampler:
     options: tuple[str, ...] = ()
     #: Edits that the sampler does not support: modes of `Edit`, or "resample".
     unsupported: tuple[str, ...] = ()
-    #: Whether the sampler chooses its own steps. One call then goes from noise to motion.
+    #: Whether the sampler chooses its own step sizes. One call then goes from noise to motion.
     adaptive: bool = False
 
 
@@ -213,8 +213,8 @@ def blended(
     """Samples with an edit whose mode is "x_t".
 
     At each step, the kept part is replaced by the known motion with the current amount of noise.
-    With the blend "after", the kept part of the first x_t has the initial noise, as if a previous
-    step had been blended. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each step
+    With `edit.blend` "after", the known motion with the initial noise also replaces the kept part
+    before the first step. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each step
     again and repeats the step.
 
     Args:

@@ -184,7 +184,7 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
 def timesteps(
     num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace"
 ) -> list[int]:
-    """Selects the training steps that sampling visits.
+    """Selects the diffusion steps that sampling visits.
 
     Args:
         num_train_timesteps: T.

@@ -268,19 +268,21 @@ def findings(card: AuditCard) -> list[str]:
             seen_by[name].append(metric)
     wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
     blind = [name for name in group if name in (*wrong, "memorized") and not seen_by[name]]
-    lines = [f"No metric notices these perturbations: {', '.join(blind)}."] if blind else []
+    lines = [f"No metric detects the following perturbations: {', '.join(blind)}."] if blind else []
 
     for metric in card.metrics:
         alone = [name for name in wrong if seen_by[name] == [metric]]
         if alone:
-            lines.append(f"Only {metric} notices these perturbations: {', '.join(alone)}.")
+            lines.append(f"Only {metric} detects the following perturbations: {', '.join(alone)}.")
     for metric in card.metrics:
         facts = _facts_of(card, metric)
         unseen = [name for name in wrong if metric not in seen_by[name] and name not in blind]
         if not facts.sees_meaning:
             unseen = [name for name in unseen if group[name] == "joints"]
         if unseen and facts.sums_up:
-            lines.append(f"{metric} does not notice these perturbations: {', '.join(unseen)}.")
+            lines.append(
+                f"{metric} does not detect the following perturbations: {', '.join(unseen)}."
+            )
     for metric in card.metrics:
         liked = [name for name in wrong if (response := table[name, metric]) and response.rewarded]
         if liked:

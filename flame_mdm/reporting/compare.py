@@ -234,7 +234,7 @@ def differences(first: Result, second: Result) -> list[list[str]] | str:
 
 
 def _difference(name: str, first: Value | None, second: Value | None) -> list[str]:
-    """Returns a row of cells for second - first, or [] if the results have no pairs of values."""
+    """Returns cells for the difference second - first, or [] if there are no pairs of values."""
     if first is None or second is None or first.n != second.n:
         return []
     count = min(len(first.per_replication), len(second.per_replication))

@@ -124,10 +124,9 @@ class Measurements(Callback):
     The values that the task reports are logged at the same steps, and no other step is slowed down.
     The norm of all gradients is measured before clipping. Seconds per step exclude validation.
 
-    Adds `facts.training` to checkpoints: `hours` of training so far, including validation;
-    `processes`, the number of processes; `device`, `speed` and `precision`; and `memory_gib`, the
-    peak memory, which is the memory of tensors on CUDA and the memory of the first process on other
-    devices.
+    Adds `facts.training` to checkpoints: `hours` (duration of training so far, including
+    validation), `processes` (their number), `device`, `speed`, `precision`, and `memory_gib` (peak
+    memory: of tensors on CUDA, or of the first process on other devices).
     """
 
     def __init__(self) -> None:
@@ -322,7 +321,7 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Returns whether motions differ by less than `SAME`, that is, the network ignores its input.
+    """Returns whether motions differ by less than `SAME`, so that the network ignores its input.
 
     If the learning rate is too high, the network may learn to return the same pose for all prompts
     and noise. Its loss is finite and even decreases slightly, so curves do not show the failure.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Distillation: trains models that sample in one to four steps from a teacher that takes more."""
+"""Distillation: a teacher that takes many steps trains a model that takes one to four steps."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -131,7 +131,7 @@ class DistillationTask(GeneratorTask):
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`.
 
-        Validation, which passes `u`, uses the grid of times that is used at the end of training.
+        Validation, which passes `u`, uses the grid of times from the end of training.
         """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None

@@ -1,4 +1,4 @@
-"""Skips work that Lightning does in every step, but that this framework does not need.
+"""Skips work that Lightning does in every step although this framework does not need it.
 
 A step of a small network takes about 2 ms, a third of which is Lightning's bookkeeping. During this
 time, a GPU waits for the host.

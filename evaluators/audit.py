@@ -262,7 +262,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that judges requested attributes exactly, or None if there is none."""
+        """Name of the value that evaluates requested attributes exactly, or None."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -270,7 +270,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Values that judge motion-text pairs by features: {name: 1, or -1 if lower is better}."""
+        """Values that rate motion-text pairs by features: {name: 1, or -1 if lower is better}."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -349,7 +349,7 @@ def _agreement(
     scores: Sequence[Mapping[str, np.ndarray]],
     perturbations: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, float | None]]:
-    """Returns, by metric, how well metrics that judge pairs agree with the exact attributes.
+    """Returns, by metric, how well metrics that rate pairs agree with the exact attributes.
 
     "auc" is the probability that a pair with every requested attribute has a better score than a
     pair that lacks an attribute. It is computed from pairs with real motions and from pairs with

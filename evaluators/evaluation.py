@@ -101,8 +101,8 @@ class Evaluation:
         """Evaluates the real motions in all replications, and then the motions from the source.
 
         Each rank generates some of the batches and computes their features. Rank 0 computes the
-        metrics, and all ranks return the result. Unless `force` is True, raises `UserError` before
-        anything is generated if real motions do not have the expected values.
+        metrics, and all ranks return the result. If real motions do not have the expected values,
+        raises `UserError` before anything is generated, unless `force` is True.
 
         Args:
             source: source of the motions; None = only real motions are measured.
@@ -281,7 +281,7 @@ class Evaluation:
     def _measure(
         self, source: Source, real_sets: Sequence[tuple[Rows, Rows]], resamples: int
     ) -> Outcome:
-        """Measures the source's motions of each replication."""
+        """Measures the source's motions for each replication."""
         scores, costs, warnings = [], [], []
         resampled: Mapping[str, list[float | None]] = {}
         for replication, (paired, real) in enumerate(real_sets):

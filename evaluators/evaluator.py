@@ -139,7 +139,7 @@ class Evaluator:
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
         """Returns the training motions with which other motions are compared.
 
-        They are stored as the poses of all frames, and the features of windows.
+        They are stored as the poses of all frames and the features of windows.
         """
         facing = self.representation.skeleton.facing
         joints = replace(self, extractor=None).extract(whole)["joints"]
@@ -249,7 +249,7 @@ class Evaluator:
     def _updated(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
-        """Updates all metrics with the motions. Returns all of them, and those that can be computed."""
+        """Updates the metrics with motions. Returns all metrics, and those that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
             # `bool()` returns False: metrics are not synchronized, because this process has all

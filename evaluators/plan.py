@@ -101,8 +101,9 @@ class Plan:
     def _motions_folder(self, request: EvaluationRequest, file: Path, protocol: Protocol) -> Path:
         """Returns the folder for the motions of a checkpoint with these options.
 
-        The folder is in the run directory of the checkpoint, or next to a checkpoint without one.
-        Motions of models in this package or on the hub go to runs/NAME in the working directory.
+        The folder is in the checkpoint's run directory or, if there is none, next to the
+        checkpoint. Motions of models in this package or on the hub go to runs/NAME in the working
+        directory.
         """
         if not Path(str(request.ckpt)).exists():
             run = Path("runs") / str(request.ckpt)
@@ -150,7 +151,7 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
 
 
 def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton | None:
-    """Sets the bones of a representation of SMPL's rotations from SMPL's model file.
+    """Sets the bones of a representation of SMPL's rotations, using SMPL's model file.
 
     Without this file, the stand-in bones are kept.
     """

@@ -58,7 +58,7 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """The clip's attributes that rules can read, or {} if it has an attribute in `UNREAD`."""
+        """The attributes that rules can recognize, or {} if the clip has one in `UNREAD`."""
         return {
             name: value
             for name, value in self.clip.attributes.items()

@@ -252,7 +252,7 @@ def show(result: Result, path: Path) -> None:
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns the end of a line that explains the intervals, or "" if there are no intervals."""
+    """Returns an explanation of the intervals for the end of a line, or "" if there are none."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""

@@ -99,7 +99,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
             )
 
     def reads(self, other: Representation) -> bool:
-        """Returns whether the network reads motions in this representation."""
+        """Returns whether the network accepts motions in this representation."""
         trained = self.task.representation
         return (trained.name, trained.fps, trained.features) == (
             other.name,
@@ -153,7 +153,7 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
     trained, recipes = T2MTask, "t2m"
 
     def reads(self, other: Representation) -> bool:
-        """Returns whether the network reads the representation, or at least the shared features."""
+        """Returns whether the network accepts the representation or its shared features."""
         trained = self.task.representation
         is_part = (other.part_of, other.fps) == (trained.name, trained.fps)
         reads_part = is_part and self.task.network.used <= other.features

@@ -40,7 +40,7 @@ class _MotionEncoder(nn.Module):
 
 
 class MARDMClip(nn.Module):
-    """Embeds captions, and the essential features of motions, as vectors of norm 1.
+    """Embeds captions and the essential features of motions as vectors of norm 1.
 
     `mean` and `std` (67,) are used to normalize the features.
     """

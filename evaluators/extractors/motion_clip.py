@@ -125,7 +125,7 @@ def info_nce(
     Args:
         motion: (B, E) features of the motions on this rank.
         text: (B, E) features of their texts.
-        logit_scale: (), logarithm of the inverse temperature.
+        logit_scale: scalar tensor, logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
         wrong_text: (B, K, E) features of texts, each of which is a negative for one motion only.

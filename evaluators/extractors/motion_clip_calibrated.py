@@ -41,13 +41,13 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     - Texts: motions of clips with the same captions or attributes are not negatives of each other's
       captions. Near-miss captions (see `near_misses`) are additional negatives.
     - Motions: half of them are accompanied by a noisy copy. The strength of the noise is drawn from
-      [0, 1], with small values more often, and the distance between a motion and its copy, both
-      scaled to norm 1, is trained to equal this strength. Half of the copies have white noise on
-      the joints and are encoded again, like motions from files. The other half have noise on
-      normalized features, like generated motions.
+      [0, 1], where small values are more likely. The distance between the features of a motion and
+      its copy, both scaled to norm 1, is trained to equal this strength. Half of the copies have
+      white noise on the joints and are encoded again, like motions from files. The other half have
+      noise on normalized features, like generated motions.
 
-    All features have the same length, because cosines leave the length undetermined, which would
-    distort Euclidean distances.
+    All features are scaled to the same norm. Otherwise, their norms, which cosines leave
+    undetermined, would distort Euclidean distances.
     """
 
     representation: HumanML
@@ -139,7 +139,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
 
 def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
-    """Returns the mean absolute difference between the distances of features and `strength` (B,).
+    """Returns the mean absolute difference between feature distances and `strength` (B,).
 
     The distance between a motion's features (B, E) and its copy's features (B, E) is computed after
     both are scaled to norm 1.

@@ -106,7 +106,7 @@ class WordVectors:
 
 
 class LearnedWords(nn.Module):
-    """Word vectors that are learned with the evaluator, for data sets without tagged words.
+    """Word vectors learned together with the evaluator, for data sets without tagged words.
 
     The vectors for the parts of speech are 0.
     """

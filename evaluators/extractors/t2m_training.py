@@ -111,10 +111,10 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
     text is not among its captions. Checkpoints contain the word vectors.
 
     Args:
-        words: folder with our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is read
+        words: folder with our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is needed
             only for training. "learned" = the vectors are learned, for data sets whose words are
             not tagged; see `LearnedWords`.
-        movement_steps: number of steps for which the movement encoder is trained.
+        movement_steps: number of training steps of the movement encoder.
         sparsity: weight of the mean magnitude of movement vectors in the loss.
         smoothness: weight of the mean magnitude of differences between successive movement vectors.
         margin: distance beyond which a wrong motion adds no loss.

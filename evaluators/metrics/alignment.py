@@ -72,7 +72,7 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns, for each query, the probability of a hit at rank k in a random pool, by k.
+        """Returns, by rank k, the probability of a hit in a random pool for each query.
 
         A hit means that the correct candidate of the query is among the k nearest candidates.
 

@@ -280,7 +280,7 @@ def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str 
 
 
 def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
-    """Counts how often the head pitches forward by more than 32 degrees, and back.
+    """Counts how often the head tilts forward by more than 32 degrees and back again.
 
     The angle is relative to the shoulders.
     """
@@ -291,7 +291,7 @@ def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns whether each requested attribute or combination of attributes was read from a motion.
+    """Returns whether each requested attribute or combination of attributes was found in a motion.
 
     Actions in `CHECKED` have their own checks. Returns {} for actions without a rule.
 

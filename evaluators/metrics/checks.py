@@ -17,7 +17,7 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the forward and left directions (F, 2) on the ground, and the left turn (degrees)."""
+    """Returns the forward and left directions (F, 2) on the ground, and the turn (degrees)."""
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]
@@ -28,7 +28,7 @@ def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def tilt_of(smooth: np.ndarray) -> np.ndarray:
-    """Returns the angle (F,) between the trunk and the vertical in degrees."""
+    """Returns the angle (F,), in degrees, between the trunk and the vertical."""
     trunk = smooth[:, NECK] - smooth[:, PELVIS]
     return np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1]))
 

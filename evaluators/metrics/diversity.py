@@ -36,9 +36,9 @@ class Diversity(SampleMetric):
     """Diversity: mean distance between random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
     The best value is the diversity of real motions. Published values for text-to-motion are
-    computed from 300 pairs, drawn as two sets without replacement; for action-to-motion and
-    unconstrained synthesis, from 200 pairs drawn with replacement. In both cases, a motion may be
-    paired with itself. `update` takes `generated` (B, E) and `keys` (B,).
+    computed from 300 pairs, drawn as two sets without replacement. Those for action-to-motion and
+    unconstrained synthesis are computed from 200 pairs, drawn with replacement. In both cases, a
+    motion may be paired with itself. `update` takes `generated` (B, E) and `keys` (B,).
 
     Args:
         pairs: number of pairs.

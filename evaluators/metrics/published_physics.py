@@ -252,7 +252,7 @@ class KimodoQuality(PublishedPhysics):
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values of a motion (F, J, 3) and, if any, its contacts (F, 4) bool."""
+        """Computes the values from the joints (F, J, 3) and any contacts (F, 4) of a motion."""
         if len(motion) < 2:
             return {}
         feet = motion[:, self.feet]
@@ -397,7 +397,7 @@ class PhysicalFootContact(PublishedPhysics):
 
 
 class TransitionJerk(SampleMetric):
-    """FlowMDM's peak jerk, and area under the jerk, at transitions between kept and generated frames.
+    """Peak jerk and area under the jerk, at transitions between kept and generated frames.
 
     The computation follows FlowMDM's code (e81c67f). The jerk of a frame is the largest L1 norm,
     over joints, of the third difference of the position, in meters per frame^3. A window is
@@ -472,7 +472,7 @@ def transition_jerk(window: Tensor) -> Tensor:
 
 
 def peak_and_area(curve: Tensor, real: float | None) -> tuple[float, float | None]:
-    """Returns the maximum of a jerk curve, and its area.
+    """Returns the maximum and the area of a jerk curve.
 
     The area is the sum of the absolute differences from the jerk of real motions, or None if this
     jerk is None.

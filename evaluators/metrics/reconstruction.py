@@ -53,9 +53,9 @@ class PositionErrors(MotionMean):
     """Base class for position errors: APE and AVE for each of `PARTS`, such as `ape_root`. Lower is better.
 
     Args:
-        samples: number of motions per text. If there are several, as in TEMOS, `best_ape_root` and
-            so on are the errors of the motion with the smallest root APE, and `worst_ape_root` and
-            so on are the errors of the motion with the largest root APE.
+        samples: number of motions per text. If there are several, as in TEMOS, `best_ape_root` etc.
+            are the errors of the motion with the smallest root APE, and `worst_ape_root` etc. are
+            the errors of the motion with the largest root APE.
         upsampling: number of recorded frames per frame of a motion. If this is above 1, motions are
             interpolated and compared with the recordings.
     """
@@ -285,7 +285,7 @@ class EditErrors(MotionMean):
 
 
 class DisplacementErrors(EditErrors):
-    """ADE and FDE: mean joint distance in all predicted frames, and in the last one, in meters.
+    """ADE and FDE: mean joint distance, in meters, in all predicted frames and in the last one.
 
     As is usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints
     and frames of a clip, and then over clips. The part that an edit kept is ignored. MFM (Table 3)

@@ -242,8 +242,8 @@ class TMRRetrieval(CaptionMetric):
     - `all`: retrieval among all motions, where only the text's own motion counts as correct.
     - `threshold`: retrieval among all motions, where motions with the same caption also count as
       correct.
-    - `dissimilar`: retrieval among 100 motions with different captions, or among half of all
-      motions if these are fewer. Without an encoder, there is no value.
+    - `dissimilar`: retrieval among 100 motions (at most half of all motions) with different
+      captions. Without an encoder, there is no value.
     - `batches`: retrieval in batches of 32. An incomplete last batch is left out, and the medians
       of the batches are averaged.
 
@@ -253,8 +253,8 @@ class TMRRetrieval(CaptionMetric):
 
     TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
     HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the
-    dissimilar subset starts with the first motion by key; the motion whose caption is least similar
-    to the captions chosen so far is added next, until the subset is complete.
+    dissimilar subset starts with the first motion by key. Until the subset is complete, the motion
+    whose caption is least similar to the captions chosen so far is added.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as

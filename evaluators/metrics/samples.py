@@ -26,15 +26,15 @@ class Declared:
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
-        units: by name, the units of those values whose unit differs from `unit`.
+        units: by name, the units of values whose unit differs from `unit`.
         directions: by name, whether higher is better, for values to which `higher_is_better` does
             not apply; None = neither direction is better.
         summary: name of the value that summarizes the other values, or None if there is no such
             value.
         audited: names of the values that audits show; None = all values.
         sees_meaning: whether the metric may detect that a motion does not show what was requested.
-        exact: name of the value that judges the requested attributes without a network, or None if
-            there is no such value.
+        exact: name of the value that evaluates the requested attributes without a network, or None
+            if there is no such value.
         depends_on_count: whether the bias of the value depends on the number of motions.
     """
 
@@ -79,7 +79,7 @@ class Declared:
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
         """Computes the values (R,) of R resamples of N samples, by name.
 
-        `weights` (R, N) is the number of times that each sample was drawn. See `per_sample` for
+        `weights` (R, N) states how often each sample was drawn. See `per_sample` for
         `rows`. Returns {} if the metric cannot be resampled.
         """
         values = {}

@@ -179,7 +179,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     """Raises `UserError` unless `weights` maps names to dense tensors of real numbers.
 
-    The tensors must not be larger, in total, than the file at `path`.
+    The total size of the tensors must not exceed the size of the file at `path`.
     """
     import torch
 
@@ -252,7 +252,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the SHA-256 of the weights in a file, which is equal for a checkpoint and its model file."""
+    """Returns the SHA-256 of a file's weights, the same for a checkpoint and its model file."""
     return state_sha256(read_checkpoint(path)["state_dict"])
 
 

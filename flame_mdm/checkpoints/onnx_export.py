@@ -211,15 +211,15 @@ class Probe:
 def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
     """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one per denoiser call.
 
-    The denoiser is called at time t and returns y. The clean estimate is x0 = p x + q y. The next
-    noisy motion is a x + b x0 + c x0' + d noise, where x0' is the clean estimate of the previous
-    call. Raises `UserError` for samplers that do not have this form.
+    The denoiser is called at time t and returns y. The clean estimate is `x0 = p x + q y`. The next
+    noisy motion is `a x + b x0 + c x0' + d noise`, where `x0'` is the clean estimate of the
+    previous call. Raises `UserError` for samplers that do not have this form.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
         raise UserError(
-            f"sampler={options.sampler} draws noise with the learned variance of this model, which the graph does not "
-            "have. Set task.sampler to ddim or dpm_solver_pp_2m"
+            f"sampler={options.sampler} draws noise with the learned variance of this model, which exported graphs do "
+            "not contain. Set task.sampler to ddim or dpm_solver_pp_2m"
         )
     return plans[0].tolist()
 

@@ -147,8 +147,8 @@ def load_strictly(
 ) -> Network:
     """Loads all weights into a network and returns it in evaluation mode.
 
-    Raises `UserError` if weights are missing, unexpected or of a different shape. `source` is named
-    at the beginning of the message.
+    Raises `UserError` if weights are missing, unexpected or of a different shape. The error message
+    begins with `source`.
     """
     try:
         network.load_state_dict(state, strict=True, assign=assign)

@@ -271,7 +271,7 @@ class Sampler:
             raise ValueError(f"{name} is damaged: {first_line(error)}") from error
 
     def unknown(self, text: str) -> list[str]:
-        """Returns the content words of a text that the model does not know.
+        """Returns the content words in a text that are unknown to the model.
 
         Raises `ValueError` if the model knows none of the content words.
         """

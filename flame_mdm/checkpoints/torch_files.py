@@ -56,7 +56,7 @@ def check_torch(path: Path) -> None:
 def check_keys(path: Path) -> None:
     """Raises `UserError` if many keys in a file may share one hash.
 
-    Loading a dictionary with such keys by `torch.load(weights_only=True)` takes quadratic time:
+    With `torch.load(weights_only=True)`, loading a dictionary with such keys takes quadratic time:
     hours for a file of one megabyte. Strings have random hashes, and small integers have different
     hashes. If the pickle names an object that PyTorch refuses, the check stops there without an
     error, because PyTorch stops at the same place and names the object.

@@ -123,7 +123,7 @@ class MDMDecoder(Denoiser):
             the time, as in MDM's code since February 2025.
         token_memory: whether to use all condition tokens as memory, with the time added to each of
             them, as MDM does with DistilBERT.
-        memory: how the time enters a memory of all tokens: "add" adds it to each token, and
+        memory: how the time is included in a memory of all tokens: "add" adds it to each token, and
             "concat" places it before them as a separate token.
         mask_padding: whether to mask the padding in attention. In the released models without
             `mask_frames`, frames attend to the padding.

@@ -129,7 +129,7 @@ class ResidualBlock(nn.Module):
 
 
 class MaskedGroupNorm(nn.Module):
-    """Group norm (Wu and He 2018) with statistics of real frames only."""
+    """Group norm (Wu and He 2018) whose statistics are computed only from real frames."""
 
     def __init__(self, channels: int, num_groups: int):
         super().__init__()

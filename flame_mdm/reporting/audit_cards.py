@@ -367,5 +367,8 @@ def _curve(
 
 
 def _metric_text(name: str) -> str:
-    """Returns the name of a metric as Markdown. Names of this project's metrics need no escapes."""
+    """Returns the name of a metric as Markdown.
+
+    The names of this project's metrics do not need escaping.
+    """
     return name if re.fullmatch(r"[\w/.-]+", name) else markdown_text(name)

@@ -201,7 +201,7 @@ def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, flo
 
 
 def _linear_axis(low: float, high: float, to_ticks: bool) -> _Axis:
-    """Returns an axis whose ends are the extreme values, or ticks."""
+    """Returns an axis that ends at the extreme values or at ticks."""
     low, high = (value if abs(value) > SMALLEST else 0.0 for value in (low, high))
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         low, high = low - (abs(low) or 1) / 10, high + (abs(high) or 1) / 10

@@ -54,7 +54,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         self.folder, self.resumed = folder, resumed
 
     def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
-        """Returns the checkpoint from which the run resumes, which `newest` has already checked."""
+        """Returns the checkpoint from which the run resumes; `newest` has already checked it."""
         assert self.resumed is not None
         content = self.resumed.content
         # The checkpoint is released, because it takes as much memory as the model and its

@@ -32,9 +32,9 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On CUDA, training uses bfloat16 if the device supports it and, in runs of at least
     `COMPILED_FROM` steps, a compiled denoiser.
 
-    On a CPU, training uses bfloat16 if the CPU has instructions for bfloat16 products,
-    `CheapDropout`, and `attention`, which does not drop attention weights. Compilation made no
-    difference on CPUs.
+    On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights) and,
+    if the CPU has instructions for bfloat16 products, bfloat16. Compilation made no difference on
+    CPUs.
 
     If the recipe sets a precision other than 32-true, this precision is kept.
     """
@@ -79,7 +79,7 @@ def _simplify(network: nn.Module) -> None:
 
 
 class CheapDropout(nn.Module):
-    """Dropout that decides about four elements with a single 64-bit random number.
+    """Dropout that uses a single 64-bit random number for four elements.
 
     The probability is rounded to a multiple of 2^-16. On a CPU, torch's dropout draws one random
     number per element in a single thread, which takes a fifth of a training step.

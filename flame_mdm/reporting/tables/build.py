@@ -258,7 +258,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 def _numbers(result: Result) -> str:
     """Returns a sentence with the numbers of motions and replications behind most values.
 
-    If the number of real motions is different, it is added.
+    The number of real motions is added if it is different.
     """
     values = [value for value in (result.values or {}).values() if value and value.replications]
     if not values:

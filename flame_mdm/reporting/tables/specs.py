@@ -129,7 +129,7 @@ def as_list(value: Any) -> list[Any]:
 
 
 class Figure(ClosedSchema):
-    """A plot of columns of a part over an option of its rows: curves or, with `points`, dots."""
+    """A plot of a part's columns over an option of its rows: curves or, with `points`, dots."""
 
     part: str
     x: str

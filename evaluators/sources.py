@@ -157,7 +157,7 @@ class Generator:
         seconds = time.perf_counter() - begin
         for row, motion in zip(rows, motions, strict=True):
             if not np.isfinite(motion).all():
-                raise UserError(f"the model returned a non-finite motion for {row.id}")
+                raise UserError(f"the model returned non-finite numbers for {row.id}")
         self.bar.update(len(rows))
         return motions, calls, seconds
 

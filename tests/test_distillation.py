@@ -417,7 +417,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
         (["trainer.max_steps=4"], "ckpt is missing. Usage: flame-mdm distill CKPT"),
         (["runs/no/model"], "runs/no/model: no such checkpoint"),
         ([student], f"a distilled model. Use its teacher, {trained}"),
-        (["process.ckpt"], "predicts noise, so computing the clean estimate divides"),
+        (["process.ckpt"], "predicts noise, so computing the clean estimate would divide"),
         (["untrained.ckpt"], "not trained with this framework"),
         (
             [*own, "distillation.teacher=representation.ckpt"],

@@ -92,7 +92,7 @@ def check_format(path: Path, number: Any) -> None:
         )
     if number != FORMAT:
         raise UserError(
-            f"{path}: has format {str(number)[:40]}, but this version reads format {FORMAT}. Update flame_mdm"
+            f"{path} has format {str(number)[:40]}, but this version reads format {FORMAT}. Update flame_mdm"
         )
 
 

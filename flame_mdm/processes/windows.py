@@ -99,8 +99,8 @@ def cover(
     """Returns the frames and weights of windows, without conditions.
 
     The weight of a window rises over the overlap at its start and falls over the overlap at its
-    end. Past its end, a window contains the frames of the motion that follow, where the last frame
-    is followed by the first one.
+    end. Past its end, a window contains the subsequent frames of the motion, where the last frame is
+    followed by the first one.
 
     Args:
         windows: W windows, each given by the index of its motion, its first frame and its number of

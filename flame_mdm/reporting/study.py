@@ -170,7 +170,7 @@ def tally(files: Sequence[Path]) -> list[Pair]:
         for number, rating in enumerate(answers.ratings, 1):
             if rating.a == rating.b:
                 raise UserError(
-                    f"{path}: rating {number} compares {rating.a} with itself; a and b must differ"
+                    f"{path}: rating {number} compares {rating.a} with itself; the runs a and b must differ"
                 )
             preferred = rating.a if rating.choice == "a" else rating.b
             names = (rating.b, rating.a) if (rating.b, rating.a) in pairs else (rating.a, rating.b)

@@ -177,12 +177,12 @@ def read_teacher(path: Path) -> MotionGenerator:
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(
-            f"{path}: a distilled model. Use its teacher, "
+            f"{path} is a distilled model. Use its teacher, "
             f"{teacher.config['distillation']['teacher']}"
         )
     if teacher.process.prediction == "epsilon":
         raise UserError(
-            f"{path}: predicts noise, so computing the clean estimate divides by almost 0 at "
+            f"{path}: this model predicts noise, so computing the clean estimate would divide by almost 0 at "
             f"the noisiest times. Use a model that predicts the clean motion or the velocity "
             f"(MDM, MFM)"
         )

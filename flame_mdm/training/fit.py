@@ -155,7 +155,7 @@ def _check_strategy(strategy: str | Config) -> None:
     name = strategy if isinstance(strategy, str) else str(strategy.get("_target_"))
     if any(kind in name.lower().replace("_", "") for kind in SHARDING):
         raise UserError(
-            f"trainer.strategy={name}: a model is not divided among processes, because averages and exact resuming "
+            f"trainer.strategy={name}: models cannot be divided among processes, because averaging and exact resuming "
             "need whole weights. Use trainer.strategy=ddp; docs/memory.md lists how much memory models need"
         )
 

@@ -246,7 +246,7 @@ class _Measure:
         return self.metrics[metric].direction_of(part)
 
     def facts_of(self, name: str) -> dict[str, Any]:
-        """Returns the facts that a card states about a value; see `AuditedMetric`.
+        """Returns the properties of a value that a card lists; see `AuditedMetric`.
 
         The direction is not included.
         """

@@ -436,7 +436,7 @@ def _through(other: HumanML, scene: Scene) -> list[np.ndarray]:
 
 
 def through_others(representation: HumanML) -> list[Perturbation]:
-    """Returns one perturbation per other representation with the same skeleton and frame rate."""
+    """Returns a perturbation for each other representation with this skeleton and frame rate."""
     files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
     others: list[HumanML] = [instantiate(read_package_yaml(path)) for path in files]
     about, skeleton, fps = (

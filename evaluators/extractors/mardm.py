@@ -32,7 +32,7 @@ class _MotionEncoder(nn.Module):
         self.out_ln, self.out = nn.LayerNorm(width), nn.Linear(width, 512)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Embeds normalized motions (B, F, D) with mask (B, F) as (B, 512)."""
+        """Embeds normalized motions (B, F, D) with mask (B, F) as vectors (B, 512)."""
         hidden = torch.cat([self.query_token.expand(len(x), 1, -1), self.embed_motion(x)], 1)
         hidden = hidden + sinusoid(torch.arange(hidden.shape[1], device=x.device), hidden.shape[2])
         hidden = self.transformer(hidden, src_key_padding_mask=~F.pad(mask, (1, 0), value=True))
@@ -89,7 +89,7 @@ class MARDMClip(nn.Module):
 
 
 def clip_tokens(captions: Sequence[str]) -> Tensor:
-    """Returns CLIP's tokens (B, 77) of captions, padded with 0. Long captions are truncated."""
+    """Returns the CLIP tokens (B, 77) of captions, padded with 0. Long captions are truncated."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
     encoded = tokenizer(
         list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt"

@@ -206,7 +206,7 @@ class _MovementEncoder(nn.Module):
 
 
 class _Recurrent(nn.Module):
-    """A bidirectional GRU with a learned initial state, and a network that embeds its end states."""
+    """A bidirectional GRU with a learned initial state, whose final states are embedded."""
 
     def __init__(self, in_features: int, hidden: int, embedding: int):
         super().__init__()
@@ -246,7 +246,10 @@ class _TextEncoder(_Recurrent):
         self.pos_emb = nn.Linear(len(PARTS_OF_SPEECH), self.WORD)
 
     def forward(self, vectors: Tensor, parts: Tensor, lengths: Tensor) -> Tensor:
-        """Encodes words (B, N, 300) and (B, N, 15) with `lengths` (B,) as vectors (B, embedding)."""
+        """Encodes sequences of words with `lengths` (B,) as vectors (B, embedding).
+
+        `vectors` (B, N, 300) and `parts` (B, N, 15) describe the words and their parts of speech.
+        """
         return self.encode(vectors + self.pos_emb(parts), lengths)
 
 

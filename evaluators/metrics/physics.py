@@ -53,7 +53,7 @@ class FootSkating(Timed, JointMean):
 
 
 class Penetration(JointMean):
-    """Mean depth of the lowest joint below the floor, y = 0, in meters.
+    """Mean depth of the lowest joint below the floor (y = 0), in meters.
 
     The mean is taken over all frames; depths up to 5 mm count as 0. Yuan et al. 2023 (PhysDiff)
     measure the lowest vertex of a mesh instead. Lower is better.
@@ -77,7 +77,7 @@ class Penetration(JointMean):
 
 
 class Floating(Penetration):
-    """Mean height of the lowest joint above the floor, y = 0, in meters.
+    """Mean height of the lowest joint above the floor (y = 0), in meters.
 
     The mean is taken over all frames; heights up to 5 mm count as 0. Jumps also count as floating.
     Lower is better.

@@ -275,7 +275,7 @@ class Graph(NamedTuple):
 
 
 class Call(nn.Module):
-    """One call of a model's denoiser, including condition encoder and guidance, but without a learned variance.
+    """A call to a model's denoiser with condition encoder and guidance, without learned variance.
 
     Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
     condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)
@@ -340,7 +340,7 @@ class Call(nn.Module):
 
 
 class ContinuingCall(Call):
-    """One call of a denoiser that continues frames. These frames are an additional input."""
+    """A call to a denoiser that continues frames, which are an additional input."""
 
     def forward(
         self,

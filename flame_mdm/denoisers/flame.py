@@ -121,7 +121,7 @@ class FLAME(Denoiser):
 
 
 def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
-    """Embeds positions or times (N,) as (N, features) float32.
+    """Embeds positions or times (N,) as float32 vectors (N, features).
 
     The first half of the features are cosines, and the second half are sines.
     """

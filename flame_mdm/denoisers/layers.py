@@ -185,13 +185,13 @@ class TimeAndCondition(nn.Module):
         )
 
     def time(self, t: Tensor) -> Tensor:
-        """Embeds times (B,) as (B, features)."""
+        """Embeds times (B,) as vectors (B, features)."""
         return self.time_embedding(sinusoid(t, self.features).to(next(self.parameters()).dtype))
 
     def forward(self, t: Tensor, condition: Tensor) -> Tensor:
-        """Embeds times (B,) and a condition (B, C) as (B, features).
+        """Embeds times (B,) and a condition (B, C) as vectors (B, features).
 
-        A condition (B, S, C) is embedded as (B, S, features).
+        A condition (B, S, C) is embedded as vectors (B, S, features).
         """
         return self.add(self.time(t), condition)
 

@@ -18,7 +18,7 @@ SLOTS = 8
 
 
 class TargetEncoder(nn.Module, ABC):
-    """Embeds the target of a condition as (B, features). Without a target, the embedding is 0.
+    """Embeds the target of a condition as vectors (B, features). Without a target, the embedding is 0.
 
     A target that requests no joint is not the same as no target, because its embedding contains the
     biases of the network.
@@ -31,7 +31,7 @@ class TargetEncoder(nn.Module, ABC):
 
     @abstractmethod
     def embed(self, target: Tensor) -> Tensor:
-        """Embeds targets (B, 8, 4) as (B, features)."""
+        """Embeds targets (B, 8, 4) as vectors (B, features)."""
 
     def forward(self, cond: Condition) -> Tensor:
         """Embeds the target of a condition. The embedding of a sample without a target is 0."""
@@ -49,7 +49,7 @@ class SingleTarget(TargetEncoder):
         self.network = perceptron(4 * SLOTS, features, layers)
 
     def embed(self, target: Tensor) -> Tensor:
-        """Embeds targets (B, 8, 4) as (B, features)."""
+        """Embeds targets (B, 8, 4) as vectors (B, features)."""
         return self.network(target.flatten(1))
 
 
@@ -68,7 +68,7 @@ class SplitTarget(TargetEncoder):
         )
 
     def embed(self, target: Tensor) -> Tensor:
-        """Embeds targets (B, 8, 4) as (B, features)."""
+        """Embeds targets (B, 8, 4) as vectors (B, features)."""
         return torch.cat(
             [network(target[:, slot]) for slot, network in enumerate(self.networks)], -1
         )
@@ -87,7 +87,7 @@ class MultiTarget(TargetEncoder):
         self.weights = nn.Parameter(torch.randn(SLOTS))
 
     def embed(self, target: Tensor) -> Tensor:
-        """Embeds targets (B, 8, 4) as (B, features)."""
+        """Embeds targets (B, 8, 4) as vectors (B, features)."""
         position, requested = target[..., :3], target[..., 3:]
         embedded = torch.stack(
             [network(position[:, slot]) for slot, network in enumerate(self.networks)], 1

@@ -254,7 +254,7 @@ DIFFUSION_SAMPLERS = {
 
 
 def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of Euler's method: order 1, one call of the denoiser.
+    """Takes a step of Euler's method: order 1, one call to the denoiser.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -274,7 +274,7 @@ def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of the midpoint method: order 2, two calls of the denoiser.
+    """Takes a step of the midpoint method: order 2, two calls to the denoiser.
 
     Args:
         x: (B, F, D) motion at time t.

@@ -131,7 +131,7 @@ def fit(folder: Path, config: Config) -> None:
 
 
 def check_devices(trainer: Config) -> None:
-    """Raises `UserError` if this machine lacks the devices of a recipe, or if the recipe shards the model.
+    """Raises `UserError` if this machine lacks the devices that a recipe requires, or if the recipe shards the model.
 
     A recipe for the CPU may use at most one process per core.
     """

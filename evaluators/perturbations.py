@@ -203,7 +203,7 @@ class Perturbation:
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the indices (N,) of motions in the order in which all grades perturb them."""
+        """Returns the indices (N,) of motions in the order of perturbation, the same at all grades."""
         return scene.draws("order", self.name).permutation(len(scene))
 
 
@@ -341,7 +341,7 @@ class DroppedActions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same number of motions with texts, but only of the remaining actions."""
+        """Returns as many motions and texts as before, but only of the remaining actions."""
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]

@@ -58,7 +58,7 @@ class DrawnClip:
 
     @property
     def requested(self) -> dict[str, Any]:
-        """The attributes that rules can recognize, or {} if the clip has one in `UNREAD`."""
+        """The attributes of the clip that are listed in `ATTRIBUTES` or `UNREAD`."""
         return {
             name: value
             for name, value in self.clip.attributes.items()

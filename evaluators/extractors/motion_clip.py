@@ -205,7 +205,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
     def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
         """Imports the weights of FLAME's released motion-CLIP into a task with the same sizes.
 
-        The weights have the names of the authors' code. They include the pooler of the text
+        The weights are named as in the authors' code. They include the pooler of the text
         encoder, because it was initialized at random in the authors' training. Raises `ValueError`
         if weights or sizes do not match.
         """

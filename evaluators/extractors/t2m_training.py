@@ -23,7 +23,7 @@ from flame_mdm.representations import Representation
 
 
 class _MovementDecoder(nn.Module):
-    """Inverse of the movement encoder: two transposed convolutions from a vector to 4 frames."""
+    """Inverse of the movement encoder: transposed convolutions decode each vector into 4 frames."""
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -114,7 +114,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         words: folder with our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is needed
             only for training. "learned" = the vectors are learned, for data sets whose words are
             not tagged; see `LearnedWords`.
-        movement_steps: number of training steps of the movement encoder.
+        movement_steps: number of training steps for the movement encoder.
         sparsity: weight of the mean magnitude of movement vectors in the loss.
         smoothness: weight of the mean magnitude of differences between successive movement vectors.
         margin: distance beyond which a wrong motion adds no loss.

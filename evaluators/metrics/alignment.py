@@ -72,7 +72,7 @@ class RPrecision(SampleMetric):
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns, by rank k, the probability of a hit in a random pool for each query.
+        """Returns, by rank k, each query's probability of a hit in a random pool.
 
         A hit means that the correct candidate of the query is among the k nearest candidates.
 

@@ -17,7 +17,7 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the forward and left directions (F, 2) on the ground, and the turn (degrees)."""
+    """Returns forward and left directions (F, 2) on the ground, and the left turn (degrees)."""
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]

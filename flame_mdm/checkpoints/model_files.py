@@ -127,7 +127,7 @@ class _Training(TypedDict, total=False):
 
 
 class _Licensed(TypedDict):
-    """Numbers and actions of the motions under one license."""
+    """Number, duration and actions of the clips under one license."""
 
     license: str
     clips: int
@@ -257,10 +257,7 @@ def weights_sha256(path: Path) -> str:
 
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a recipe in which default paths replace the absolute paths of this machine.
-
-    These are the paths of the data and the run.
-    """
+    """Returns a recipe in which default paths replace this machine's data and run paths."""
     defaults = {
         config.get("data_root"): "data",
         config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",

@@ -275,7 +275,9 @@ class Graph(NamedTuple):
 
 
 class Call(nn.Module):
-    """A call to a model's denoiser with condition encoder and guidance, without learned variance.
+    """A call to a model's denoiser, with guidance.
+
+    The condition encoder is included, but a learned variance is not.
 
     Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
     condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)

@@ -125,8 +125,8 @@ class Measurements(Callback):
     The norm of all gradients is measured before clipping. Seconds per step exclude validation.
 
     Adds `facts.training` to checkpoints: `hours` (duration of training so far, including
-    validation), `processes` (their number), `device`, `speed`, `precision`, and `memory_gib` (peak
-    memory: of tensors on CUDA, or of the first process on other devices).
+    validation), `processes` (their number), `device`, `speed`, `precision`, and `memory_gib` (the
+    peak memory of tensors on CUDA, and of the first process on other devices).
     """
 
     def __init__(self) -> None:
@@ -321,7 +321,7 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Returns whether motions differ by less than `SAME`, so that the network ignores its input.
+    """Returns whether motions differ by less than `SAME`, as if the network ignored its input.
 
     If the learning rate is too high, the network may learn to return the same pose for all prompts
     and noise. Its loss is finite and even decreases slightly, so curves do not show the failure.

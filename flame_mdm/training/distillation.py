@@ -1,5 +1,5 @@
 # pyright: standard
-"""Distillation: a teacher that takes many steps trains a model that takes one to four steps."""
+"""Distillation: trains models that take one to four steps, from a teacher that takes more."""
 
 import copy
 from collections.abc import Mapping, Sequence

@@ -203,7 +203,10 @@ class Perturbation:
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the indices (N,) of motions in the order of perturbation, the same at all grades."""
+        """Returns the indices (N,) of motions in the order in which they are perturbed.
+
+        The order is the same at all grades.
+        """
         return scene.draws("order", self.name).permutation(len(scene))
 
 

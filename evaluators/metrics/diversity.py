@@ -110,7 +110,7 @@ class TextMultimodality(SampleMetric):
     def value(self, features: Tensor, groups: Tensor) -> float:
         """Returns the multimodality of features (N, E).
 
-        `groups` (N,) contains the keys of the texts. Raises `UserError` if a text does not have
+        `groups` (N,) contains the keys of the texts. Raises `UserError` unless each text has
         `samples` motions.
         """
         features = features[self.by_group(groups, self.samples)]
@@ -146,8 +146,8 @@ class PairedMultimodality(SampleMetric):
     def value(self, features: Tensor, groups: Tensor) -> float:
         """Returns the multimodality of features (N, E).
 
-        `groups` (N,) contains the keys of the texts. Raises `UserError` if a text does not have
-        2 * `samples` motions.
+        `groups` (N,) contains the keys of the texts. Raises `UserError` unless each text has 2 *
+        `samples` motions.
         """
         first, second = features[self.by_group(groups, 2 * self.samples)].chunk(2, dim=1)
         return pair_distance(first, second)
@@ -245,7 +245,7 @@ class JointVariance(SampleMetric):
     def value(self, groups: Tensor) -> float:
         """Returns the variance.
 
-        Raises `UserError` if a text does not have `samples` motions, or if their lengths differ.
+        Raises `UserError` unless each text has `samples` motions of the same length.
         """
         order, values = self.order("keys"), []
         for members in self.by_group(groups, self.samples):

@@ -121,7 +121,7 @@ class PositionErrors(MotionMean):
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
-        """Returns the errors by name. Raises `UserError` if a text does not have `samples` motions."""
+        """Returns the errors by name. Raises `UserError` unless each text has `samples` motions."""
         texts = (
             self.by_group(groups, self.samples)
             if self.samples > 1

@@ -212,7 +212,7 @@ class SampleMetric(Declared, Metric):
     def by_group(self, groups: Tensor, samples: int) -> Tensor:
         """Returns the indices (C, S) of the samples of each group.
 
-        Raises `UserError` if a group does not have S samples.
+        Raises `UserError` unless each group has S samples.
         """
         names, sizes = groups.unique(return_counts=True)
         if wrong := int((sizes != samples).sum()):

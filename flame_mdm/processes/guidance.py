@@ -140,7 +140,7 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` whose joints are at the requested world positions.
+    """Returns the motions nearest to `x` in which joints are at the requested world positions.
 
     Each Gauss-Newton step applies the smallest change of the normalized features that reaches the
     positions. A Gaussian-process prior keeps the change smooth in time. In frames with a requested

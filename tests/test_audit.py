@@ -200,8 +200,8 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_se
         None, None, rewarded=False, monotone=False
     )
     assert findings(card) == [
-        "No metric detects the following perturbations: still.",
-        "jitter rates these perturbations better than real motions: noise.",
+        "No metric detects these perturbations: still.",
+        "jitter is better for these perturbations than for real motions: noise.",
     ]
 
 

@@ -18,15 +18,15 @@ from flame_mdm.safe_io import write_text
 from flame_mdm.schemas import ClosedSchema, Int, read_json
 
 COMMITTED = "docs/benchmarks/audit"  # folder of the cards that audited.json lists
-SETS = {"fewer": "{:g} real motions", "as stored": "features as stored"}
+SETS = {"fewer": "{:g} real motions", "as stored": "the features as stored"}
 """Perturbations that show the bias of a metric, each with a phrase for its strongest grade."""
 ROUNDING = 1e-6  # smaller relative differences count as rounding errors
 WIDE, HIGH = 132, 48
 LEGEND = (
-    "Each cell shows the smallest strength from which the metric differs from real motions in "
-    "a paired comparison, at this and all larger strengths. a → b: the value itself leaves "
-    "the 95 % interval of real motions only at strength b. –: there is no such strength. ~: "
-    "the difference does not always grow with the strength."
+    "Each cell shows the strength at and above which the metric differs significantly from its "
+    "value for real motions in a paired comparison. a → b: the value itself leaves the 95 % "
+    "interval of real motions only at strength b. –: there is no such strength. ~: the difference "
+    "does not always grow with the strength."
 )
 
 
@@ -268,26 +268,24 @@ def findings(card: AuditCard) -> list[str]:
             seen_by[name].append(metric)
     wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
     blind = [name for name in group if name in (*wrong, "memorized") and not seen_by[name]]
-    lines = [f"No metric detects the following perturbations: {', '.join(blind)}."] if blind else []
+    lines = [f"No metric detects these perturbations: {', '.join(blind)}."] if blind else []
 
     for metric in card.metrics:
         alone = [name for name in wrong if seen_by[name] == [metric]]
         if alone:
-            lines.append(f"Only {metric} detects the following perturbations: {', '.join(alone)}.")
+            lines.append(f"Only {metric} detects these perturbations: {', '.join(alone)}.")
     for metric in card.metrics:
         facts = _facts_of(card, metric)
         unseen = [name for name in wrong if metric not in seen_by[name] and name not in blind]
         if not facts.sees_meaning:
             unseen = [name for name in unseen if group[name] == "joints"]
         if unseen and facts.sums_up:
-            lines.append(
-                f"{metric} does not detect the following perturbations: {', '.join(unseen)}."
-            )
+            lines.append(f"{metric} does not detect these perturbations: {', '.join(unseen)}.")
     for metric in card.metrics:
         liked = [name for name in wrong if (response := table[name, metric]) and response.rewarded]
         if liked:
             lines.append(
-                f"{metric} rates these perturbations better than real motions: {', '.join(liked)}."
+                f"{metric} is better for these perturbations than for real motions: {', '.join(liked)}."
             )
     biased = [metric for metric in card.metrics if _facts_of(card, metric).depends_on_count]
     for perturbation in card.perturbations:
@@ -295,8 +293,8 @@ def findings(card: AuditCard) -> list[str]:
         if of_motions is not None:
             grade = perturbation.grades[-1]
             lines += [
-                f"{metric} of {of_motions.format(grade.grade)} is {number(grade.values[metric][0])}. For all motions, "
-                f"decoded and encoded, it is {number(card.real[metric][0])}."
+                f"With {of_motions.format(grade.grade)}, {metric} is {number(grade.values[metric][0])}. With all motions, "
+                f"decoded and encoded again, it is {number(card.real[metric][0])}."
                 for metric in biased
             ]
     return lines

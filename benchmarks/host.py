@@ -261,8 +261,8 @@ def measure(settings: Settings) -> Section:
     return section(
         "Host cost of a training step",
         f"""The network is tiny: it has one transformer layer of width 16 and no text encoder, and is trained on batches
-        of 4 clips. A step does almost no arithmetic, so its time is the call overhead of torch, the framework and
-        Lightning. Bare Lightning trains the same network with the same masked loss, fused optimizer and gradient
+        of 4 clips. A step does almost no arithmetic, so its time consists mainly of the call overhead
+        of torch, the framework and Lightning. Bare Lightning trains the same network with the same masked loss, fused optimizer and gradient
         clipping on batches in memory. It logs nothing and has no averaged weights, loggers or checkpoints. The
         complete framework cuts and gathers its batches, checks losses, averages weights, shows its progress and logs
         every {log_interval()} steps. Each run takes {steps} steps on one thread, and the mean thread time per step is

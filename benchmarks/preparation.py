@@ -99,7 +99,7 @@ def measure(settings: Settings) -> Section:
     return section(
         "Data set preparation",
         f"""`make prepare` converts synthetic clips of about {FRAMES_PER_CLIP} frames, with one worker per core. Times
-        are CPU seconds, summed over all processes. Memory is the maximum during the run.""",
+        are CPU seconds, summed over all processes. Memory is the peak during the run.""",
         f"One core prepares {rows[-1]['clips per second per core']:,.0f} clips per second, and memory grows by "
         f"{per_frame:.0f} bytes per frame.",
         {"sizes": rows},

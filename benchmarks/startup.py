@@ -101,9 +101,9 @@ def measure(settings: Settings) -> Section:
     return section(
         "Startup of the commands",
         f"""Times are measured from the start of a process to its end, with one thread. The work is minimal (one
-        training step, one motion, one replication of eight motions), so that mainly imports are measured. Values are
-        medians of {rounds} alternating runs, and ratios refer to the time of importing torch.""",
-        f"`--help` answers in {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times as "
+        training step, one motion, one replication of eight motions), so that the times consist mainly of imports. Values
+        are medians of {rounds} alternating runs, and ratios refer to the time of importing torch.""",
+        f"`--help` takes {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times as "
         "long as importing torch.",
         {"commands": rows},
     )

@@ -262,12 +262,12 @@ def measure(settings: Settings) -> Section:
         "Host cost of a training step",
         f"""The network is tiny: it has one transformer layer of width 16 and no text encoder, and is trained on batches
         of 4 clips. A step does almost no arithmetic, so its time consists mainly of the call overhead
-        of torch, the framework and Lightning. Bare Lightning trains the same network with the same masked loss, fused optimizer and gradient
-        clipping on batches in memory. It logs nothing and has no averaged weights, loggers or checkpoints. The
-        complete framework cuts and gathers its batches, checks losses, averages weights, shows its progress and logs
-        every {log_interval()} steps. Each run takes {steps} steps on one thread, and the mean thread time per step is
-        measured. Values are medians of {rounds} alternating runs. For the second table, the parts of the framework's
-        step are timed one by one, without Lightning.""",
+        of torch, the framework and Lightning. Bare Lightning trains the same network with the same masked loss, fused
+        optimizer and gradient clipping on batches in memory. It logs nothing and has no averaged weights, loggers or
+        checkpoints. The complete framework cuts and gathers its batches, checks losses, averages weights, shows its
+        progress and logs every {log_interval()} steps. Each run takes {steps} steps on one thread, and the mean thread
+        time per step is measured. Values are medians of {rounds} alternating runs. For the second table, the parts of
+        the framework's step are timed one by one, without Lightning.""",
         f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms, which is {whole:.2f} times as long as "
         f"in bare Lightning with the same network. Without averaged weights, it takes {without:.2f} times as long.",
         {"steps": ratios(times, BARE, "training"), "parts of the framework": shares},

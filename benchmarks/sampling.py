@@ -224,8 +224,8 @@ def measure(settings: Settings) -> Section:
         frames of {FEATURES} features and are sampled on the device "{size.device}" with a guidance scale of
         {GUIDANCE}, so a network call processes two rows per motion. Latency and throughput are measured with the
         ancestral sampler and include the time for drawing noise. "Distilled" refers to the sampler for distilled
-        models, without guidance. The samplers are compared with {BATCH} motions per batch. The loops are timed without a
-        network, for a single motion. Values are medians of {size.rounds} alternating rounds.""",
+        models, without guidance. The samplers are compared with {BATCH} motions per batch. The loops are timed without
+        a network, for a single motion. Values are medians of {size.rounds} alternating rounds.""",
         f"With 10 steps, sampling one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 yield "
         f"{64 / ten['64']:.0f} motions per second.",
         {

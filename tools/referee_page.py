@@ -23,9 +23,9 @@ The thresholds were set on one half of the recordings, and these figures were me
 the caption of a motion counts as true. Falsified claims, which state the other side, direction or speed, one repetition
 more or less, the reverse order, another duration, or the other end of the motion, count as false. If a caption
 is wrong, this also counts as an error of the referee. We corrected patterns and measurements after we had seen errors
-on both halves, so expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as kicking with both
-legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the verdicts on CMU's
-claims would be right.
+on both halves, so expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as
+kicking with both legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the
+verdicts on CMU's claims would be right.
 
 CMU's captions come from HumanML3D's test split and from KIT-ML, and cover only the recordings that were available.
 Bandai-Namco's captions are filled-in templates, so its many clips have only a few different sentences. The figures for

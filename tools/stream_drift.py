@@ -68,8 +68,8 @@ can be compared. Unless stated otherwise, the motions are not cleaned up.
 FID is computed with the package's motion-CLIP between two-second windows of the streams and of synthetic motions that
 the model has not seen. For comparison, a second set of such motions has an FID of {real_fid}.
 The jitter is {first} m/s³ in the first minute and {last} m/s³ in the last minute, which is {ratio} times as much.
-In 99.9 % of the frames, no toe is more than {low} cm below the floor, and the lowest toe in any frame is {lowest} cm below it.
-With `cleanup=true`, the lowest toe
+In 99.9 % of the frames, no toe is more than {low} cm below the floor,
+and the lowest toe in any frame is {lowest} cm below it. With `cleanup=true`, the lowest toe
 in the same streams is {cleaned_lowest} cm below the floor, and in {cleaned_deep} of {cleaned_frames} frames, a toe is
 more than 3 cm below it.
 

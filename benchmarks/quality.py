@@ -2,7 +2,7 @@
 
 This script does not train models. It reads the runs in a folder, which must have been trained with
 `make train ... speed=...` and evaluated with `make evaluate`, with at least two seeds per data set
-and speed. Values are means over the seeds, with 95 % intervals by Student's t. Differences are
+and speed. Values are means over the seeds, with 95 % intervals (Student's t). Differences are
 computed between runs with the same seed, which begin with the same weights and use the same batches.
 """
 
@@ -114,7 +114,7 @@ def measure(settings: Settings) -> Section:
     return section(
         "Quality at both speeds",
         """At each speed, models are trained with several seeds and evaluated once on the test motions. Values are means
-        over the seeds, with 95 % intervals by Student's t. Differences are computed between runs with the same seed,
+        over the seeds, with 95 % intervals (Student's t). Differences are computed between runs with the same seed,
         which begin with the same weights and use the same batches.""",
         f"For {equal} of {total} quality figures, the 95 % interval of `fast` − `reference` contains 0{others}.",
         tables,

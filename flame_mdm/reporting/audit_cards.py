@@ -293,8 +293,8 @@ def findings(card: AuditCard) -> list[str]:
         if of_motions is not None:
             grade = perturbation.grades[-1]
             lines += [
-                f"With {of_motions.format(grade.grade)}, {metric} is {number(grade.values[metric][0])}. With all motions, "
-                f"decoded and encoded again, it is {number(card.real[metric][0])}."
+                f"With {of_motions.format(grade.grade)}, {metric} is {number(grade.values[metric][0])}. With all "
+                f"motions, decoded and encoded again, it is {number(card.real[metric][0])}."
                 for metric in biased
             ]
     return lines

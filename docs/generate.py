@@ -43,12 +43,12 @@ def recipes_page() -> str:
     page = f"""# Recipes
 
 {HEAD}
-Every table row that these papers report for their own model has a recipe, such as `make train EXP=humanml3d/mdm`:
-FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023, arXiv:2209.14916) and Motion Flow
-Matching (Hu et al., 2023, arXiv:2312.08895). Recipes that mention no table do not correspond to a row in a paper. Their
-files list the deviations from the paper. "As in humanml3d/mdm" means that all deviations listed for that recipe also
-apply. Three deviations apply to all recipes: a batch contains motions of about the same length, every sample in a batch
-has the same weight, and checkpoints are selected on validation clips.
+Every table row that these papers report for their own model has a recipe, such as `make train EXP=humanml3d/mdm`: FLAME
+(Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023, arXiv:2209.14916) and Motion Flow Matching (Hu
+et al., 2023, arXiv:2312.08895). Recipes that mention no table do not correspond to a row in any paper. Their files list
+the deviations from the paper. "As in humanml3d/mdm" means that all deviations listed for that recipe also apply. Three
+deviations apply to all recipes: a batch contains motions of about the same length, every sample in a batch has the same
+weight, and checkpoints are selected on validation clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):

@@ -63,7 +63,7 @@ def test_any_features_decode_to_rotations_and_to_motions_that_can_be_written(
     if make is Motion272 and kind != "signs":
         assert len(refusals) == 3
         assert {message.partition(",")[0] for message in refusals} == {
-            "the bone that ends in left_hip has no length"
+            "the bone that ends at left_hip has no length"
         }
     else:
         assert not refusals

@@ -58,8 +58,8 @@ def unread(path: Path) -> UserError:
 def motions_in(folder: Path) -> list[Path]:
     """Returns the motion files in a folder and its subfolders, sorted.
 
-    Hidden files (created by macOS and editors), folders, and AMASS files without motion are
-    skipped. A JSON file counts as a motion only if it contains an array of joints.
+    Hidden files (such as those created by macOS and editors), folders, and AMASS files that contain
+    no motion are skipped. A JSON file counts as a motion only if it contains an array of joints.
     """
     return sorted(file for file in folder.rglob("*") if _is_motion(file, folder))
 

@@ -54,9 +54,10 @@ NUMBERS = ", ".join(map(str, AXIS_ANGLES))
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays in an .npz, .json or .npy motion file.
 
-    The result contains either `joints` or, as in AMASS, `poses` (F, 72) and `trans` (F, 3). These
-    entries are added if the file contains them: `fps`, `text`, `features`, `representation` and,
-    for `.json` files, `up`, `unit` and `names`. `ours` is True if this project wrote the file.
+    The result contains either `joints` or, as in AMASS, `poses` (F, 72) and `trans` (F, 3). The
+    following entries are added if the file contains them: `fps`, `text`, `features`,
+    `representation` and, for `.json` files, `up`, `unit` and `names`. `ours` is True if this
+    project wrote the file.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -78,12 +79,12 @@ def read_arrays(path: Path) -> dict[str, Any]:
     for name in {"joints", "poses", "trans"} & data.keys():
         check_numbers(name, data[name])
     if "features" in data and (not is_real(data["features"]) or data["features"].ndim != 2):
-        raise UserError("features must be an array (frames, features) of real numbers")
+        raise UserError("features must be an array of real numbers with shape (frames, features)")
     if "poses" in data:
         data["poses"] = _axis_angles(data["poses"])
         if data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
             raise UserError(
-                "poses require trans (F, 3) with the same number of frames, as in AMASS files"
+                "poses require trans with shape (frames, 3) and the same number of frames, as in AMASS"
             )
     for key in RATES:
         if key in data:
@@ -124,7 +125,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
     """Returns the axis-angle vectors (F, 72) of SMPL's joints.
 
-    If the file contains no hands, their vectors are 0.
+    If the file does not contain the hands' rotations, their vectors are 0.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
@@ -141,7 +142,7 @@ def _axis_angles(poses: np.ndarray) -> np.ndarray:
 
 
 def check_numbers(name: str, values: np.ndarray) -> None:
-    """Checks the numbers in an array (F, ...).
+    """Checks the numbers in an array with one entry per frame.
 
     Raises:
         UserError: If the array has no frames or too many frames, or if it contains numbers that are

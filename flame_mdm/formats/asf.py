@@ -1,10 +1,11 @@
 """ASF/AMC motion capture files (Acclaim, CMU): one file per skeleton, and one per motion.
 
 An ASF file lists the bones of a subject. For each bone, it contains the direction (in world
-coordinates) and the length in the standing rest pose, the coordinate axes C in which the bone
-turns, and the degrees of freedom. An AMC file contains the angles of these degrees of freedom in
-each frame. If M is the rotation given by these angles, the bone turns by C M C^-1 relative to its
-parent. With the order XYZ, for example, the rotation about x is applied first: C = Rz Ry Rx.
+coordinates) and the length in the standing rest pose, the axes C of the coordinate system in which
+the bone turns, and the degrees of freedom. An AMC file contains the angles of these degrees of
+freedom in each frame. If M is the rotation given by these angles, the bone turns by C M C^-1
+relative to its parent. With the order XYZ, for example, the rotation about x is applied first:
+C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ class Bone(NamedTuple):
 def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints.
 
-    Each bone becomes a joint with the same name at its start. The frame rate `fps` is required,
-    because AMC files do not contain it. Most of CMU's recordings have 120 frames per second.
+    Each bone becomes a joint with the bone's name, located at the start of the bone. The frame rate
+    `fps` is required, because AMC files do not contain it. Most of CMU's recordings were captured
+    at 120 frames per second.
     """
     lines = read_lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
@@ -179,10 +181,10 @@ def _order(lines: Lines, words: list[str]) -> str:
 
 
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
-    """Returns the angles (F, N), in degrees, of each bone's N degrees of freedom.
+    """Returns each bone's angles (F, N) in degrees, where N is its number of degrees of freedom.
 
     Raises:
-        UserError: If there are too many frames for this number of `joints`.
+        UserError: If the file has too many frames for this number of `joints`.
     """
     rows: dict[str, list[list[float]]] = {name: [] for name, bone in bones.items() if bone.freedoms}
     frames = 0

@@ -73,7 +73,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     The body's joints coincide with the motion's joints, raised by the thickness of the sole.
 
     Args:
-        motion: the clip. If it has no rotations, they are computed from its joint positions.
+        motion: the clip. If it contains no rotations, they are computed from its joint positions.
         body: the mesh; None = the mannequin.
 
     Raises:
@@ -110,9 +110,9 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 
 
 def local_rotations(body: FittedBody) -> np.ndarray:
-    """Returns the rotations (F, 22, 3, 3) of a body's joints relative to their parents.
+    """Returns the rotations of a body's joints relative to their parents, (F, 22, 3, 3).
 
-    They include the bend of the toes.
+    The bend of the toes is included.
     """
     count = len(SMPL22)
     world = body.turns[:, :count] @ body.mesh.turns[:count] @ body.neutral.mT
@@ -125,7 +125,7 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns a linear map (22, 3, 3) for each body part, and the scale of the body's width.
 
-    In its rest pose, the mapped body has the `offsets` (22, 3) of a clip.
+    In its rest pose, the mapped body has the same `offsets` (22, 3) as the clip.
     """
     # The limbs determine the size of the body. Hips and shoulders follow the clip's own widths.
     # The trunk blends both widths from bottom to top. Limbs are stretched only along their bones.
@@ -134,7 +134,7 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     for joint in LIMBS:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
             raise UserError(
-                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's bone is "
+                f"the bone that ends at {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's bone is "
                 f"{usual[joint]:.3g} m. Is the unit right? Motions like this are drawn without a body"
             )
     wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())

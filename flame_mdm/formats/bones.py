@@ -1,6 +1,6 @@
 """Rotations for SMPL's joints, computed from the bones in a BVH or AMC file.
 
-Joint positions do not show how a forearm or a head turns about its own axis, but the bones in a
+Joint positions do not show how a forearm or the head turns about its own axis, but the bones in a
 file do. The rotation of each SMPL joint is the rotation of its bone relative to the rest pose.
 Three rest poses are tried, in this order: the file's pose without rotations, a rest pose that
 precedes the motion, and the axes of a known skeleton in a T-pose. If a rest pose is not a T-pose,
@@ -44,8 +44,8 @@ def bone_poses(
 ) -> BoneRotations:
     """Returns the rotations of SMPL's joints, taken from the bones in a file.
 
-    They cannot be used if the rest pose is unknown, or if they do not reproduce the joint
-    positions, for example because position channels move each joint.
+    The file's rotations cannot be used if the rest pose is unknown, or if they do not reproduce the
+    joint positions, for example because position channels move each joint.
 
     Args:
         tree: the tree of joints in the file.
@@ -110,7 +110,7 @@ def _rest(
 def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
     """Returns the bone rotations (22, 3, 3) in a pose, turned so that y is up and +z is ahead.
 
-    Returns None if the body in the `pose` (22, 3) is not upright.
+    Returns None if the body is not upright in the `pose` (22, 3).
     """
     shoulders = pose[[JOINT["left_shoulder"], JOINT["right_shoulder"]]].mean(0)
     trunk = shoulders - pose[[JOINT["left_hip"], JOINT["right_hip"]]].mean(0)
@@ -145,7 +145,7 @@ def _aligned(rest: np.ndarray, turned: np.ndarray, steps: np.ndarray) -> np.ndar
 
 
 def _local(turned: np.ndarray, steps: np.ndarray, start: int, end: int) -> np.ndarray:
-    """Returns the mean position (3,) of a bone's end, in the bone's coordinates."""
+    """Returns the mean position of a bone's end in the bone's coordinates, with shape (3,)."""
     return np.einsum("fji,fj->fi", turned[:, start], steps[:, end]).mean(0)
 
 
@@ -155,9 +155,9 @@ def _unit(vector: ArrayLike) -> np.ndarray:
 
 
 def _assembled(turned: np.ndarray, root: np.ndarray, steps: np.ndarray) -> Poses:
-    """Returns poses with the given world rotations (F, 22, 3, 3) of the joints.
+    """Returns poses whose joints have the given world rotations (F, 22, 3, 3).
 
-    The body has the bone lengths of the file.
+    The body has the same bone lengths as the skeleton in the file.
     """
     offsets = np.zeros((len(SMPL22), 3))
     local = turned.copy()

@@ -59,7 +59,7 @@ class Bvh:
         ]
 
     def rotations(self) -> np.ndarray:
-        """Returns the rotation (F, J, 3, 3) of each joint relative to its parent."""
+        """Returns the joint rotations relative to the parents, with shape (F, J, 3, 3)."""
         rotations = np.tile(np.eye(3), (len(self.frames), len(self.joints), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
@@ -70,10 +70,10 @@ class Bvh:
         return rotations
 
     def translations(self) -> np.ndarray:
-        """Returns the position (F, J, 3) of each joint in its parent's coordinates.
+        """Returns the joint positions in the parents' coordinates, with shape (F, J, 3).
 
-        Positions are read from the position channels. A joint without such channels stays at its
-        offset.
+        Positions are read from the position channels. A joint without position channels stays at
+        its offset.
         """
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
@@ -83,7 +83,7 @@ class Bvh:
         return translations
 
     def positions(self) -> np.ndarray:
-        """Returns the world position (F, J, 3) of each joint."""
+        """Returns the world positions of the joints, with shape (F, J, 3)."""
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
     def resample(self, fps: float, cubic: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +141,7 @@ def read_lines(path: str | Path) -> Lines:
 def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
-    If the file is incomplete or invalid, raises a `UserError` that names the file and the line.
+    Raises a `UserError` that names the file and the line if the file is incomplete or invalid.
     """
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:
@@ -231,7 +231,7 @@ class _Node:
 class Lines:
     """Splits the lines of a text file into words, and skips blank lines and comments (#).
 
-    The number of the current line is kept for error messages.
+    The current line number is kept for error messages.
     """
 
     def __init__(self, data: bytes, name: str):

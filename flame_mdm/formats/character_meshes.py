@@ -22,7 +22,7 @@ MAX_IMAGE = 64 * 2**20
 
 
 def character_clip(character: Character, motion: PosedFigure, name: str) -> RiggedClip:
-    """Returns a clip in which a character, including its meshes, performs a motion.
+    """Returns a clip in which a character performs a motion, including the character's meshes.
 
     `name` is the name of the animation.
 
@@ -179,9 +179,9 @@ def _material(file: glb.Glb, number: int) -> Material:
 
 
 def _image(file: glb.Glb, number: int | None) -> bytes:
-    """Returns the content of a PNG or JPEG image in the file.
+    """Returns the content of a PNG or JPEG image that is stored in the file.
 
-    Returns b"" if the image is stored outside the file or in another format.
+    Returns b"" if the image is a separate file or has another format.
     """
     if number is None:
         return b""

@@ -3,10 +3,11 @@
 A character may differ from SMPL's body in proportions, units, axes, names and rest pose. The rest
 pose must be upright with flat feet.
 
-The arms and legs point in the directions of the motion's bones. The trunk, the head, the hands and
-the feet turn as in the motion, relative to the rest pose. The path of the hips is scaled in
-proportion to the leg length. Then the legs are bent so that the toes reach the motion's toe
-positions, which are scaled in the same way and adjusted to the character's own toe height.
+The arms and legs point in the directions of the motion's bones. The rotations of the trunk, the
+head, the hands and the feet relative to the rest pose are the same as in the motion. The path of
+the hips is scaled in proportion to the leg length. Then the legs are bent so that the toes reach
+the motion's toe positions, which are also scaled, and adjusted to the height of the character's
+toes.
 """
 
 import copy
@@ -48,12 +49,12 @@ class BvhCharacter(RestPose):
 def read(path: str | Path) -> Character | BvhCharacter:
     """Reads a character.
 
-    Its joint names must match a known skeleton, or be listed in a `.yaml` file with the same name
-    as the character's file.
+    The joint names must match a known skeleton, or be listed in a `.yaml` file that has the same
+    name as the character's file.
 
     Raises:
-        UserError: If the file is damaged, if a .glb file contains no skin, or if there is no usable
-            rest pose.
+        UserError: If the file is damaged, if a .glb file contains no skin, or if the file contains
+            no usable rest pose.
         UnknownJoints: If joints cannot be identified.
     """
     path = Path(path)
@@ -159,11 +160,11 @@ def read_skinned(path: Path) -> Character:
 
 
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the pose in which the skin was bound, and the corners of a box around its meshes.
+    """Returns the pose in which the skin was bound, and the corners of a box around the meshes.
 
-    The pose consists of the matrices (N, 4, 4) of the nodes. If the nodes are stored in a different
-    pose, the orientation of the skin's coordinates is derived from the pelvis, which is nearly
-    upright.
+    The pose consists of one matrix per node, with shape (N, 4, 4). If the nodes are stored in a
+    different pose, the orientation of the skin's coordinates is derived from the pelvis, which is
+    nearly upright.
     """
     # If the file is stored in the bind pose, the product of joint matrix and inverse bind matrix is
     # the same for all joints. Otherwise, this product for the pelvis, with its rotation rounded to
@@ -203,7 +204,7 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 class UnknownJoints(UserError):
     """Error raised when joints cannot be identified.
 
-    `template` contains the lines of a file of joint names, which the user can complete.
+    `template` contains the lines of a file that lists joint names, for the user to complete.
     """
 
     def __init__(self, message: str, template: list[str]):
@@ -214,7 +215,7 @@ class UnknownJoints(UserError):
 def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     """Returns the index of the character's joint for each SMPL joint.
 
-    `names` contains the names of the character's joints by index.
+    `names` maps the indices of the character's joints to their names.
 
     Raises:
         UnknownJoints: If a joint cannot be identified.

@@ -59,7 +59,7 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
 def uprightness(joints: np.ndarray) -> float:
     """Returns the mean vertical component of the trunk direction, from -1 to 1.
 
-    In `joints` (F, 22, 3), y is up.
+    The y axis of `joints` (F, 22, 3) points up.
     """
     return float(_trunk(joints)[:, 1].mean())
 
@@ -67,9 +67,9 @@ def uprightness(joints: np.ndarray) -> float:
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
     """Returns a message if the body is lying in most frames, or "" otherwise.
 
-    The message suggests the up axis with which the body would stand, if there is one. `up` is the
-    file's up axis. `axes` (3, 3) is the matrix that converted `joints` (F, 22, 3) from the file's
-    axes to y up.
+    If the body would stand upright with another up axis, the message suggests that axis. `up` is
+    the file's up axis. `axes` (3, 3) is the matrix that converted `joints` (F, 22, 3) from the
+    file's axes to y up.
     """
     if uprightness(joints) >= LYING:
         return ""
@@ -84,7 +84,7 @@ def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
 
 
 def jump(joints: np.ndarray, fps: float) -> str:
-    """Returns a message if the pelvis or a leg moves faster than people do, or "" otherwise.
+    """Returns a message if the pelvis or a leg moves implausibly fast, or "" otherwise.
 
     `joints` (F, 22, 3) are in meters.
     """
@@ -107,7 +107,7 @@ def jump(joints: np.ndarray, fps: float) -> str:
 
 
 def below_floor(joints: np.ndarray) -> str:
-    """Returns a message if a body with adult bones sinks below the floor, or "" otherwise.
+    """Returns a message if a body with an adult's bones sinks below the floor, or "" otherwise.
 
     This happens if the person in the file is smaller than an adult.
     """
@@ -122,8 +122,8 @@ def rest_frames(joints: np.ndarray, fps: float) -> int:
     """Returns the number of initial frames that show a rest pose or lead from it to the motion.
 
     Several programs write a T-pose or A-pose as the first frame. If the recorded person really
-    stands in a rest pose at first, the change from the first frame to the second is not larger than
-    the following changes.
+    stands in a rest pose at first, the pose does not change more from the first frame to the second
+    than between later frames.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0
@@ -137,9 +137,9 @@ def rest_frames(joints: np.ndarray, fps: float) -> int:
 
 
 def _is_rest_pose(pose: np.ndarray) -> bool:
-    """Returns whether joints (22, 3) show a person standing with straight legs and straight arms.
+    """Returns whether joints (22, 3) show a person standing with straight arms and legs.
 
-    Both arms must be raised equally.
+    Both arms must be raised by the same angle.
     """
     trunk = _trunk(pose[None])[0]
     raised = []

@@ -51,7 +51,7 @@ REACH = 0.999
 
 
 def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
-    """Returns a motion with smooth joint paths, constant bone lengths and feet that do not slide.
+    """Returns the motion with smooth joint paths, constant bone lengths and feet that do not slide.
 
     See `cleanup` for the changes. The result contains no features, rotations or contacts, because
     they would no longer match the joints.
@@ -85,8 +85,8 @@ def cleanup(
 ) -> np.ndarray:
     """Corrects pops, bone lengths, sliding feet, toes below the floor, and hands inside the body.
 
-    The floor is at the 10th percentile, over all frames, of the height of the lowest toe, but not
-    above y = 0.
+    The height of the floor is the 10th percentile of the lowest toe's height over all frames, or 0
+    if this percentile is positive.
 
     Args:
         joints: (F, J, 3), joint positions in meters, y up. Motions with fewer than 4 frames are
@@ -138,8 +138,8 @@ def _least_squares(
     """Returns the x (frames, N) that minimizes the sum of all terms.
 
     A term (n, weight, target) stands for the sum of weight * (d - target)^2, where d are the n-th
-    differences of x. The weight is a number or has the shape (frames - n,). The target is a number
-    or has the shape (frames - n, N), and at least one target is an array.
+    differences of x. The weight is a number or an array of shape (frames - n,). The target is a
+    number or an array of shape (frames - n, N), and at least one target must be an array.
     """
     # An n-th difference has binomial coefficients with alternating signs. It couples frames that
     # are at most three apart. The normal equations are therefore a banded matrix, and solving
@@ -185,11 +185,11 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) -> None:
-    """Bends limbs whose foot or hand has moved down because bone lengths have changed.
+    """Bends limbs whose foot or hand moved down when the bone lengths were changed.
 
-    Between two very different poses in a sequence, for example when a crawl changes to a walk, the
-    poses are averages of the two and have short bones. With bones of full length, the limbs would
-    go through the floor.
+    When a sequence changes between two very different poses, for example from a crawl to a walk,
+    the poses in between are averages of the two and have short bones. With bones of full length,
+    the limbs would go through the floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):
@@ -208,10 +208,10 @@ def _arm(skeleton: Skeleton, side: str) -> list[int]:
 
 
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
-    """Returns the confidence (F - 1, 2) in [0, 1] that each toe stays on the floor.
+    """Returns the confidences (F - 1, 2), from 0 to 1, that the toes stay on the floor.
 
-    The confidence for a frame refers to the time until the next frame. `toes` (F, 2, 3) are the
-    positions of the toes.
+    A frame's confidences refer to the time until the next frame. `toes` (F, 2, 3) are the positions
+    of the toes.
     """
     # A toe is on the floor if it is both low and slow. The faster the body travels, the faster a
     # toe may slide, because feet in generated motions are carried along with the body.
@@ -263,7 +263,7 @@ def _lift(motion: np.ndarray, leg: Sequence[int], floor: float) -> None:
 
 
 def _faded(size: np.ndarray, frames: float) -> np.ndarray:
-    """Smooths `size` (F, ...), so that each peak fades in and out within about `frames` frames."""
+    """Smooths `size` (F, ...) so that each peak fades in and out within about `frames` frames."""
     return gaussian_filter1d(
         maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0
     )
@@ -292,7 +292,8 @@ def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> 
 def bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
     """Moves the foot of a leg, or the hand of an arm, by `shift` (F, 3).
 
-    `leg` contains the hip, the knee, the ankle and any further joints of the foot.
+    `leg` contains the hip, the knee, the ankle and any further joints of the foot, or the
+    corresponding joints of the arm.
     """
     # This is two-bone inverse kinematics. The new ankle is on the line from the hip to the
     # requested position, as far as the leg can reach. Thigh, shin and this line form a triangle,

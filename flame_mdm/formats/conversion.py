@@ -38,9 +38,9 @@ class RawMotion:
     Attributes:
         values: joint positions (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
-        note: a line for the user if a body with different proportions was used, or "" otherwise.
-            The line states the error, and whether the rotations come from the file or were fitted
-            to the joints.
+        note: a line for the user if a body with different proportions was used, otherwise "". The
+            line states the error, and whether the rotations come from the file or were fitted to
+            the joints.
         error: mean distance in meters between the joints of this body and the joints of the motion.
     """
 
@@ -57,10 +57,10 @@ def needs_rotations(representation: Representation) -> bool:
 def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     """Converts a motion to the form and frame rate of a representation.
 
-    Joint positions are resampled with cubic splines, and rotations are interpolated on the sphere.
-    KIT-ML's 21 joints are computed from SMPL's joints. If SMPL rotations are unknown, they are
-    computed from the bones of the file or, without bones, fitted to the joints. The body then has
-    the bones of an adult, and its path is scaled in proportion to the leg length.
+    Joint positions are resampled with cubic splines, and rotations with spherical interpolation
+    (slerp). KIT-ML's 21 joints are computed from SMPL's joints. If SMPL rotations are unknown, they
+    are computed from the bones of the file or, without bones, fitted to the joints. The body then
+    has an adult's bones, and its path is scaled in proportion to the leg length.
 
     Raises:
         UserError: If the representation cannot encode the skeleton of the motion.
@@ -79,8 +79,8 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
 def kit_joints(joints: np.ndarray) -> np.ndarray:
     """Converts SMPL's joints (F, 22 or more, 3) to KIT-ML's 21 joints (F, 21, 3).
 
-    The result is mirrored, as in KIT-ML. KIT-ML's joint in the middle of a foot is placed halfway
-    between the ankle and the toes.
+    The result is mirrored, as in KIT-ML. The joint that KIT-ML has in the middle of each foot is
+    placed halfway between the ankle and the toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     feet = {
@@ -132,8 +132,8 @@ def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
         joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:
-        The poses, and the distances (F, 22), in meters, between their joints and the scaled
-        `joints`.
+        The poses, and the distances in meters between their joints and the scaled `joints`, with
+        shape (F, 22).
     """
     adult = body.offsets.new_tensor(ADULT[: len(SMPL22)])
     legs = list(LEGS)

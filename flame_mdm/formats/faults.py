@@ -65,9 +65,9 @@ THIGH = 0.17
 
 
 class Fault(NamedTuple):
-    """A fault of one joint or of the whole body in frames `start` to `end` (exclusive).
+    """A fault of one joint or the whole body, from frame `start` to frame `end` (exclusive).
 
-    `worst` is the worst value in these frames, in the unit of the limit.
+    `worst` is the most extreme value in these frames, in the same unit as the limit.
     """
 
     kind: str
@@ -127,10 +127,10 @@ def _runs(
     flags: np.ndarray | None = None,
     frames: int = 1,
 ) -> list[Fault]:
-    """Returns the faults that last at least `frames` frames.
+    """Returns the faults that last for at least `frames` frames.
 
-    A frame belongs to a fault if its flag (F, J) is set or, without flags, if its value (F, J)
-    exceeds the limit.
+    A joint is faulty in a frame if its flag is set or, without flags, if its value exceeds the
+    limit. Flags and values have the shape (F, J).
     """
     runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
     for joint in np.flatnonzero(flags.any(0)).tolist():
@@ -158,7 +158,7 @@ def _stretched(
 
 
 def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Returns how deep elbows and wrists are inside the body. Wrists include the hands."""
+    """Returns how deep the elbows and wrists are inside the body. Wrists include the hands."""
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
@@ -198,10 +198,9 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures how deep an arm is inside the body.
+    """Measures how deep an arm penetrates the body.
 
-    The body is modeled by capsules for the trunk and the thighs. Their sizes are derived from the
-    bones.
+    The trunk and the thighs are modeled as capsules, whose sizes are derived from the bones.
 
     Args:
         joints: (F, J, 3), joint positions in meters.
@@ -209,9 +208,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        The depths (F, 3), in meters, of the elbow, the wrist and the middle of the hand (negative
-        outside the body), and a unit vector (F, 3, 3) for each of these points. The vector points
-        away from the axis of the body part in which the point is deepest.
+        The depths (F, 3) in meters for the elbow, the wrist and the middle of the hand, negative
+        outside the body; and a unit vector (F, 3, 3) for each of these points, which points away
+        from the axis of the body part in which the point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

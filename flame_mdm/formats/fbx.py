@@ -3,8 +3,8 @@
 `fbx_scene` reads motions from these trees, and `fbx_writer` writes motions as such trees.
 
 Autodesk does not publish the format. The layout of the records, the arrays and the end of the file
-follows the description by the Blender Foundation
-(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and files written by
+is based on the description by the Blender Foundation
+(https://code.blender.org/2013/08/fbx-binary-file-format-specification) and on files written by
 Autodesk's own SDK. A record has a name, properties and nested records. Numbers are little-endian.
 """
 
@@ -69,9 +69,9 @@ class Record:
 
     Attributes:
         name: name of the record, such as "Model".
-        properties: bool, int, float, str, bytes or one-dimensional arrays. `write` stores an int as
-            a 64-bit integer and a float as a double. `Int` and `Short` are stored as shorter
-            integers.
+        properties: values of type bool, int, float, str or bytes, or one-dimensional arrays.
+            `write` stores an int as a 64-bit integer and a float as a double. `Int` and `Short` are
+            stored as shorter integers.
         children: nested records.
         block: whether a terminator is written even if the record has no children. Some readers
             require it.
@@ -105,15 +105,15 @@ class Record:
 
 
 class Int(int):
-    """An integer that is stored in 32 bits."""
+    """An integer that is stored as 32 bits."""
 
 
 class Short(int):
-    """An integer that is stored in 16 bits."""
+    """An integer that is stored as 16 bits."""
 
 
 def read(path: Path) -> Record:
-    """Reads a binary FBX file of version 7 and returns the record that contains all others.
+    """Reads a binary FBX file of version 7, and returns the record that contains all others.
 
     Raises:
         UserError: If the file is too large or damaged, is an ASCII file, or has an earlier version.

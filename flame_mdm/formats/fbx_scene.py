@@ -5,8 +5,8 @@ transform of a model is
 
     T  Roff  Rp  Rpre  R  Rpost^-1  Rp^-1  Soff  Sp  S  Sp^-1
 
-where T is the translation, R is the rotation and S is the scale. Roff and Soff are the offsets and
-Rp and Sp the pivots of rotation and scale, and Rpre and Rpost are the pre- and post-rotation.
+where T is the translation, R is the rotation and S is the scale. Roff and Soff are the offsets of
+rotation and scale, Rp and Sp are their pivots, and Rpre and Rpost are the pre- and post-rotation.
 """
 
 import math
@@ -72,10 +72,11 @@ class Curve:
     """An animation curve: a number that depends on time.
 
     Attributes:
-        times: (K,) in seconds, increasing.
+        times: (K,), times of the keys in seconds, increasing.
         values: (K,), value at each of these times.
-        flags: (K,), interpolation from each key to the next.
-        slopes: (K, 2), slopes per second of cubic segments, after each key and before the next key.
+        flags: (K,), method of interpolation from each key to the next.
+        slopes: (K, 2), for cubic segments, the slopes per second after each key and before the next
+            key.
     """
 
     times: np.ndarray
@@ -123,7 +124,7 @@ def hermite(begin: Any, end: Any, leaving: Any, arriving: Any, share: Any) -> An
 
 @dataclass(eq=False)
 class _Model:
-    """A node of the scene: its properties, and its animation curves by property and axis."""
+    """A node of the scene: its properties, and its animation curves, keyed by property and axis."""
 
     name: str
     properties: dict[str, tuple[float, ...]]
@@ -141,7 +142,7 @@ class _Model:
     def animated(
         self, name: str, default: tuple[float, float, float], times: np.ndarray
     ) -> np.ndarray:
-        """Returns the values (F, 3) of a property at times (F,)."""
+        """Returns a property's values (F, 3) at times (F,)."""
         values = np.tile(self.vector(name, default), (len(times), 1))
         for axis, curve in self.curves.get(name, {}).items():
             values[:, axis] = curve.at(times)
@@ -206,7 +207,7 @@ def animations(path: Path) -> list[str]:
 
 
 class _Scene:
-    """The objects of a file by id, and their connections."""
+    """The objects of a file, keyed by id, and their connections."""
 
     def __init__(self, root: fbx.Record) -> None:
         objects = root.first("Objects") or fbx.Record("")
@@ -345,14 +346,14 @@ def _is_object(record: fbx.Record) -> bool:
 def _name(record: fbx.Record) -> str:
     """Returns the name of an object.
 
-    The file stores it together with the object's class.
+    The file stores the name together with the object's class.
     """
     name = record.properties[1]
     return str(name).partition("\x00")[0] or record.name
 
 
 def _properties(record: fbx.Record | None) -> dict[str, tuple[float, ...]]:
-    """Returns the numeric properties of an object by name."""
+    """Returns the numeric properties of an object, keyed by name."""
     block = record.first("Properties70") if record else None
     properties = {}
     for entry in block.all("P") if block else ():

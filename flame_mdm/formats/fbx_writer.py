@@ -1,9 +1,9 @@
 """Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
 
-The structure of the scene follows files written by Autodesk's FBX SDK. Programs differ in the
-details that they require; for each such detail, a comment names the program. The bones are at the
-top level, because Unreal and Unity treat a node above them as a bone. The rest pose of the bones is
-stored in `PreRotation`, so that rotations of 0 result in the rest pose in every program.
+The structure of the scene is the same as in files written by Autodesk's FBX SDK. Some details are
+required only by certain programs, which are named in comments. The bones are at the top level of
+the scene, because Unreal and Unity would treat a node above them as a bone. The rest pose of the
+bones is stored in `PreRotation`, so that rotations of 0 result in the rest pose in every program.
 """
 
 from collections import Counter
@@ -152,8 +152,8 @@ class _Writer:
     ) -> dict[int, np.ndarray]:
         """Adds a mesh in its bind pose, with its materials and its skin.
 
-        `materials` contains the ids of the materials written so far. Returns the bind-pose matrix
-        (4, 4) of each object by id.
+        `materials` contains the ids of the materials written so far. Returns the matrix (4, 4) of
+        each object in the bind pose, keyed by id.
         """
         # A Geometry contains the vertices, and a Model places it. A Skin deforms the geometry with
         # one Cluster per bone. A cluster contains its vertices, their weights, and the matrices of
@@ -222,7 +222,7 @@ class _Writer:
         return number
 
     def _bind_pose(self, poses: dict[int, np.ndarray]) -> None:
-        """Adds the bind pose of the meshes, given each object's matrix (4, 4) by id."""
+        """Adds the bind pose of the meshes; `poses` maps each object's id to its matrix (4, 4)."""
         _, record = self._object("Pose", "bind pose", "BindPose")
         record.add("Type", "BindPose")
         record.add("Version", Int(100))
@@ -289,14 +289,14 @@ class _Writer:
 def _degrees(turns: np.ndarray) -> np.ndarray:
     """Converts rotations (F, J, 3, 3) to continuous Euler angles (F, J, 3) in degrees.
 
-    The angles are about x, y and z.
+    The angles are rotations about x, y and z.
     """
     angles = continuous_euler(torch.from_numpy(turns), [EULER] * turns.shape[1])
     return np.degrees(angles.flip(-1).numpy())
 
 
 def _matrix(matrix: np.ndarray) -> np.ndarray:
-    """Returns the 16 numbers of a matrix. The last four contain the translation."""
+    """Returns the 16 numbers of a matrix. The last four numbers contain the translation."""
     return matrix.T.astype("<f8").ravel()
 
 

@@ -1,9 +1,9 @@
 """Clips for game engines, cut from longer motions: loops, starts, stops and turns.
 
-The ends of the clips fit together. A gait is cut at two frames that are one cycle apart. The start
-clip ends at the first of these frames, the loop lies between them, and the stop clip begins at the
-second one. Then the ends of the clips are adjusted to shared poses: the first pose of the loop, and
-the standing pose.
+The ends of the clips match each other. A gait is cut at two frames that are one cycle apart. The
+start clip ends at the first of these frames, the loop lies between them, and the stop clip begins
+at the second one. Then the ends of the clips are adjusted to shared poses: the first pose of the
+loop, and the standing pose.
 """
 
 from collections.abc import Sequence
@@ -58,11 +58,11 @@ TALL = 0.15  # maximum mean distance in meters per joint between the end poses o
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A motion for a game engine.
+    """A clip for a game engine.
 
     Attributes:
         name: name of the clip, without the name of the set.
-        kind: loop (whose last pose equals its first pose), start, stop or turn.
+        kind: "loop" (the last pose equals the first pose), "start", "stop" or "turn".
         motion: the joints and the root trajectory.
         text: the text from which the motion was generated.
     """
@@ -75,7 +75,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A cycle of a gait in a motion.
+    """One cycle of a gait within a motion.
 
     The fields are the first frame, the frame with the same pose one cycle later, and the difference
     between the two poses.
@@ -87,7 +87,7 @@ class Cycle:
 
 
 def direction(degrees: float) -> np.ndarray:
-    """Returns the x and z components (2,) of a direction.
+    """Returns the x and z components of a direction, with shape (2,).
 
     0 degrees is straight ahead, and 90 degrees is to the left.
     """
@@ -112,9 +112,9 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 
 
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
-    """Of the gait cycles in a direction, returns the one whose ends differ least.
+    """Returns the gait cycle in a direction whose first and last poses differ least.
 
-    Returns None if there is no cycle. Cycles that begin with a landing of the left foot are
+    Returns None if no cycle is found. Cycles that begin with a landing of the left foot are
     preferred, so that the loops of a set begin with the same foot.
     """
     # The cycle lies in the longest part that has a steady speed in the requested direction. All
@@ -160,7 +160,7 @@ def gait(
     """Returns the start, loop and stop clips of a gait on a straight path.
 
     Args:
-        motion: a motion in which a person stands, moves in a direction, and stands again.
+        motion: a motion in which a person stands, moves in one direction, and stands again.
         cycle: the cycle that becomes the loop clip.
         degrees: the direction, relative to the heading of the person.
         stand: (22, 3), the first pose of the start clip and the last pose of the stop clip.
@@ -244,8 +244,8 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 def loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns the middle repetition of a loop that was generated with three repetitions.
 
-    If the loop travels, the root follows a straight line at a constant speed. Otherwise, the root
-    stays in place.
+    If the person moves or turns during the loop, the root does so at a constant speed, along a
+    straight line. Otherwise, the root stays in place.
     """
     count = (len(motion) - 1) // 3
     cycle = closed(motion.cut(count, 2 * count))
@@ -260,7 +260,7 @@ def passing(motion: GroundedMotion) -> list[float | None]:
     """Returns the times in seconds at which the planted left and right toes pass the root of a loop.
 
     A time is None if the toes never pass the root. Two gaits are best blended at these times,
-    because the foot is then in the same place in both gaits.
+    because the foot is then at the same place in both.
     """
     travel = motion.path[-1] - motion.path[0]
     distance = np.linalg.norm(travel)
@@ -281,9 +281,9 @@ def passing(motion: GroundedMotion) -> list[float | None]:
 def with_neighbors(clips: Sequence[Clip], frames: int) -> tuple[np.ndarray, list[slice]]:
     """Returns the joints of all clips in one array, and the frames of each clip.
 
-    The joints are relative to the root. Each clip is padded with `frames` frames on both sides, so
-    that filters over time do not mix the clips. A loop is padded with repetitions of itself, and
-    all other clips are padded with their first and last poses.
+    The joint positions are relative to the root. Each clip is padded with `frames` frames on both
+    sides, so that filters over time do not mix the clips. A loop is padded with repetitions of
+    itself, and all other clips are padded with their first and last poses.
     """
     parts, slices, position = [], [], 0
     for clip in clips:

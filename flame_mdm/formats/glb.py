@@ -62,8 +62,8 @@ Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 class _Object(BaseModel):
     """Base class for the parts of the document that are read.
 
-    Types are checked strictly. Keys without a field are ignored here, and copied unchanged when the
-    file is written.
+    Types are checked strictly. Keys for which no field is defined are ignored here, but copied
+    unchanged when the file is written.
     """
 
     model_config = ConfigDict(strict=True)
@@ -149,7 +149,7 @@ def _item(items: Sequence[Item], index: int, name: str) -> Item:
 
 
 def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
-    """Returns the node indices with parents before their children, and the parent of each node.
+    """Returns the node indices, with parents before their children, and each node's parent.
 
     Raises:
         ValueError: If the nodes do not form trees.
@@ -283,7 +283,7 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
 
 
 def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
-    """Returns the corners (8, 3) of the box that bounds a part of a mesh."""
+    """Returns the corners (8, 3) of the bounding box of a part of a mesh."""
     accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
     if {len(accessor.min), len(accessor.max)} != {3}:
         raise ValueError("a mesh has no bounds for its positions")
@@ -293,7 +293,7 @@ def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
 
 
 def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
-    """Returns the inverse bind matrices (K, 4, 4) of a skin, or (0, 4, 4) if it has none."""
+    """Returns a skin's inverse bind matrices (K, 4, 4), or an array (0, 4, 4) if it has none."""
     if skin.inverseBindMatrices < 0:
         return np.zeros((0, 4, 4))
     accessor = _item(parts.accessors, skin.inverseBindMatrices, "inverseBindMatrices")
@@ -316,9 +316,9 @@ def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
 
 
 def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
-    """Returns the numbers (N, C) of an accessor as float64.
+    """Returns an accessor's numbers (N, C) as float64.
 
-    Normalized integers are scaled to a maximum of 1.
+    Normalized integers are scaled so that the largest integer becomes 1.
 
     Args:
         file: the file.
@@ -326,7 +326,7 @@ def numbers(file: Glb, accessor: int, kind: str) -> np.ndarray:
         kind: required type of the accessor, such as "VEC3".
 
     Raises:
-        ValueError: If the file does not contain such numbers.
+        ValueError: If the file contains no such accessor, or if the accessor is invalid.
     """
     item = _Accessor.model_validate(_item(file.document["accessors"], accessor, "accessor"))
     view = _View.model_validate(_item(file.document["bufferViews"], item.bufferView, "bufferView"))
@@ -365,7 +365,7 @@ class Binary:
     ) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor.
 
-        If `normalized` is set, bytes represent numbers from 0 to 1.
+        If `normalized` is set, the numbers are bytes that represent values from 0 to 1.
         """
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]
@@ -420,9 +420,9 @@ class Binary:
 
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w.
+    """Converts rotations (F, ..., 3, 3) to float32 quaternions (x, y, z, w).
 
-    The sign does not flip between successive quaternions.
+    The signs do not flip between successive frames.
     """
     turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
     return turns[..., [1, 2, 3, 0]].float().numpy()

@@ -91,10 +91,10 @@ class Track:
     """A property of a node over time.
 
     Attributes:
-        times: (K,) in seconds, increasing.
+        times: (K,), times of the keys in seconds, increasing.
         values: (K, C), value at each of these times.
         interpolation: method of interpolation between the keys, such as "LINEAR".
-        slopes: (2, K, C), slopes per second before and after each key, for CUBICSPLINE only.
+        slopes: (2, K, C), slopes per second before and after each key; used only for CUBICSPLINE.
     """
 
     times: np.ndarray
@@ -171,7 +171,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of those animations in a file that move nodes."""
+    """Returns the names of all animations that move nodes in a file."""
     file = glb.read(path)
     try:
         return [name for name, _ in _animations(file)]
@@ -197,7 +197,7 @@ def _motion(file: glb.Glb, animation: str | int | None) -> AnimatedNodes:
 
 
 def world_matrices_of(path: Path) -> np.ndarray:
-    """Returns the world matrices (F, N, 4, 4) of the nodes in the first animation of a valid file."""
+    """Returns the nodes' world matrices (F, N, 4, 4) in the first animation of a valid file."""
     file = glb.read(path)
     candidates = _animations(file)
     return _worlds(file, candidates[0][1], candidates)[0]
@@ -206,7 +206,7 @@ def world_matrices_of(path: Path) -> np.ndarray:
 def _worlds(
     file: glb.Glb, chosen: _Animation, candidates: Sequence[tuple[str, _Animation]]
 ) -> tuple[np.ndarray, float]:
-    """Returns the world matrices (F, N, 4, 4) of the nodes in each frame, and the frame rate."""
+    """Returns the nodes' world matrices (F, N, 4, 4) in each frame, and the frame rate."""
     tracks = _tracks(file, chosen)
     fps = _rate(file, [item for _, item in candidates])
     last = max(track.times[-1] for properties in tracks.values() for track in properties.values())
@@ -241,7 +241,7 @@ def _animated(node: dict[str, Any], tracks: dict[str, Track], times: np.ndarray)
 
 
 def _tracks(file: glb.Glb, animation: _Animation) -> dict[int, dict[str, Track]]:
-    """Returns the tracks of an animation by node and property."""
+    """Returns the tracks of an animation, keyed by node and property."""
     rank = {index: number for number, index in enumerate(file.nodes)}
     tracks: dict[int, dict[str, Track]] = {}
     for channel in animation.channels:
@@ -276,8 +276,8 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
 def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     """Returns the frame rate.
 
-    The frame rate is read from `asset.extras.fps` if the writer stored it there. Otherwise, it is
-    computed from the intervals between keys.
+    The frame rate is read from `asset.extras.fps` if it is stored there. Otherwise, it is computed
+    from the intervals between keys.
     """
     # glTF stores keys, but no frame rate. In a sampled animation, the median interval between keys
     # determines the frame rate. Times have single precision, so the rate is rounded to a nearly

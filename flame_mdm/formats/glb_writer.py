@@ -12,7 +12,7 @@ VERTICES, INDICES = 34962, 34963  # values of a buffer view's target in glTF
 
 
 def write(path: Path, clip: RiggedClip, text: str) -> None:
-    """Writes a clip with one node per joint, including the person's skin if the clip has one.
+    """Writes a clip with one node per joint, and with the person's skin if the clip has one.
 
     `text` is stored in the file. The node `lifted`, which is the parent of the joints, is raised by
     the thickness of the soles, so that the person stands on the soles. In a rig with a root on the

@@ -1,12 +1,12 @@
-"""Motions relative to a root on the floor, and feet that stay where they are planted.
+"""Motions relative to a root on the floor, with feet that stay where they are planted.
 
 In game engines, a root on the floor moves the character, and the rest of the motion is played
 relative to this root. Motions are cut in this representation, so that the last pose of one clip can
-be the first pose of the next. Afterward, the path of the root is added again, and inverse
-kinematics keeps each foot in place during its contacts.
+be the first pose of the next. Afterward, the path of the root is added back, and inverse kinematics
+keeps each foot in place while it is on the floor.
 
 Arrays contain the positions of the 22 SMPL joints in F frames, in meters, y up. Angles are in
-radians. Positive angles turn to the left.
+radians; positive angles turn to the left.
 """
 
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ FEET = tuple(
 
 @dataclass(frozen=True, eq=False)
 class GroundedMotion:
-    """A motion, stored as the path of a root on the floor and joints relative to this root.
+    """A motion, stored as the path of a root on the floor and the joints relative to this root.
 
     Attributes:
         local: (F, 22, 3), joint positions relative to the root, which faces +z.
@@ -97,7 +97,7 @@ def turned(points: np.ndarray, angles: np.ndarray | float) -> np.ndarray:
 
 
 def facing(joints: np.ndarray) -> np.ndarray:
-    """Returns the unwrapped direction (F,) that the hips and shoulders face."""
+    """Returns the direction in which the hips and shoulders face, as unwrapped angles (F,)."""
     right_hip, left_hip, right_shoulder, left_shoulder = (
         joints[:, joint] for joint in SMPL22.facing
     )
@@ -140,7 +140,7 @@ def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
 def anchored(
     motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool
 ) -> GroundedMotion:
-    """Replaces the first or last pose of a motion. The change fades out over `seconds`.
+    """Replaces the first or last pose of a motion, and blends the change out over `seconds`.
 
     `pose` (22, 3) is relative to the root. Bones keep their lengths.
     """
@@ -155,7 +155,7 @@ def anchored(
 
 
 def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns the joints (F, 22, 3) with the bone lengths of a pose (22, 3).
+    """Returns the joints (F, 22, 3) with the same bone lengths as in a pose (22, 3).
 
     The bones keep their directions.
     """
@@ -178,11 +178,11 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
 def planted(
     motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False
 ) -> GroundedMotion:
-    """Returns the motion with toes that do not move during contacts.
+    """Returns the motion with toes that stay in place during contacts.
 
-    The toes also stay above the floor. If a leg is too short, the body is lowered. With
+    The toes also stay above the floor. If a leg is too short to reach, the body is lowered. With
     `fixed_start` and `fixed_end`, the first and the last pose do not change. A foot that is planted
-    in a fixed pose stays at its position in that pose.
+    in such a fixed pose stays where it is in that pose.
     """
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
     # whole body is lowered smoothly for a moment. Then the legs bend to reach the footprints.
@@ -219,7 +219,7 @@ def planted(
 
 
 def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndarray:
-    """Returns how far a hip must be lowered (F,) so that its foot can move by `shift` (F, 3)."""
+    """Returns how far (F,) a hip must be lowered so that its foot can move by `shift` (F, 3)."""
     # The hip may be anywhere in a sphere around the ankle. The radius of the sphere is the length
     # of the straight leg, or the distance from hip to ankle in the motion if this distance is
     # longer. `highest` is the height of the sphere above the hip's position on the floor.
@@ -234,9 +234,9 @@ def _lack(world: np.ndarray, leg: tuple[int, ...], shift: np.ndarray) -> np.ndar
 def _shift(
     toe: np.ndarray, flags: np.ndarray, fixed_start: bool, fixed_end: bool, near: int
 ) -> np.ndarray:
-    """Returns the horizontal displacement (F, 3) that keeps a toe (F, 3) in place during contacts.
+    """Returns the horizontal displacements (F, 3) that keep a toe (F, 3) in place during contacts.
 
-    The displacement changes smoothly from each contact to the next.
+    The displacements change smoothly from one contact to the next.
     """
     # Within a contact, the shift moves the toe to its mean position, or to its position in a fixed
     # pose. Between contacts, one shift is blended into the next. If a contact begins or ends fewer
@@ -275,7 +275,7 @@ def _shift(
 
 
 def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
-    """Returns several repetitions of a loop in a row.
+    """Returns a motion that repeats a loop several times.
 
     The last frame of each repetition is the first frame of the next one.
     """
@@ -317,7 +317,7 @@ def planted_loop(motion: GroundedMotion) -> GroundedMotion:
 
 
 def slide(motion: GroundedMotion) -> float:
-    """Returns the maximum distance in meters that a toe slides during one contact."""
+    """Returns the maximum distance, in meters, that a toe slides during a single contact."""
     toes = motion.world()[:, [leg[-1] for leg in FEET]][..., [0, 2]]
     distances = [0.0]
     for foot in range(2):

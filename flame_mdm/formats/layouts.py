@@ -84,7 +84,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The names of those joints in the files that the map uses."""
+        """The names of the joints in the files that the map uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -94,9 +94,9 @@ class Layout(BaseModel):
 
     @property
     def bones(self) -> Mapping[str, str]:
-        """For each SMPL joint, the bone in the files whose rotation it follows.
+        """For each SMPL joint, the name of the bone in the files whose rotation it follows.
 
-        The position of the joint may be the mean of several joints instead.
+        The joint's position, in contrast, may be the mean position of several joints.
         """
         return self._bones
 
@@ -106,16 +106,16 @@ class Layout(BaseModel):
         return self._rig
 
     def bone(self, joint: str) -> str:
-        """Returns the name, in the files, of the joint that turns like an SMPL joint.
+        """Returns the name of the joint in the files that turns in the same way as an SMPL joint.
 
-        This is the bone of the SMPL joint. If it has no bone, this is the joint with the largest
-        weight in its position.
+        This is the SMPL joint's bone or, if it has no bone, the joint with the largest weight in
+        its position.
         """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
-        """Returns the layout with a different map, under the name of a supported layout."""
+        """Returns the layout with a different map and with the name of a supported layout."""
         layout = self.model_copy(update={"map": dict(map)})
         layout._name = name
         return layout
@@ -123,7 +123,7 @@ class Layout(BaseModel):
     def ending(self, **ends: str) -> dict[str, Source]:
         """Returns a map in which some SMPL joints are the end sites of their parents.
 
-        Each keyword argument names such a joint and its parent, for example foot="ankle".
+        Each keyword argument consists of such a joint and its parent, for example foot="ankle".
         """
         return {
             side + joint: f"{self.map[side + parent]}.end"
@@ -132,7 +132,7 @@ class Layout(BaseModel):
         }
 
     def pairs(self) -> dict[str, str]:
-        """Returns the counterpart, on the other side, of each joint that the map uses.
+        """Returns each joint that the map uses, with its counterpart on the other side of the body.
 
         A joint without a counterpart is its own counterpart.
         """
@@ -146,7 +146,7 @@ class Layout(BaseModel):
         return pairs
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Maps joints (F, J, 3) with these names to SMPL's joints (F, 22, 3).
+        """Maps joints (F, J, 3), which have these names, to SMPL's joints (F, 22, 3).
 
         The result is float32, in meters, y up.
         """
@@ -247,10 +247,10 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 
 
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout and the joint names of a file that was read with `read_tree`.
+    """Returns the layout and joint names of a file that was read with `read_tree`.
 
     `fields` override the fields of the supported layout. If arrays with this skeleton are in
-    meters, BVH files are assumed to be in centimeters, as written by `flame_mdm.formats`.
+    meters, BVH files are assumed to be in centimeters, like those written by `flame_mdm.formats`.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
@@ -259,7 +259,7 @@ def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Seque
 
 
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
-    """Returns the layout and the joint names of an array (F, J, 3).
+    """Returns the layout and joint names of an array (F, J, 3).
 
     Both are taken from `fields` or determined by the number of joints.
     """
@@ -292,9 +292,9 @@ def layout_name(layout: Layout) -> str:
 
 
 def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the supported layout for joints with these names, with the changes in `fields`.
+    """Returns the supported layout for joints with these names, modified by `fields`.
 
-    The map in this layout uses the `names`, which are matched as in `flame_mdm.formats.names`.
+    The layout's map uses the given `names`, which are matched as in `flame_mdm.formats.names`.
 
     Raises:
         UserError: If no layout fits, or if a name could refer to several joints.
@@ -348,7 +348,7 @@ def _renamed(source: Source, names: Mapping[str, str]) -> Source:
 def skeleton_file(path: Path) -> Path | None:
     """Returns the nearest `skeleton.yaml` in a file's folder or its parent folders.
 
-    Raises `UserError` if that path is not a regular file.
+    Raises `UserError` if this `skeleton.yaml` is not a regular file.
     """
     for folder in path.absolute().parents:
         if os.path.lexists(folder / "skeleton.yaml"):
@@ -358,7 +358,7 @@ def skeleton_file(path: Path) -> Path | None:
 
 
 def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
-    """Returns the fields of `Layout` from a file's `skeleton_file`.
+    """Returns the fields of `Layout` that a file's `skeleton_file` contains.
 
     `up` (y, z or -y) overrides the up axis.
     """
@@ -371,7 +371,7 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 def read_skeleton(path: Path) -> dict[str, Any]:
     """Reads fields of `Layout` from a skeleton file.
 
-    If a field is invalid, raises a `UserError` that names the file and the key.
+    Raises a `UserError` that names the file and the key if a field is invalid.
     """
     try:
         fields = Layout.model_validate(read_yaml(path)).model_dump(exclude_unset=True)
@@ -390,7 +390,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
 
 
 def leg_length(joints: np.ndarray) -> float:
-    """Returns the mean length of the left leg, from hip to knee to ankle, in meters.
+    """Returns the mean length, in meters, of the left leg from hip to knee to ankle.
 
     `joints` (F, 22, 3) are the positions of SMPL's joints.
     """
@@ -409,10 +409,11 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
         joints: (F, 22, 3), positions of SMPL's joints in meters.
         unit: meters per unit of length in the file.
         children: whether the person may be a child.
-        doubt: a line about another problem with the motion, to be added to the error message.
+        doubt: a line about another problem with the motion, which is added to the error message.
 
     Raises:
-        UserError: If the leg length is not plausible for a person. The message suggests a unit.
+        UserError: If the length of the legs is implausible for a person. The message suggests a
+            unit.
     """
     leg, shortest = leg_length(joints), CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:
@@ -482,12 +483,12 @@ def check_feet(joints: np.ndarray) -> None:
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
     """Checks that an array does not contain another skeleton with the same number of joints.
 
-    The limbs of a person have the same length on both sides, and this length does not change. If
-    the joint order or the skeleton is wrong, the pairs of joints that are compared are not limbs.
+    A person's limbs have the same length on both sides, and their lengths do not change. If the
+    joint order or the skeleton is wrong, the compared pairs of joints are not limbs.
 
     Args:
-        joints: (F, 22, 3), positions of SMPL's joints under the assumption that the array has the
-            joints of the skeleton.
+        joints: (F, 22, 3), positions of SMPL's joints, on the assumption that the array contains
+            the joints of the skeleton.
         count: number of joints in the array.
         skeleton: name of the skeleton.
 
@@ -513,6 +514,6 @@ def _bone(joints: np.ndarray, start: str, end: str) -> float:
 
 
 def _lengths(joints: np.ndarray, start: str, end: str) -> np.ndarray:
-    """Returns the distances (F,) between two of SMPL's joints."""
+    """Returns the distance between two of SMPL's joints in each frame."""
     first, last = (joints[:, SMPL22.joints.index(name)].astype(float) for name in (start, end))
     return np.linalg.norm(first - last, axis=1)

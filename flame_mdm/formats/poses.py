@@ -48,7 +48,7 @@ SQUARINGS = 12
 
 @dataclass(eq=False)
 class Poses:
-    """A moving body, given by its rest pose and rotations, in meters, y up.
+    """A moving body, defined by its rest pose and rotations, in meters, y up.
 
     The rest pose is SMPL's rest pose: arms to the sides, facing +z, left at +x.
     """
@@ -65,15 +65,14 @@ class Poses:
         return forward_kinematics(SMPL22, self.rotations, self.offsets, self.root)
 
     def rest(self) -> Tensor:
-        """Returns the joints (22, 3) of the rest pose, with the lowest joint on the floor."""
+        """Returns the joints (22, 3) in the rest pose, with the lowest joint on the floor."""
         joints = SMPL22.assemble(self.offsets, self.offsets.new_zeros(3))
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
 
     def resampled(self, rate: float, fps: float) -> "Poses":
         """Returns the motion at `fps` instead of `rate` frames per second.
 
-        Rotations are interpolated on the sphere; the path of the pelvis is interpolated by cubic
-        splines.
+        Rotations are interpolated on the sphere, and the path of the pelvis by cubic splines.
         """
         if math.isclose(rate, fps):
             return self
@@ -90,10 +89,10 @@ class BoneRotations:
     """Rotations of SMPL's joints, taken from the bones of a file.
 
     Attributes:
-        poses: the rotations, on a body with the bones of the file. None if the file contains no
-            usable rotations.
-        reason: why the rotations in the file cannot be used, or "" if they can be used or the file
-            contains none.
+        poses: the rotations, for a body with the bone lengths of the file. None if the file
+            contains no usable rotations.
+        reason: why the rotations in the file cannot be used, or "" if they can be used or if the
+            file contains no rotations.
     """
 
     poses: Poses | None = None
@@ -101,11 +100,11 @@ class BoneRotations:
 
 
 def solve(joints: Tensor, fps: float) -> Poses:
-    """Computes a body and the rotations with which it reproduces joint positions in every frame.
+    """Computes a body, and the rotations with which the body reproduces the joint positions.
 
     Each bone has its mean length over the clip. The pelvis and the chest, which have three bones
-    each, receive the rotation that fits all three bones best (Kabsch 1976). Every other joint aims
-    its bone at the next joint.
+    each, receive the rotation that fits all three bones best (Kabsch 1976). The rotation of every
+    other joint points its bone at the next joint.
 
     Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
     twisted so that knees and elbows bend like hinges. The twist of the spine is distributed evenly
@@ -128,17 +127,17 @@ def solve(joints: Tensor, fps: float) -> Poses:
     if (lengths[1:] < 1e-4).any():
         name = SMPL22.joints[int(lengths[1:].argmin()) + 1]
         raise UserError(
-            f"the bone that ends in {name} has no length, so its direction is undefined"
+            f"the bone that ends at {name} has no length, so its direction is undefined"
         )
     offsets, quaternions = solve_checked(joints, fps)
     return Poses(offsets, rotation.quaternion_to_matrix(quaternions), joints[:, 0])
 
 
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
-    """Returns the results of `solve` as offsets (22, 3) and quaternions (F, 22, 4), without checks.
+    """Like `solve`, but without checks; returns offsets (22, 3) and quaternions (F, 22, 4).
 
-    Both results have the same precision as the joints. The function has no data-dependent branches
-    and solves similar joints in a single batch, so that its ONNX graph is small.
+    Both results have the same precision as the joints. The function has no data-dependent branches,
+    and it processes similar joints in a single batch so that its ONNX graph is small.
     """
     bones = SMPL22.bones(joints)
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
@@ -192,7 +191,7 @@ def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
 
 
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
-    """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
+    """Returns the quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
 
     The quaternions are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute
     orientation using unit quaternions"), computed by repeated squaring. If the bones have no

@@ -30,7 +30,7 @@ class Skeleton:
     parents: tuple[int, ...]
     # Kinematic chains of HumanML3D's inverse kinematics
     chains: tuple[tuple[int, ...], ...]
-    # (J, 3), unit vector in the rest direction of the bone that ends in each joint, or 0 for the
+    # (J, 3), unit vector in the rest direction of the bone that ends at each joint, or 0 for the
     # root. The vectors are taken from HumanML3D's `paramUtil.py`.
     raw_offsets: tuple[tuple[int, int, int], ...]
     # Indices of the right hip, left hip, right shoulder and left shoulder, which define the heading

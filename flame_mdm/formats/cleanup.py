@@ -189,7 +189,7 @@ def _keep_heights(motion: np.ndarray, before: np.ndarray, skeleton: Skeleton) ->
 
     When a sequence changes between two very different poses, for example from a crawl to a walk,
     the poses in between are averages of the two and have short bones. With bones of full length,
-    the limbs would go through the floor.
+    the limbs would pass through the floor.
     """
     legs = [chain[1:] for chain in skeleton.chains[:2]]
     for limb in (*legs, *(_arm(skeleton, side) for side in ("left", "right"))):

@@ -59,7 +59,7 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
 
 
 def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
-    """Appends a person's mesh, and returns the parts of the document that describe it."""
+    """Appends a person's mesh, and returns the document's entries for it."""
     light = np.rint(255 * (skin.colors / 255) ** 2.2)  # from screen colors to linear colors
     light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
     attributes = {

@@ -65,7 +65,7 @@ class GroundedMotion:
         return joints
 
     def with_world(self, joints: np.ndarray) -> "GroundedMotion":
-        """Returns a motion with the same root, but with other world joint positions (F, 22, 3)."""
+        """Returns the motion with the same root, but with new world joint positions (F, 22, 3)."""
         local = joints.copy()
         local[..., [0, 2]] -= self.path[:, None]
         return replace(self, local=turned(local, -self.heading[:, None]))
@@ -121,7 +121,7 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Derives from height and speed whether the left and right toes are planted (F, 2)."""
+    """Returns whether the left and right toes are planted (F, 2), judged by height and speed."""
     # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
     # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
@@ -170,7 +170,7 @@ def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Returns the first and last frame of each sequence of True values in `flags` (F,)."""
+    """Returns the first and last frame of each series of True values in `flags` (F,)."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0]))
     return [(begin, end - 1) for begin, end in edges.reshape(-1, 2).tolist()]
 
@@ -331,9 +331,9 @@ def slide(motion: GroundedMotion) -> float:
 
 
 def pivot(motion: GroundedMotion) -> float:
-    """Returns the maximum angle in degrees by which a foot turns during one contact.
+    """Returns the maximum angle, in degrees, by which a foot turns during a single contact.
 
-    The angle is measured about the vertical axis.
+    Only rotation about the vertical axis is measured.
     """
     joints = motion.world()
     angles = [0.0]

@@ -84,7 +84,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The names of the joints in the files that the map uses."""
+        """The names of the joints that the map uses in the files."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -213,7 +213,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @cache
 def _variants() -> dict[str, Layout]:
-    """Returns the supported layouts by name, including variants with end sites as toes or hands."""
+    """Returns the supported layouts, keyed by name, with variants that use end sites."""
     variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
     toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
     for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
@@ -398,7 +398,7 @@ def leg_length(joints: np.ndarray) -> float:
 
 
 def head_height(joints: np.ndarray) -> float:
-    """Returns the median height, in meters, of the head joint above each frame's lowest joint."""
+    """Returns the median height of the head joint above each frame's lowest joint, in meters."""
     return float(np.median(joints[:, SMPL22.joints.index("head"), 1] - joints[..., 1].min(1)))
 
 
@@ -438,7 +438,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
 
 
 def _usual_unit(leg: float, unit: float) -> str:
-    """Returns advice for a file whose leg length (`leg` meters) no common unit explains."""
+    """Returns advice for a leg length of `leg` meters that is wrong in every common unit."""
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"
@@ -481,7 +481,7 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Checks that an array does not contain another skeleton with the same number of joints.
+    """Checks that an array is not of another skeleton with the same number of joints.
 
     A person's limbs have the same length on both sides, and their lengths do not change. If the
     joint order or the skeleton is wrong, the compared pairs of joints are not limbs.

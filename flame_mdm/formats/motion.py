@@ -1,9 +1,9 @@
-"""`Motion`, a single motion independent of any model, and writers for motion files.
+"""`Motion`, a single motion that does not depend on any model, and the writers of motion files.
 
 `docs/formats.md` describes the files. The 6D rotations in the 263 features of HumanML3D are never
-exported, because they are not SMPL's rotations: they follow different chains and do not define the
-twist of a bone. Exported rotations are computed from joint positions (`flame_mdm.formats.poses`) or
-come from features and files that contain SMPL's rotations.
+exported, because they are not SMPL's rotations: they are based on different chains and do not
+define the twist of a bone. Exported rotations are either computed from joint positions
+(`flame_mdm.formats.poses`) or taken from features and files that contain SMPL's rotations.
 """
 
 import json
@@ -65,17 +65,17 @@ Programs draw a bone only if it has a tip.
 
 @dataclass(eq=False, repr=False)
 class Motion(PosedFigure):
-    """A single motion, independent of any model: generated, real, or read from a file.
+    """A single motion that does not depend on any model: generated, real, or read from a file.
 
     Attributes:
         joints, fps, skeleton, text, id, contacts: see `flame_mdm.visualize.body.Figure`. Joints
             are float32.
         poses: rotations of SMPL's joints, if known.
-        features: (F, D) float32 features in the units of the data, or empty if unknown.
+        features: (F, D) float32 features in the units of the data, or empty if there are none.
         representation: name of the representation to which the features belong.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
-        degenerate: number of frames in which the features determine no rotation for at least one
-            joint.
+        degenerate: number of frames in which the features do not determine the rotation of at least
+            one joint.
         parts: text, first frame and end (exclusive) of each part of a sequence; () if there is only
             one part.
         notes: lines for the user about the file that was read, for example about frames that were
@@ -141,9 +141,9 @@ class Motion(PosedFigure):
         """Writes a motion file and returns a line that describes it.
 
         Args:
-            path: the file. Its extension selects the format (docs/formats.md).
+            path: the file. Its extension determines the format (docs/formats.md).
             rest_pose: whether a `.bvh` file begins with a frame in the rest pose, in which the arms
-                point to the sides. Some programs expect this frame.
+                point to the sides. Some programs require this frame.
             rig: the skeleton of a `.bvh`, `.glb`, `.fbx` or USD file: a name from
                 `flame_mdm.formats.retarget.presets`. Default: SMPL's skeleton.
             character: your own character, as a file or as the result of `characters.read`. The
@@ -157,7 +157,7 @@ class Motion(PosedFigure):
             facts: additional entries for an `.npz` file, such as the seed.
 
         Raises:
-            UserError: If an argument is unknown or does not fit the file or the motion, or if
+            UserError: If an argument is unknown or does not apply to the file or the motion, or if
                 `.mp4` is requested and the av package is not installed.
         """
         path = Path(path)
@@ -200,9 +200,9 @@ class Motion(PosedFigure):
     def resampled(self, fps: float) -> "Motion":
         """Returns this motion at another frame rate, with the same duration.
 
-        Known rotations are interpolated on the sphere, so that bones keep their lengths. Without
-        rotations, joint positions are interpolated by cubic splines. Features are left out, because
-        they are valid at only one frame rate.
+        Known rotations are interpolated on the sphere, so that bones keep their lengths. If there
+        are no rotations, joint positions are interpolated by cubic splines. Features are left out,
+        because they are valid only at the original frame rate.
         """
         if math.isclose(self.fps, fps):
             return self
@@ -237,8 +237,8 @@ class Motion(PosedFigure):
     def show(self) -> Any:
         """Returns a player.
 
-        Jupyter notebooks display it. Elsewhere, the result is the path of an HTML page that opens
-        in any browser.
+        In a Jupyter notebook, the player is displayed. Elsewhere, the result is the path of an HTML
+        page that can be opened in any browser.
         """
         from flame_mdm.visualize import player_page
 
@@ -348,7 +348,7 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
 def _write_rigged(
     motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool
 ) -> str:
-    """Writes a .glb, .fbx or USD file with the moving skeleton and, if one fits, a skinned body."""
+    """Writes a .glb, .fbx or USD file with the moving skeleton and, if a body fits, its skin."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
     name = motion.text or motion.id or "motion"
@@ -383,7 +383,7 @@ def _write_character(motion: Motion, path: Path, character: Character | BvhChara
 
 
 def _write_vrma(motion: Motion, path: Path) -> str:
-    """Writes a .vrma file, which contains a motion for VRM avatars but no body."""
+    """Writes a .vrma file, which contains a motion for VRM avatars, but no body."""
     poses = motion.posed()
     fitted, _ = motion.try_fit()
     name = motion.text or motion.id or "motion"
@@ -424,7 +424,7 @@ LARGE_ERROR = 10
 
 
 def _error(motion: Motion, poses: Poses) -> str:
-    """Describes how far joint positions with constant bone lengths are from the motion's joints."""
+    """Describes how far the motion's joints move when all bone lengths are made constant."""
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()
     line = f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"

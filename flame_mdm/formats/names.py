@@ -3,8 +3,8 @@
 The Blender extension also contains this file, so it uses only the standard library.
 
 Programs spell the same joint in many ways: `mixamorig:LeftUpLeg`, `Character1_LeftUpLeg`, `Actor
-left up leg`, `L_UpLeg`. Case, separators, and a prefix that many joints share are ignored. The side
-may be marked at the beginning or the end of a name, by a letter or a word.
+left up leg`, `L_UpLeg`. Case, separators, and a prefix shared by many joints are ignored. A letter
+or a word at the beginning or the end of a name may mark the side.
 """
 
 import re
@@ -29,7 +29,7 @@ class Match(NamedTuple):
         skeleton: key of the skeleton.
         numbers: indices of the joints to which each name in the skeleton may refer. A name with
             several indices is ambiguous.
-        missing: names in the skeleton that match no joint.
+        missing: names in the skeleton that do not match any joint.
     """
 
     skeleton: str
@@ -45,8 +45,8 @@ def plain(name: str) -> str:
 def spellings(name: str, opposite: str) -> list[str]:
     """Returns the `plain` spellings of a name, beginning with the name itself.
 
-    `opposite` is the counterpart on the other side. The side may be marked by a letter or a word,
-    before or after the rest of the name: LeftHip, L_Hip, hip.L.
+    `opposite` is the name of the counterpart on the other side. A letter or a word before or after
+    the rest of the name may mark the side: LeftHip, L_Hip, hip.L.
     """
     name, opposite = plain(name), plain(opposite)
     options = [name]
@@ -64,7 +64,7 @@ def spellings(name: str, opposite: str) -> list[str]:
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
     """Returns a mapping from each spelling of a name (see `spellings`) to the name.
 
-    A spelling that two names share refers to the name that is spelled exactly like it.
+    If two names share a spelling, the spelling refers to the name that is spelled exactly so.
 
     Args:
         pairs: for each name, its counterpart on the other side, or the name itself.
@@ -82,11 +82,11 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
     """Returns the skeleton that best matches a list of joint names.
 
-    Skeletons without missing joints are preferred, then skeletons with more matching names, then
-    earlier ones. If several prefixes match equally well, the match is ambiguous.
+    Skeletons without missing joints are preferred, then those with more matching names, then those
+    listed earlier. If several prefixes match equally well, the match is ambiguous.
 
     Args:
-        names: joint names in a file. There must be at least one.
+        names: joint names in a file. At least one is required.
         skeletons: for each skeleton, a mapping from spellings of a joint to the joint's name in the
             skeleton. The first spelling is preferred.
     """
@@ -123,7 +123,7 @@ def _match(key: str, skeleton: Mapping[str, str], by_name: Mapping[str, list[int
 
 
 def _prefixes(names: Sequence[str]) -> list[str]:
-    """Returns "" and the prefixes, up to a separator, that at least `SHARED` names share.
+    """Returns "", and the prefixes (up to a separator) that at least `SHARED` names share.
 
     The most frequent prefix comes first.
     """

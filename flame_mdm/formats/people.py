@@ -1,6 +1,6 @@
-"""Bodies by name: the mannequin, the body in a file, and people of all shapes from Anny.
+"""Loads bodies by name: the mannequin, the body in a file, and Anny's people of all shapes.
 
-Anny's shapes are given as numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
+Anny's shapes are specified by numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
 Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589, (c) 2025 NAVER Corp., Apache-2.0.
 Anny's shapes and weights come from MakeHuman and MPFB2 (CC0). Anny can also download topologies of
 SMPL and SMPL-X, which are not free for commercial use. This project never uses these topologies.
@@ -73,7 +73,7 @@ CLOTHES = {
 
 
 def load_body(name: str) -> Mesh:
-    """Returns a body by its name.
+    """Returns the body with the given name.
 
     The name is "mannequin", a file, or "anny" with shape parameters, such as "anny gender=1
     age=0.9". Creating the first Anny body takes about 90 seconds. Each body is saved in the user's
@@ -100,7 +100,7 @@ def _cache() -> Path:
 
 
 def shape_of(words: list[str]) -> dict[str, float]:
-    """Returns the shape parameters given by words such as age=0.9."""
+    """Parses shape parameters from words such as age=0.9."""
     shape = dict(SHAPE)
     for word in words:
         key, _, value = word.partition("=")
@@ -192,8 +192,8 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
 def _turns(joints: np.ndarray) -> np.ndarray:
     """Returns world rotations (22, 3, 3) from SMPL's rest pose to Anny's rest pose.
 
-    `joints` (22, 3) are in Anny's rest pose. Pelvis, chest and head keep their direction, and the
-    feet stay level. The arms are twisted so that the elbows bend like SMPL's.
+    `joints` (22, 3) are in Anny's rest pose. The pelvis, chest and head keep their directions, and
+    the feet stay level. The arms are twisted so that the elbows bend like SMPL's.
     """
     turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     usual = np.array(ADULT)
@@ -215,7 +215,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 
 
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns the color (V, 3), from 0 to 255, of each vertex, based on the joint that it follows.
+    """Returns vertex colors (V, 3), from 0 to 255, based on the joints that the vertices follow.
 
     The hair has the shape of the mannequin's hair.
     """
@@ -232,7 +232,7 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns how far points on the head lie inside the hair region.
+    """Returns how far points on the head lie inside the region of the hair.
 
     This region is above the forehead and behind the ears.
     """
@@ -253,8 +253,8 @@ def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) ->
     """Adds helper bones to skinning weights, and returns the new weights (V, 28).
 
     The upper part of a limb follows a helper bone that turns less about the limb's axis. The lower
-    part of the forearm follows a helper bone that takes over part of the wrist's twist. `joints`
-    (22, 3) are the joint positions of the mesh.
+    part of a forearm follows a helper bone that takes on part of the wrist's twist. `joints` (22,
+    3) are the joint positions of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:

@@ -220,7 +220,7 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
 def _twist(
     group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float
 ) -> Tensor:
-    """Returns quaternions (F, G, 4) that rotate limbs about their axes until their hinges match.
+    """Returns quaternions (F, G, 4) that twist limbs about their axes so that their hinges match.
 
     Args:
         group: the G joints at which the limbs begin.
@@ -252,7 +252,7 @@ def _twist(
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
-    """Smooths values (F, N) over time with a Gaussian whose standard deviation is `frames`."""
+    """Smooths values (F, N) over time with a Gaussian; `frames` is its standard deviation."""
     reach = int(4 * frames + 0.5)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / frames) ** 2).to(x)
     padded = torch.cat([x[:1].expand(reach, -1), x, x[-1:].expand(reach, -1)])

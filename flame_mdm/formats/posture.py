@@ -31,8 +31,8 @@ def complete(
         world: (F, 22, 3, 3), world rotations of the joints.
 
     Returns:
-        The rotation (22, 3, 3) of each body part in the rest pose, the world rotations (F, 22, 3,
-        3) of the parts, and the offsets (22, 3) of a body that stands on flat feet.
+        The rotations of the body parts in the rest pose (22, 3, 3), their world rotations in each
+        frame (F, 22, 3, 3), and the joint offsets (22, 3) of the body on flat feet.
     """
     # A person standing upright is assumed to look straight ahead. Therefore, the median direction
     # from neck to head, relative to an upright chest, is the direction of a level head. The toes
@@ -57,7 +57,7 @@ def complete(
 
 
 def world_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Converts rotations (..., 22, 3, 3) relative to the parents to world rotations."""
+    """Converts rotations relative to the parents (..., 22, 3, 3) to world rotations."""
     world = rotations.copy()
     for parent, joint in SMPL22.edges:
         world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
@@ -65,7 +65,7 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 
 
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Returns orthonormal axes as rows (3, 3).
+    """Returns three orthonormal axes as the rows of a matrix (3, 3).
 
     The rows are the normalized direction, the normalized part of `u` that is orthogonal to it, and
     the cross product of the two.
@@ -107,7 +107,7 @@ def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.nda
 
 
 def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Returns the rotations (F, 3, 3) of the toes relative to a foot.
+    """Returns the rotations of the toes relative to a foot, with shape (F, 3, 3).
 
     `foot` (F, 3, 3) contains the world rotations of the foot.
     """

@@ -1,7 +1,7 @@
 """The reader for motion files; the writers are in `flame_mdm.formats.motion`.
 
-`docs/formats.md` describes the files. Commands, data sets and the Python API all use this reader,
-so a file is always read with the same skeleton, frame rate and checks.
+`docs/formats.md` describes the files. The commands, data sets and the Python API all use this
+reader, so that a file always has the same skeleton and frame rate and passes the same checks.
 """
 
 import math
@@ -74,8 +74,8 @@ class Doubts:
     """Properties of a motion that look wrong but may be intended.
 
     Attributes:
-        upright: mean vertical component of the trunk direction, from -1 to 1. It is NaN (not
-            measured) for files from this project and for KIT-ML's skeleton.
+        upright: mean vertical component of the trunk direction, from -1 to 1. NaN (not measured)
+            for files from this project and for KIT-ML's skeleton.
         lying: a message if the body is lying, otherwise "".
         jump: a message if the body jumps or a leg flips, otherwise "".
     """
@@ -92,12 +92,12 @@ class Doubts:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A motion that was read from a file, with further results of the reader.
+    """A motion that was read from a file, and additional information from the reader.
 
     Attributes:
         motion: the motion. Its notes are lines for the user.
         layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
-        doubts: properties that look wrong. They are also listed in the notes of the motion.
+        doubts: properties that look wrong, which the motion's notes also list.
         smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, or
             None if the file contains no such rotations.
         tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
@@ -125,12 +125,13 @@ def read(
     animations in `.fbx`, `.glb`, `.vrm` and `.vrma` files; and `.amc`, `.json` and `.npy` files.
 
     Args:
-        path: the file. The nearest `skeleton.yaml`, in its folder or above it, describes the file,
-            except for files written by this project. `fps`, `unit` and `up` override it.
+        path: the file. Unless this project wrote the file, it is described by the nearest
+            `skeleton.yaml` in its folder or the parent folders. `fps`, `unit` and `up` override
+            this description.
         fps: frames per second; overrides the rate in the file. .npy and .amc files contain no frame
             rate.
-        unit: meters per unit of length in the file. It does not apply to files with SMPL's
-            rotations, such as AMASS's files.
+        unit: meters per unit of length in the file. Does not apply to files with SMPL's rotations,
+            such as AMASS's files.
         up: the up axis of the file: y, z or -y.
         resample_to: target frame rate; None = the frame rate of the file. Rotations are
             interpolated on the sphere, and joint positions and translations by cubic splines.
@@ -138,7 +139,7 @@ def read(
             animation.
 
     Returns:
-        The motion. Its `notes` state what was left out or looks wrong.
+        The motion. Its `notes` state what was left out and what looks wrong.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -167,9 +168,10 @@ def read_recording(
 ) -> Recording:
     """Reads and checks a motion; see `read` for arguments and errors.
 
-    With `as_smpl`, all arrays are mapped to SMPL's 22 joints. Otherwise, KIT-ML's 21 joints and
-    SMPL's hands are kept. `standard` is a function that changes the joint tree of a published data
-    set. If it is given, the root is resampled linearly, as in the published version.
+    If `as_smpl` is set, all arrays are mapped to SMPL's 22 joints. Otherwise, arrays with KIT-ML's
+    21 joints or with SMPL's hands keep their joints. `standard` is a function that changes the
+    joint tree of a published data set. With such a function, the root is resampled linearly, as in
+    the published version.
     """
     path = Path(path)
     if path.suffix.lower() not in ENDINGS:
@@ -199,7 +201,7 @@ def read_recording(
 def from_array(joints: Any, fps: float | None) -> Motion:
     """Converts joints (F, J, 3) in meters, y up, to a motion.
 
-    The number of joints determines the built-in skeleton.
+    The skeleton is the built-in skeleton with the same number of joints.
     """
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not is_real(values):
@@ -273,7 +275,7 @@ def _of_scene(
 ) -> Recording:
     """Reads the recording in a file with animated nodes.
 
-    Its positions are in meters, y up, unless `fields` specify otherwise.
+    The positions are in meters, y up, unless `fields` specify otherwise.
     """
     _refuse(fields, ["joints"], "FBX and GLB files contain the names of their joints")
     scene = scenes.read(path, animation)
@@ -305,7 +307,7 @@ def _of_joints(
 ) -> Recording:
     """Converts an array of joints to a recording.
 
-    `said` contains the keys that were set in the command. They override the keys in the file.
+    `said` contains the keys that were set in the command, which override the keys in the file.
     """
     rate, joints = _rate(data, rate, fields), data["joints"]
     stated = {key: data[key] for key in ("up", "unit") if key in data}
@@ -394,7 +396,7 @@ def _of_ours(
 ) -> Recording:
     """Returns the recording in a file that this project wrote.
 
-    Such a file is in meters, y up, and contains rotations and features.
+    Such a file is in meters, y up, and may contain rotations and features.
     """
     for key, value in said.items():
         raise UserError(
@@ -424,7 +426,7 @@ def _of_ours(
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
     """Returns the frame rate of arrays.
 
-    The sources, in order of priority, are the command, the file, and skeleton.yaml.
+    The command takes precedence over the file, and the file over skeleton.yaml.
     """
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
@@ -435,7 +437,7 @@ def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]
 
 
 def _checked(fields: dict[str, Any]) -> dict[str, Any]:
-    """Checks and returns fields of `Layout`, some of which may come from a JSON file."""
+    """Checks and returns the fields of `Layout`, some of which may come from a JSON file."""
     try:
         Layout(**{key: value for key, value in fields.items() if key in ("up", "unit")})
     except ValueError as error:
@@ -447,7 +449,7 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: str) -> None:
-    """Raises `UserError` if a key that has no effect on the file is set."""
+    """Raises `UserError` if a key is set that has no effect on the file."""
     for key in without_effect:
         if key in fields:
             raise UserError(
@@ -490,7 +492,7 @@ def _resampled(motion: Motion, fps: float | None) -> Motion:
 def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Returns the pelvis positions (F, 3) and rotation matrices (F, 24, 3, 3).
 
-    `smpl` consists of a translation and quaternions.
+    `smpl` consists of the translation and the quaternions.
     """
     translation, turns = smpl
     return translation + torch.tensor(PELVIS, dtype=torch.float64), rotation.quaternion_to_matrix(
@@ -520,7 +522,7 @@ def _smpl_poses(pelvis: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
 
 
 def _poses(data: dict[str, Any]) -> Poses | None:
-    """Returns the rotations stored with joints, from AMASS arrays or SMPL features.
+    """Returns the rotations that a file with joints contains as AMASS arrays or SMPL features.
 
     HumanML3D features contain no such rotations.
     """

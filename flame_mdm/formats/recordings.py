@@ -28,7 +28,7 @@ def is_at_60(trial: str) -> bool:
 def known_rate(name: str, skeleton: str, fps: float) -> float | None:
     """Returns the frame rate of a recording if its name and skeleton show that `fps` is wrong.
 
-    BVH conversions state 120 frames per second for nearly all of CMU's recordings.
+    BVH conversions specify 120 frames per second for nearly all of CMU's recordings.
     """
     trial = TRIAL.search(name)
     if (

@@ -1,7 +1,6 @@
-"""Frame rates, lengths and resampling of motions.
+"""Checks of frame rates and lengths, and resampling of motions.
 
-Frame rates and lengths are limited, because even a file of a few bytes can declare arbitrary
-values.
+Frame rates and lengths are limited, because even a file of a few bytes can declare any values.
 """
 
 import math
@@ -56,7 +55,7 @@ def check_frames(frames: int) -> None:
 def check_tree(frames: int, joints: int, size: int) -> None:
     """Raises `UserError` if a file of `size` bytes has too many frames for its number of joints.
 
-    Each joint takes up memory in each frame, even if the file contains no numbers for it.
+    Each joint requires memory in each frame, even if the file contains no numbers for the joint.
     """
     check_frames(frames)
     most = min(MAX_POSITIONS, max(FEW_POSITIONS, size // BYTES_PER_POSITION))
@@ -96,9 +95,9 @@ def frame_pairs(
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
     """Resamples positions (F, ...) from `rate` to `fps` frames per second.
 
-    Returns F' = floor((F - 1) fps / rate) + 1 frames. With `cubic`, values between frames lie on a
-    cubic spline, and bones keep their lengths to within 0.1 %. Otherwise, values are interpolated
-    linearly.
+    The result has F' = floor((F - 1) fps / rate) + 1 frames. If `cubic` is set, values between
+    frames lie on a cubic spline, and bones keep their lengths to within 0.1 %. Otherwise, values
+    are interpolated linearly.
     """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
     if cubic:
@@ -110,7 +109,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Evaluates the cubic spline through values (F, ...) at `times` (N,).
 
-    Times are in frames, and the values are at times 0, 1, ...
+    Times are measured in frames, and the values are those at times 0, 1, ...
     """
     from scipy.interpolate import CubicSpline  # imported here, because few motions need it
 

@@ -31,12 +31,12 @@ Common poses are bent limbs, a hanging arm, and a body that turns or bows.
 
 @cache
 def presets() -> dict[str, dict[str, Any]]:
-    """Returns the skeletons in `rigs.yaml` by name."""
+    """Returns the skeletons in `rigs.yaml`, keyed by name."""
     return read_package_yaml(Path(__file__).with_name("rigs.yaml"))
 
 
 def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the joint names of a skeleton in `rigs.yaml`, without their prefix, by SMPL joint."""
+    """Returns a `rigs.yaml` skeleton's joint names, without their prefix, keyed by SMPL joint."""
     names = {}
     for part, side, mark in _parts(skeleton):
         bones = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
@@ -47,7 +47,8 @@ def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
 def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a skeleton in `rigs.yaml`.
 
-    Each part consists of its key, the prefix of SMPL's joints, and the side mark in joint names.
+    For each part, yields its key, the prefix of SMPL's joints, and the mark of the side in joint
+    names.
     """
     yield "trunk", "", ""
     for side, mark in zip(("left_", "right_"), skeleton["sides"], strict=True):
@@ -55,7 +56,7 @@ def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def preset(name: str | None, poses: Poses) -> Rig:
-    """Returns a skeleton from `rigs.yaml`, or SMPL's (None), with the bone lengths of a body."""
+    """Returns a skeleton from `rigs.yaml` (None = SMPL's skeleton) with a body's bone lengths."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
         return Rig(
@@ -119,8 +120,8 @@ def preset(name: str | None, poses: Poses) -> Rig:
 class _RigJoint(NamedTuple):
     """A joint of a rig in the rest pose.
 
-    Its fields are its name, the index of its parent, the index of the SMPL joint that it follows
-    (or -1), its position, its world rotation, and its neutral rotation.
+    The fields are the joint's name, the index of its parent, the index of the SMPL joint that it
+    follows (or -1), its position, its world rotation, and its neutral rotation.
     """
 
     name: str
@@ -132,7 +133,7 @@ class _RigJoint(NamedTuple):
 
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
-    """Returns the local axes (3, 3) of a joint in a T-pose; `bone` is the bone's direction."""
+    """Returns a joint's local axes (3, 3) in a T-pose; `bone` is the bone's direction."""
     # Gram-Schmidt: the first direction is kept, its component is removed from the second direction,
     # and the third axis is their cross product. The right side is the mirror image of the left
     # side. In "opposed" skeletons, all three axes are then reversed, which keeps them right-handed.
@@ -158,8 +159,8 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
     """Applies a motion to a skeleton.
 
     Returns:
-        The local rotations (F, J, 3, 3), as in `Rig.local`, and the world position of the hips (F,
-        3).
+        The local rotations (F, J, 3, 3), as in `Rig.local`, and the world positions (F, 3) of the
+        hips.
     """
     return rig.local(rig.turned(world_rotations(poses.rotations.numpy()))), poses.root.numpy()
 
@@ -174,7 +175,7 @@ def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> T
         orders: order of the Euler angles of each joint, such as "ZXY".
 
     Returns:
-        Angles (F, J, 3).
+        The angles (F, J, 3).
     """
     # Each rotation is described by two triples of Euler angles, (a, b, c) and (a + pi, pi - b, c +
     # pi), and full turns may be added to each angle. In each frame, the triple nearest to the

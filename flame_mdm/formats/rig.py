@@ -67,7 +67,7 @@ class Rig:
         return self.sources.index(0)
 
     def offsets(self) -> np.ndarray:
-        """Returns the position (J, 3) of each joint relative to its parent.
+        """Returns the joint positions relative to the parents, with shape (J, 3).
 
         A root's position is in the world coordinates of the file.
         """
@@ -84,7 +84,7 @@ class Rig:
         return (positions - self.positions[parent]) @ self.turns[parent] / scale
 
     def rest(self) -> np.ndarray:
-        """Returns the rotation (J, 3, 3) of each joint relative to its parent.
+        """Returns the joint rotations relative to the parents, with shape (J, 3, 3).
 
         A root's rotation is relative to the world coordinates of the file.
         """
@@ -93,7 +93,7 @@ class Rig:
     def local(self, turned: np.ndarray) -> np.ndarray:
         """Converts world rotations (..., J, 3, 3) to rotations relative to the parents.
 
-        A root's rotation becomes relative to the world coordinates of the file.
+        The resulting rotation of a root is relative to the world coordinates of the file.
         """
         local = turned.copy()
         for joint, parent in enumerate(self.parents):
@@ -134,7 +134,7 @@ def recognized(
 ) -> dict[str, list[int]]:
     """Returns the indices of the joints that may correspond to each SMPL joint.
 
-    The most similar known skeleton determines the correspondence.
+    The correspondence is taken from the most similar known skeleton.
 
     Args:
         names: joint names by index.
@@ -173,7 +173,7 @@ def matched(
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """A character's skeleton in its rest pose, y up, facing +z, in the unit of the character."""
+    """A character's skeleton in its rest pose, y up, facing +z, in the character's unit."""
 
     # The skeleton, whose neutral rotations `fitted` replaces for a motion
     rig: Rig
@@ -183,7 +183,7 @@ class RestPose:
     floor: float
 
     def position(self, joint: str) -> np.ndarray:
-        """Returns the position (3,) of an SMPL joint in the rest pose."""
+        """Returns an SMPL joint's position (3,) in the rest pose."""
         return self.rig.positions[self.map[joint]]
 
 
@@ -206,7 +206,7 @@ def rest_pose(
         positions: (J, 3), joint positions in world coordinates with any unit and orientation.
         turned: (J, 3, 3), joint rotations in these coordinates.
         joints: index of the character's joint for each SMPL joint.
-        lowest: points in these coordinates, among them the lowest point of the character.
+        lowest: points in these coordinates, including the lowest point of the character.
         vertical: (3,), the up direction in these coordinates.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
@@ -269,9 +269,9 @@ def rest_pose(
 
 
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
-    """Returns the skeleton with neutral rotations that turn its limbs to SMPL's rest pose.
+    """Returns the skeleton with neutral rotations that move its limbs to SMPL's rest pose.
 
-    `offsets` (22, 3) are the offsets of SMPL's joints from their parents at rest.
+    `offsets` (22, 3) are the positions of SMPL's joints relative to their parents in the rest pose.
     """
     # Each bone of a limb is turned from the character's rest pose to SMPL's. First its direction is
     # matched, then its twist, so that knees and elbows bend about the same axis. A limb that is
@@ -322,8 +322,8 @@ def follow(
         world: (F, 22, 3, 3), world rotations of the body parts.
 
     Returns:
-        The world rotations (F, J, 3, 3) and the positions (F, J, 3) of the character's joints, and
-        the character's skeleton.
+        The world rotations (F, J, 3, 3) and positions (F, J, 3) for the joints of the character,
+        and the character's skeleton.
     """
     # All joints take the rotations of the body, relative to the rest poses. The hips follow the
     # scaled path. If the legs have different proportions, the feet would then hover or sink.

@@ -1,4 +1,4 @@
-"""Moving skeletons of other programs, with the skin of a person, for .glb, .fbx and USD files.
+"""Moving skeletons of other programs, with a person's skin, for .glb, .fbx and USD files.
 
 Lengths are in meters, and y is up. The rest pose faces +z. F, J and V are the numbers of frames,
 joints and vertices.
@@ -28,7 +28,7 @@ class Material:
     Attributes:
         name: the name of the material.
         color: red, green and blue from 0 to 1, in the color space of screens.
-        image: content of a PNG or JPEG file. Its colors are multiplied by `color`. Empty = no
+        image: content of a PNG or JPEG file, whose colors are multiplied by `color`. Empty = no
             image.
     """
 
@@ -96,7 +96,7 @@ class RiggedClip:
         offsets: (J, 3), position of each joint relative to its parent in the rest pose.
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to the parents.
-        moves: positions (F, 3) relative to the parent, for each joint whose position changes.
+        moves: for each joint whose position changes, its positions (F, 3) relative to the parent.
         lift: the thickness of the soles, by which a person is raised above these positions.
         skins: the skinned meshes; () if no person fits the motion.
         scales: (J,), scale of each joint: units of its parent per unit of the joint.
@@ -135,12 +135,12 @@ class RiggedClip:
         return positions, turns
 
     def part(self, frames: slice, name: str, contacts: np.ndarray) -> "RiggedClip":
-        """Returns some frames of the clip under a new name, with their `contacts` (F, 2)."""
+        """Returns some frames of the clip as a clip `name`, with their `contacts` (F, 2)."""
         moves = {joint: moved[frames] for joint, moved in self.moves.items()}
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
     def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Returns the frames (K,) in which each of `CONTACTS` changes, and the new values (K,).
+        """For each of `CONTACTS`, returns the K frames in which it changes, and its new values.
 
         The first frame is always included. The result is empty if the contacts are unknown.
         """
@@ -179,7 +179,7 @@ class RiggedClip:
     def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
         """Returns `offsets` and `moves` with the person standing on the soles.
 
-        The hips are lifted, while a root stays on the floor.
+        The hips are lifted, but a root on the floor stays there.
         """
         offsets = self.offsets.copy()
         moves = {joint: moved.copy() for joint, moved in self.moves.items()}
@@ -233,9 +233,10 @@ def rigged(
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
-        fitted: the body of the person, whose toes bend as in rendered images. None = no skin.
-        root_motion: whether the root on the floor follows the hips and their direction. Otherwise,
-            it stays in place.
+        fitted: the person's body, whose toes bend in the same way as in rendered images. None = no
+            skin.
+        root_motion: whether the root on the floor follows the position and direction of the hips.
+            Otherwise, the root stays in place.
 
     Raises:
         UserError: If `root_motion` is set for a skeleton without a root on the floor.

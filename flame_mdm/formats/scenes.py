@@ -1,4 +1,4 @@
-"""Animations in FBX and GLB files, and the names of their nodes as joints of a skeleton."""
+"""Animations in FBX and GLB files, and joint names for their nodes."""
 
 import re
 from pathlib import Path
@@ -22,17 +22,17 @@ def read(path: Path, animation: str | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of the animations in a file. Raises `UserError` if the file is damaged."""
+    """Returns the names of all animations in a file. Raises `UserError` if the file is damaged."""
     reader = fbx_scene if path.suffix.lower() == ".fbx" else glb_animation
     return reader.animations(path)
 
 
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
-    """Returns a joint name for each node, as used in skeleton layouts.
+    """Returns a joint name for each node, in the form that skeleton layouts use.
 
     If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the
-    tip of a bone is always called `NAME.end`, like an end site in a BVH file, whatever its suffix
-    is in the file.
+    tip of a bone is always named `NAME.end`, like an end site in a BVH file, regardless of its
+    suffix in the file.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

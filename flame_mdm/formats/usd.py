@@ -160,7 +160,7 @@ def _mesh(stage: Any, skin: Skin) -> None:
 
 
 def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
-    """Declares the bounding box of the person in each frame, computed from the joints."""
+    """Declares the person's bounding box in each frame, which is computed from the joints."""
     from pxr import UsdGeom, Vt
 
     positions, _ = clip.world()  # scales are ignored, because the box only has to be large enough

@@ -1,8 +1,8 @@
-"""Atomic writes, hashes, locks, and safe reading of files from other people.
+"""Atomic writes, hashes, locks, and safe reading of files that come from other people.
 
-Files that may come from other people are first read or checked with this module. Such a file must
-be a regular file of limited size, and the sizes that it declares must match its actual size.
-Functions that read a path raise `FileNotFoundError` if it does not exist, and `UserError` if it is
+Files that may come from other people are always read or checked with this module first. Such a file
+must be a regular file of limited size, and the sizes that it declares must match its actual size.
+Functions that read a file raise `FileNotFoundError` if it does not exist, and `UserError` if it is
 not a regular file or if its content is rejected.
 """
 
@@ -70,10 +70,10 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # error numbers of 
 def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` at the end.
 
-    A failure leaves no files behind. The temporary name is unique, so several processes can write
-    the same file; the last one wins. A link at `path` is replaced, but its target is not changed.
-    Before this process writes its first file in the folder, temporary files that killed processes
-    left there are removed.
+    No files are left behind after a failure. The temporary name is unique, so several processes can
+    write the same file; the last one wins. If `path` is a link, the link is replaced, and its
+    target is not changed. Before this process writes its first file to the folder, temporary files
+    that killed processes left there are removed.
 
     Args:
         path: file to write.
@@ -100,9 +100,9 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
     """Yields a temporary folder whose files are moved to the folder `path` at the end.
 
-    Either all files are moved or none. If `path` exists, files with the same names are replaced,
-    and all other files are kept. Temporary folders that killed processes left behind are removed.
-    Links must not lead out of the folder `within`. The errors are the same as those of
+    Either all files are moved, or none are. If `path` exists, files with the same names are
+    replaced, and all other files are kept. Temporary folders that killed processes left behind are
+    removed. Links must not lead out of the folder `within`. Raises the same errors as
     `atomic_write`.
     """
     path = Path(path)
@@ -127,7 +127,7 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 def _temporary(path: Path) -> Iterator[Path]:
     """Yields a unique path next to `path`, and removes the file at this path at the end.
 
-    The folder is created. Error messages contain `path` instead of the unique path. An `OSError`
+    The folder is created if necessary. Error messages contain `path` instead of the unique path. An `OSError`
     about either path, or about a parent folder, is converted to a `UserError`.
     """
     temporary = path
@@ -151,16 +151,16 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _remove_abandoned_once(folder: Path) -> None:
-    """Removes files that killed processes left behind, once per folder and process.
+    """Removes files that killed processes left behind, but only once per folder and process.
 
-    Listing the folder for each of thousands of files would take too long.
+    Listing the folder again for each of thousands of files would take too long.
     """
     with suppress(PermissionError):  # a folder that cannot be listed
         remove_abandoned(folder)
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Returns why a file could not be written, and the free space if the disk may be full."""
+    """Explains why a file could not be written; states the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -175,7 +175,7 @@ def write_failure(error: BaseException, path: Path) -> str:
 def made_folder(folder: Path) -> Iterator[None]:
     """Creates a folder and its parents.
 
-    When the context ends, the created folders are removed if they are empty.
+    At the end of the context, the created folders are removed if they are empty.
     """
     created = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
@@ -205,9 +205,10 @@ def write_json(
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` that does not contain it.
+    """Adds the name of a file to every `UserError` whose message does not contain it.
 
-    The exceptions in `errors` are converted to `UserError`, with `prefix` before their message.
+    The exceptions in `errors` are converted to `UserError`, and `prefix` is added before their
+    messages.
     """
     try:
         yield
@@ -224,11 +225,11 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
     """Holds a lock file that names the process and the host.
 
     Yields the name of a dead process that left the file behind, or "". If another process holds the
-    lock, `busy` is called with the name of that process. Unless `busy` raises an error, this
-    function then waits for the lock. `advice` is part of the warning about file systems that do not
+    lock, `busy` is called with the name of that process, and then, unless `busy` raises an error,
+    this function waits for the lock. `advice` is part of the warning about file systems that do not
     support locks. When the process ends, for whatever reason, the operating system releases the
     lock. The lock is a POSIX record lock. Unlike the locks of `filelock`, such a lock also works
-    between hosts on NFS and Lustre, but it does not exist on Windows.
+    between hosts on NFS and Lustre, but it is not available on Windows.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:
@@ -269,12 +270,12 @@ def sha256(path: str | Path) -> str:
 
 
 def regular_file(path: str | Path, limit: int | None = None) -> int:
-    """Returns the size in bytes of a regular file or of the target of a link.
+    """Returns the size, in bytes, of a regular file or of the target of a link.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        UserError: If it cannot be read, is not a regular file, is larger than `limit` bytes, or is
-            a Git LFS pointer.
+        UserError: If the file cannot be read, is not a regular file, is larger than `limit` bytes,
+            or is a Git LFS pointer.
     """
     try:
         status = Path(path).stat()
@@ -331,7 +332,7 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON string.
+    """Returns the parsed content of a JSON string.
 
     Raises `ValueError` for content that `read_json` rejects.
     """
@@ -350,7 +351,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the plain content of a YAML file. Interpolations such as `${a}` remain text."""
+    """Returns the plain content of a YAML file. Interpolations such as `${a}` are kept as text."""
     import yaml
     from omegaconf import OmegaConf
 
@@ -370,8 +371,8 @@ def read_yaml(path: str | Path) -> Any:
 def read_package_yaml(path: Path) -> Any:
     """Returns the plain content of a YAML file that is part of the package.
 
-    LibYAML makes it fifteen times as fast as `read_yaml`, but it skips the checks for files from
-    other people.
+    Thanks to LibYAML, this is fifteen times as fast as `read_yaml`, but the checks for files from
+    other people are skipped.
     """
     import yaml
 
@@ -381,7 +382,7 @@ def read_package_yaml(path: Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of YAML nodes after aliases are expanded, or infinity if they are cyclic."""
+    """Returns the number of YAML nodes after aliases are expanded, or infinity if there are cycles."""
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""
@@ -402,10 +403,10 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 def read_npz(
     source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays, by name, in an .npz file, which may be a path or an open, seekable file.
+    """Returns the arrays in an .npz file, keyed by name.
 
     Args:
-        source: the file.
+        source: the path or an open, seekable file.
         skip: names of arrays not to read.
         only: names of the arrays to read; None = all arrays.
 
@@ -432,9 +433,9 @@ def read_npz(
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
     """Returns the array in an .npy file.
 
-    With `mmap`, the file is mapped into memory (read-only) instead of read, which requires a path.
-    Raises `UserError` if the file is damaged, contains objects, or exceeds the limits of this
-    module.
+    If `mmap` is set, the file must be given as a path, and it is mapped into memory (read-only)
+    instead of being read. Raises `UserError` if the file is damaged, contains objects, or exceeds
+    the limits of this module.
     """
     import numpy as np
 
@@ -449,7 +450,7 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
     """Yields an open file of arrays and its size.
 
-    Errors about damaged content are raised as `UserError`.
+    Errors caused by damaged content are converted to `UserError`.
     """
     with ExitStack() as stack:
         name = ""
@@ -467,9 +468,9 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
-    """Returns the number of elements in the array of an .npy file.
+    """Returns the number of elements of the array in an .npy file.
 
-    The header of the file must match its `size` in bytes.
+    The header must match the file's `size` in bytes.
     """
     from numpy.lib import format as npy
 
@@ -502,8 +503,8 @@ def opened_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
     """Opens a zip archive for reading.
 
     Raises `UserError` if the archive has more than `MAX_MEMBERS` members. The size of the archive's
-    directory is also limited, because `zipfile` reads it at once and creates an object for each
-    entry, even if the archive declares fewer entries.
+    directory is also limited, because `zipfile` reads the entire directory at once and creates an
+    object for each entry, even if the archive declares fewer entries.
     """
     directory = _DirectoryReader(file)
     with zipfile.ZipFile(cast(IO[bytes], directory)) as archive:
@@ -521,7 +522,7 @@ def check_members(count: int) -> None:
 
 
 class _DirectoryReader:
-    """A file that limits the number of bytes read at once, until `limit` is None."""
+    """A file that limits how many bytes are read at once, until `limit` is set to None."""
 
     def __init__(self, file: IO[bytes]):
         self.file, self.limit = file, DIRECTORY_LIMIT
@@ -536,7 +537,7 @@ class _DirectoryReader:
 
 
 def check_member(member: zipfile.ZipInfo) -> None:
-    """Raises `UserError` if a zip member is encrypted, or neither stored nor deflated.
+    """Raises `UserError` if a zip member is encrypted, or if it is neither stored nor deflated.
 
     `zipfile` limits the number of unpacked bytes only for such members.
     """

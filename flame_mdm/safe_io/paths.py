@@ -1,7 +1,7 @@
-"""Paths for safe writing to a folder that may contain files from other people.
+"""Paths for writing safely to a folder that may contain files from other people.
 
 Links must not lead out of the folder. A file that is written in place must not have a second name
-(hard link). Temporary names are unique.
+(a hard link). The names of temporary files are unique.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _tokens: set[str] = set()
 
 
 def check_within(path: str | Path, root: str | Path) -> None:
-    """Raises `UserError` if a link along a path leads out of the folder `root`."""
+    """Raises `UserError` if any link along a path leads out of the folder `root`."""
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
@@ -45,11 +45,11 @@ def check_within(path: str | Path, root: str | Path) -> None:
 
 
 def check_tree(folder: Path) -> None:
-    """Checks a folder from someone else before libraries write to it.
+    """Checks a folder that comes from someone else, before libraries write to it.
 
     Libraries open files in place, so they could change files outside the folder. Raises `UserError`
     if the folder contains a pipe, a device, a link that leads out of the folder, or a file with a
-    second name (hard link).
+    second name (a hard link).
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -71,9 +71,9 @@ def check_tree(folder: Path) -> None:
 def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
-    Writing in place would also change the target of a link, so links are not followed. Raises
-    `UserError` if the path is a link or not a regular file, or if the file has a second name (hard
-    link).
+    Writing in place would change the target of a link, so links are not followed. Raises
+    `UserError` if the path is a link or is not a regular file, or if the file has a second name (a
+    hard link).
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -124,10 +124,10 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
     Args:
         folder: folder of the temporary files and folders.
         path: the file or folder whose temporary files are removed. None = all temporary files in
-            the folder.
-        is_locked: whether this process holds the lock that writers of such files require. If it
-            does, files of processes on other machines are also removed. Otherwise, these files
-            remain, because their processes may still be alive.
+            the folder are removed.
+        is_locked: whether this process holds the lock that is required for writing such files. If
+            it does, files from processes on other machines are also removed. Otherwise, these files
+            are kept, because their processes may still be alive.
     """
     if not folder.is_dir():
         return

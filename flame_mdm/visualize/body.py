@@ -1,4 +1,4 @@
-"""Figures and bodies for players and pictures; a body is a mesh that is skinned to a motion."""
+"""Figures and bodies for players and images; a body is a mesh that is skinned to a motion."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
 
 @dataclass(eq=False, repr=False)
 class Figure:
-    """Moving joints to draw in players and pictures, such as a `flame_mdm.formats.motion.Motion`.
+    """Moving joints that players and images show, such as a `flame_mdm.formats.motion.Motion`.
 
     Attributes:
-        joints: (F, J, 3) joint positions in meters, y up, floor at y = 0.
+        joints: (F, J, 3), joint positions in meters, y up, with the floor at y = 0.
         fps: frames per second.
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
         text: the caption or the name of the action, or "" if there is neither.
-        id: name of the motion. This is the name of a clip or file or, for a generated motion, the
-            text and the sample number, which together determine the noise.
-        contacts: (F, N) bool, whether each joint of `skeleton.feet` is on the floor; None =
+        id: name of the motion: the name of a clip or file or, for a generated motion, the text and
+            the sample number, which together determine the noise.
+        contacts: (F, N) bool, whether each joint in `skeleton.feet` is on the floor; None =
             unknown.
     """
 
@@ -91,7 +91,7 @@ def head(skeleton: Skeleton) -> int | None:
 def radii(skeleton: Skeleton) -> list[float]:
     """Returns the radius of the body around each joint, in meters.
 
-    It increases with the joint's number of descendants.
+    The radius increases with the number of the joint's descendants.
     """
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
@@ -100,7 +100,7 @@ def radii(skeleton: Skeleton) -> list[float]:
 
 
 class Mesh:
-    """A closed mesh in its stored pose, an A-pose with the pelvis at the origin.
+    """A closed mesh in its stored pose, which is an A-pose with the pelvis at the origin.
 
     `tools/mannequin.py` writes the mannequin's mesh.
 
@@ -138,7 +138,7 @@ class Mesh:
 def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the four bones (V, 4) with the largest weights, and their integer weights (V, 4).
 
-    `weights` are (V, B). The integer weights of a vertex sum to 255.
+    `weights` have the shape (V, B). The integer weights of each vertex add up to 255.
     """
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     most = np.take_along_axis(weights, bones, 1)
@@ -149,19 +149,19 @@ def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def mannequin() -> Mesh:
-    """Returns the mannequin, the body that is part of the package."""
+    """Returns the mannequin, which is the body that comes with the package."""
     return Mesh(MANNEQUIN)
 
 
 def read_body(name: str) -> Mesh:
-    """Returns the mannequin or the body in a file. Raises `UserError` if the file is damaged."""
+    """Returns the mannequin, or the body that a file contains. Raises `UserError` if the file is damaged."""
     with naming(name, KeyError, ValueError, IndexError, prefix="not a body: "):
         return mannequin() if name == "mannequin" else Mesh(Path(name))
 
 
 @dataclass(frozen=True, eq=False)
 class FittedBody:
-    """A body (B = 28 bones) that has the bone lengths of a clip, and its motion over F frames."""
+    """A body with B = 28 bones and the bone lengths of a clip, and its motion over F frames."""
 
     mesh: Mesh
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the
@@ -182,7 +182,7 @@ class FittedBody:
     lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the vertices and normals (V, 3) in a frame, computed by linear blend skinning."""
+        """Returns a frame's vertices and normals (V, 3), computed by linear blend skinning."""
         turns = self.turns[frame]
         moves = self.starts[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
         blended = self.mesh.weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)

@@ -62,14 +62,14 @@ def player_page(
     Args:
         motions: the motions. Their skeletons, lengths and frame rates may differ.
         title: heading of the page.
-        about: HTML of a collapsible section below the heading of the page. Any text in it must
-            already be escaped.
+        about: HTML of a collapsible section below the heading of the page. Any text in this HTML
+            must already be escaped.
         columns: number of motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
-        beside: for each motion, the id of an earlier motion next to which it is shown, such as the
+        beside: for each motion, the id of an earlier motion that it is shown next to, such as the
             original of an edited motion; "" = none.
-        marks: for each motion, the spans to mark on the timeline. Each span consists of its first
-            frame, its end (exclusive), its kind and a description.
+        marks: for each motion, the spans of frames to mark on the timeline. Each span consists of
+            its first frame, its end (exclusive), its kind and a description.
         body: the body to draw; None = the mannequin.
     """
     blank = [""] * len(motions)
@@ -98,7 +98,7 @@ def player_page(
 def packed_motion(motion: Figure, begin: int = 0) -> dict[str, Any]:
     """Returns the frames of a motion for the player, starting at `begin`.
 
-    Frames before `begin` influence only the rotations.
+    Frames before `begin` only influence the rotations.
     """
     return _packed(motion, "", "", (), None, begin)
 
@@ -140,10 +140,10 @@ def _packed(
 
 
 def _packed_body(body: FittedBody, begin: int) -> dict[str, Any]:
-    """Returns the proportions of a body, and a 32-bit quaternion for each frame and bone.
+    """Returns a body's proportions, and a 32-bit quaternion for each frame and bone.
 
     The quaternions are accurate to about 0.1 degrees. The two highest bits indicate which of x, y,
-    z and w is largest. The other three components, which range from -0.71 to 0.71, follow in 10
+    z and w is largest. The other three components, which range from -0.71 to 0.71, follow with 10
     bits each.
     """
     quaternions = Rotation.from_matrix(body.turns[begin:].reshape(-1, 3, 3)).as_quat()

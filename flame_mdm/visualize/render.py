@@ -41,12 +41,12 @@ SMOOTH = 2  # images are drawn larger by this factor and then downscaled
 def write_gif(
     path: str | Path, motions: Sequence[Figure], size: int = 256, body: Mesh | None = None
 ) -> None:
-    """Writes a looping animation of motions side by side, with a caption below each.
+    """Writes a looping animation that shows motions side by side, with a caption below each.
 
     Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second, so the
-    highest frame rate of the motions is divided by the smallest integer for which the result is 50
-    or less. For example, 60 fps becomes 30, and 120 fps becomes 40. Motions that end earlier hold
-    their last frame. `body` is the body to draw; None = the mannequin.
+    highest frame rate of the motions is divided by the smallest integer that results in 50 or less.
+    For example, 60 fps becomes 30 fps, and 120 fps becomes 40 fps. Shorter motions hold their last
+    frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -67,7 +67,7 @@ def write_gif(
 def write_mp4(
     path: str | Path, motions: Sequence[Figure], size: int = 384, body: Mesh | None = None
 ) -> None:
-    """Writes the same animation as `write_gif`, but as H.264 video (yuv420p) at any frame rate."""
+    """Writes the animation of `write_gif` as an H.264 video (yuv420p) with any frame rate."""
     path = target(path, motions)
     try:
         av = import_module("av")
@@ -104,9 +104,10 @@ def contact_sheet(
     size: int = 192,
     body: Mesh | None = None,
 ) -> None:
-    """Writes one PNG image with a row per motion.
+    """Writes a PNG image with one row per motion.
 
-    Each row contains `frames` poses of `size` pixels, equally spaced in time, and a caption.
+    Each row contains a caption and `frames` poses, which are equally spaced in time and `size`
+    pixels wide.
     """
     path = target(path, motions)
     rows = []
@@ -146,9 +147,10 @@ def thumbnail(motion: Figure, height: int = 120) -> bytes:
 
 
 def _palette() -> Image.Image:
-    """Returns one palette for all frames, so that colors do not flicker.
+    """Returns a single palette for all frames, so that colors do not flicker.
 
-    The palette contains all colors, and the blends between them that occur at smoothed edges.
+    The palette contains all colors, as well as the blends between them that occur at smoothed
+    edges.
     """
     drawn = np.array(
         [*SIDE_COLORS.values(), *RIM_COLORS.values(), LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT]
@@ -167,7 +169,7 @@ def _palette() -> Image.Image:
 def _video(
     motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
 ) -> Iterator[Image.Image]:
-    """Yields an image of all panels, with a progress bar, for each 1 / fps seconds of motion."""
+    """Yields images of all panels and a progress bar, one for every 1 / fps seconds of motion."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]
@@ -198,7 +200,7 @@ def _video(
 
 
 def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> Image.Image:
-    """Draws one pose on the ground, as a body or skeleton.
+    """Draws a pose on the ground, as a body or a skeleton.
 
     The camera follows the smoothed root.
     """
@@ -290,12 +292,12 @@ def _shaded(normals: np.ndarray, colors: np.ndarray) -> np.ndarray:
 def _rasterize(
     image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray
 ) -> None:
-    """Draws triangles into an image. Each pixel shows the nearest triangle.
+    """Draws triangles on an image. Each pixel shows the triangle nearest to the camera.
 
-    Colors are interpolated between the corners. The image is (height, width, 3) uint8. The vertices
-    have pixel coordinates `at` (V, 2), y down, distances from the camera `depth` (V,), and `colors`
-    (V, 3) from 0 to 255. Triangles (T, 3) whose corners appear clockwise are seen from inside, so
-    they are not drawn.
+    Colors are interpolated between the corners. The image has the shape (height, width, 3) and the
+    type uint8. `at` (V, 2) are the pixel coordinates of the vertices, y down, `depth` (V,) are
+    their distances from the camera, and `colors` (V, 3) range from 0 to 255. Triangles (T, 3) whose
+    corners appear clockwise are seen from inside, so they are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
@@ -348,7 +350,7 @@ def _draw_skeleton(
     project: Callable[[np.ndarray], np.ndarray],
     rim: float,
 ) -> None:
-    """Draws limbs and a head at joints (J, 3), from far to near, with dark rims of `rim` pixels."""
+    """Draws a figure's limbs and head at joints (J, 3), from far to near, with dark rims of `rim` pixels."""
     at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []
@@ -373,7 +375,7 @@ def _capsule(
     color: Color | int,
     grow: float = 0,
 ) -> None:
-    """Draws a line with round ends, whose radius is `radius` meters plus `grow` pixels."""
+    """Draws a line with round ends; its radius is `radius` meters plus `grow` pixels."""
     (ax, ay, per_meter_a, *_), (bx, by, per_meter_b, *_) = a, b
     size_a, size_b = radius * per_meter_a + grow, radius * per_meter_b + grow
     pen.line([(ax, ay), (bx, by)], color, round(size_a + size_b))
@@ -386,7 +388,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> list[str]:
-    """Returns up to three caption lines, and one more line if no body fits the motion."""
+    """Returns up to three lines of the caption, and one more line if no body fits the motion."""
     lines, font = [""], _font(size)
     # The caption has room for three lines
     for word in shortened(motion.text or motion.id, width).split():

@@ -110,7 +110,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 
 
 def local_rotations(body: FittedBody) -> np.ndarray:
-    """Returns the rotations of a body's joints relative to their parents, (F, 22, 3, 3).
+    """Returns the rotations of a body's joints relative to the parents, with shape (F, 22, 3, 3).
 
     The bend of the toes is included.
     """
@@ -123,7 +123,7 @@ def local_rotations(body: FittedBody) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns a linear map (22, 3, 3) for each body part, and the scale of the body's width.
+    """Returns linear maps (22, 3, 3) for the body parts, and the scale of the body's width.
 
     In its rest pose, the mapped body has the same `offsets` (22, 3) as the clip.
     """

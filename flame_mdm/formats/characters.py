@@ -279,7 +279,7 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
-    """Writes a copy of the character's file with the motion, and returns a summary line.
+    """Writes a copy of the character's file that contains the motion; returns a summary line.
 
     The motion becomes the first animation in the file.
     """
@@ -325,7 +325,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 
 
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
-    """Writes a copy of the character's file with the motion, and returns a summary line."""
+    """Writes a copy of the character's file that contains the motion; returns a summary line."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
             f"{path}: a .bvh character has no meshes, so it can only be saved as a .bvh file"

@@ -169,7 +169,7 @@ class _Model:
 
 
 def euler(order: str, degrees: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 3, 3) from angles (..., 3) about x, y and z in degrees.
+    """Returns rotations (..., 3, 3) for angles (..., 3), in degrees, about x, y and z.
 
     The rotations are applied in `order`.
     """

@@ -193,7 +193,7 @@ class _Writer:
         return poses
 
     def _material(self, material: Material) -> int:
-        """Adds a material and, if it has one, its image. Returns the id of the material."""
+        """Adds a material, and its image if it has one. Returns the id of the material."""
         number, record = self._object("Material", material.name, "")
         record.add("Version", Int(102))
         record.add("ShadingModel", "lambert")

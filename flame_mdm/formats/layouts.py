@@ -481,7 +481,7 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Checks that an array is not of another skeleton with the same number of joints.
+    """Checks that an array is not from another skeleton with the same number of joints.
 
     A person's limbs have the same length on both sides, and their lengths do not change. If the
     joint order or the skeleton is wrong, the compared pairs of joints are not limbs.

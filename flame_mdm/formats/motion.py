@@ -255,7 +255,7 @@ class Motion(PosedFigure):
 
 
 def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the axis-angle vectors (F, 66) of the 22 joints and the translation (F, 3).
+    """Returns the 22 joints' axis-angle vectors (F, 66), and the translation (F, 3).
 
     Both are in AMASS's coordinates: meters, z up.
     """

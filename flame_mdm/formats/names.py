@@ -64,7 +64,7 @@ def spellings(name: str, opposite: str) -> list[str]:
 def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
     """Returns a mapping from each spelling of a name (see `spellings`) to the name.
 
-    If two names share a spelling, the spelling refers to the name that is spelled exactly so.
+    If two names share a spelling, the spelling refers to the name that is spelled exactly that way.
 
     Args:
         pairs: for each name, its counterpart on the other side, or the name itself.

@@ -117,7 +117,7 @@ def shape_of(words: list[str]) -> dict[str, float]:
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays that make up the body file of an Anny body; see `packed`.
+    """Returns the arrays that make up an Anny body's file; see `packed`.
 
     The first call takes about 90 seconds.
     """
@@ -275,7 +275,7 @@ def packed(
     joints: np.ndarray,
     turns: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays that make up a body file, which `Mesh` reads.
+    """Returns the arrays that make up a body file; such files are read by `Mesh`.
 
     Points are stored in units of 1/20 mm, with the pelvis at 0, and normals in units of 1/127.
     """

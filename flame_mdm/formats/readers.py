@@ -98,8 +98,8 @@ class Recording:
         motion: the motion. Its notes are lines for the user.
         layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
         doubts: properties that look wrong, which the motion's notes also list.
-        smpl: translation (F, 3) and quaternions (F, 24, 4) of SMPL's joints in AMASS's axes, or
-            None if the file contains no such rotations.
+        smpl: SMPL's translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes, or None if the
+            file does not contain them.
         tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
             the file contains no tree.
     """

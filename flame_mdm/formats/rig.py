@@ -115,7 +115,7 @@ class Rig:
         return turned
 
     def assembled(self, world: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-        """Returns the positions (F, J, 3) of joints with the world rotations `world` (F, J, 3, 3).
+        """Returns the joint positions (F, J, 3) for the world rotations `world` (F, J, 3, 3).
 
         `pelvis` (F, 3) is the position of the pelvis.
         """
@@ -322,8 +322,8 @@ def follow(
         world: (F, 22, 3, 3), world rotations of the body parts.
 
     Returns:
-        The world rotations (F, J, 3, 3) and positions (F, J, 3) for the joints of the character,
-        and the character's skeleton.
+        The character's world rotations (F, J, 3, 3) and joint positions (F, J, 3), and its
+        skeleton.
     """
     # All joints take the rotations of the body, relative to the rest poses. The hips follow the
     # scaled path. If the legs have different proportions, the feet would then hover or sink.

@@ -119,7 +119,7 @@ class RiggedClip:
     contacts: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), bool))
 
     def world(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the world positions (F, J, 3) and world rotations (F, J, 3, 3) of the joints.
+        """Returns the joints' world positions (F, J, 3) and world rotations (F, J, 3, 3).
 
         The joints are not lifted. All joints of the skeleton must have a scale of 1.
         """
@@ -135,7 +135,7 @@ class RiggedClip:
         return positions, turns
 
     def part(self, frames: slice, name: str, contacts: np.ndarray) -> "RiggedClip":
-        """Returns some frames of the clip as a clip `name`, with their `contacts` (F, 2)."""
+        """Returns some frames as a new clip with the given `name` and `contacts` (F, 2)."""
         moves = {joint: moved[frames] for joint, moved in self.moves.items()}
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 

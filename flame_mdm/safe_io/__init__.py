@@ -127,8 +127,8 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 def _temporary(path: Path) -> Iterator[Path]:
     """Yields a unique path next to `path`, and removes the file at this path at the end.
 
-    The folder is created if necessary. Error messages contain `path` instead of the unique path. An `OSError`
-    about either path, or about a parent folder, is converted to a `UserError`.
+    The folder is created if necessary. Error messages contain `path` instead of the unique path. An
+    `OSError` for either path, or for a parent folder, is converted to a `UserError`.
     """
     temporary = path
     try:
@@ -160,7 +160,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Explains why a file could not be written; states the free space if the disk may be full."""
+    """Describes why a file could not be written, and the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -382,7 +382,7 @@ def read_package_yaml(path: Path) -> Any:
 
 
 def _nodes(node: Any, counted: dict[int, float]) -> float:
-    """Returns the number of YAML nodes after aliases are expanded, or infinity if there are cycles."""
+    """Returns the number of YAML nodes after aliases are expanded, or infinity if they are cyclic."""
     if id(node) not in counted:
         counted[id(node)] = math.inf
         content = node.value if node is not None else ""

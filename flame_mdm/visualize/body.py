@@ -154,7 +154,7 @@ def mannequin() -> Mesh:
 
 
 def read_body(name: str) -> Mesh:
-    """Returns the mannequin, or the body that a file contains. Raises `UserError` if the file is damaged."""
+    """Returns the mannequin, or the body in a file. Raises `UserError` if the file is damaged."""
     with naming(name, KeyError, ValueError, IndexError, prefix="not a body: "):
         return mannequin() if name == "mannequin" else Mesh(Path(name))
 

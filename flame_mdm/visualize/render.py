@@ -43,10 +43,10 @@ def write_gif(
 ) -> None:
     """Writes a looping animation that shows motions side by side, with a caption below each.
 
-    Each motion has a panel of `size` pixels. GIF allows at most 50 frames per second, so the
-    highest frame rate of the motions is divided by the smallest integer that results in 50 or less.
-    For example, 60 fps becomes 30 fps, and 120 fps becomes 40 fps. Shorter motions hold their last
-    frame. `body` is the body to draw; None = the mannequin.
+    Each motion is shown in a panel that is `size` pixels wide. GIF allows at most 50 frames per
+    second, so the highest frame rate of the motions is divided by the smallest integer that results
+    in 50 or less. For example, 60 fps becomes 30 fps, and 120 fps becomes 40 fps. Shorter motions
+    hold their last frame. `body` is the body to draw; None = the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -134,7 +134,7 @@ def contact_sheet(
 def thumbnail(motion: Figure, height: int = 120) -> bytes:
     """Returns a WebP image of the pose that differs most from the first pose.
 
-    The image is `height` pixels high and 0.7 times as wide.
+    The image is `height` pixels high, and its width is 0.7 times its height.
     """
     poses = motion.joints - motion.joints[:, :1] * [1, 0, 1]
     frame = int(np.linalg.norm(poses - poses[0], axis=2).sum(1).argmax())
@@ -267,7 +267,7 @@ def _figure(motion: Figure, body: FittedBody | None, frame: int, size: int) -> I
 def _camera(center: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that projects points (N, 3) in meters.
 
-    The function returns x, y, pixels per meter and depth (N, 4).
+    The function returns an array (N, 4) with x, y, pixels per meter and depth.
     """
 
     def project(points: np.ndarray) -> np.ndarray:
@@ -350,7 +350,7 @@ def _draw_skeleton(
     project: Callable[[np.ndarray], np.ndarray],
     rim: float,
 ) -> None:
-    """Draws a figure's limbs and head at joints (J, 3), from far to near, with dark rims of `rim` pixels."""
+    """Draws a figure with joints (J, 3), from far to near, with dark rims of `rim` pixels."""
     at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []

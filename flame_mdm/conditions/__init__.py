@@ -59,7 +59,7 @@ class ConditionEncoder(nn.Module, ABC):
 
         Args:
             groups: one list of captions per clip.
-            seed: seed of all random draws.
+            seed: seed for all random draws.
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:

@@ -44,7 +44,7 @@ class ActionLabels(ConditionEncoder):
         self.table = nn.Parameter(torch.randn(num_actions, features))
 
     def forward(self, batch: MotionBatch) -> Condition:
-        """Returns the learned vectors of the labels `batch.action` (B,).
+        """Returns the learned vector for each label in `batch.action` (B,).
 
         Raises:
             UserError: If the batch contains no labels.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Prompts as models read them: parts with captions, the understood content, and unknown words."""
+"""Prompts as models read them: parts with captions, a summary, changes and unknown words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ class ReadPrompt:
     """A prompt as a model reads it.
 
     Attributes:
-        parts: the words of each part, and its duration in seconds, or None if the prompt does not
-            specify a duration.
+        parts: for each part, its words and its duration in seconds. The duration is None if the
+            prompt does not specify it.
         captions: the caption that the model reads for each part.
         unknown: words that never occur in the training captions, or that the model does not read.
         summary: one line that states how the prompt was understood, or "" if the model's captions
             may describe several actions.
-        changes: lines about differences between the prompt and the sampled motion.
-        fitting: for each part, a duration in seconds that suits its specified number of
-            repetitions, or None if it does not specify a number. The tuple is empty if the captions
-            do not describe single actions.
+        changes: one line per difference between the prompt and the sampled motion.
+        fitting: for each part, a duration in seconds that suits the number of repetitions, or None
+            if the part does not specify this number. The tuple is empty if the captions do not
+            describe single actions.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -46,15 +46,15 @@ def read_prompt(
     """Returns a prompt as a model reads it.
 
     Args:
-        prompt: the text as typed by the user.
-        parts: the words of each part of the prompt, as in "walks @3 | sits", and its duration in
-            seconds, or None if the prompt does not specify a duration.
+        prompt: the text as the user typed it.
+        parts: for each part of a prompt such as "walks @3 | sits", its words and its duration in
+            seconds. The duration is None if the prompt does not specify it.
         facts: facts about the model, such as its "vocabulary", "actions" and "captions".
         max_words: maximum number of words that the model reads in a caption; None = no limit.
         splits: whether a sentence with several actions is split into one part per action. This
-            applies only to texts with a single part.
-        check_words: whether to replace words for actions with the model's own words, and to reject
-            text if the model knows none of its content words.
+            applies only to prompts with a single part.
+        check_words: whether to replace words for actions with the model's own words, and whether to
+            reject text if the model knows none of its content words.
 
     Raises:
         UserError: If the model does not understand a part.
@@ -87,8 +87,8 @@ def _with_actions(
 ) -> ReadPrompt:
     """Reads a prompt for a model whose captions describe single actions.
 
-    The prompt keeps its parts unless it is split. If a part names several actions, the model reads
-    the words of the part unchanged.
+    The prompt keeps its parts unless it is split. If a part names several actions, its words are
+    passed to the model unchanged.
     """
     readings: list[Reading]
     if splits:

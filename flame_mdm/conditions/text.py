@@ -30,8 +30,8 @@ class PretrainedText(ConditionEncoder):
     """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
     A frozen language model is not part of the state dict or the parameters. It is loaded only
-    if a caption is missing from the cache. Its tokens are always rounded to float16, even without a
-    cache.
+    if a caption is missing from the cache. Its output tokens are always rounded to float16, even
+    without a cache.
 
     Args:
         model: name of the language model on the Hugging Face hub, or its folder.
@@ -46,12 +46,12 @@ class PretrainedText(ConditionEncoder):
             implementation, the map is drawn with a fixed seed, but a released checkpoint can
             replace it.
         revision: full 40-digit commit hash on the hub; required for models from the hub.
-        package: installed Python package to load the files from, instead of the hub. In
-            this case, `model` is used only as a name.
+        package: installed Python package from which the files are loaded instead of from the hub.
+            In this case, `model` is used only as a name.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
         normalize: whether to scale the pooled vector to norm 1.
-        tokens: whether to return the last hidden states as tokens. Otherwise, no tokens are
+        tokens: whether to return the last layer's hidden states as tokens. Otherwise, no tokens are
             returned.
         attend_padding: whether to pad every caption to `max_tokens` and to treat the padding as
             real tokens, as FLAME and MFM do.
@@ -63,7 +63,7 @@ class PretrainedText(ConditionEncoder):
 
     Raises:
         UserError: If a caption is encoded with a model that is not pinned to a revision, whose file
-            differs from the published file, or whose width is not `features`.
+            differs from the published file, or whose output width is not `features`.
         FileNotFoundError: If a caption is encoded with a model that is neither in the cache nor
             available for download.
 
@@ -369,9 +369,8 @@ class Pretrained:
 class EncodedCaptions:
     """Outputs of a language model for N captions.
 
-    The outputs are vectors (N, C) float32 and tokens (T, C) float16. Caption n has the tokens
-    from `offsets[n]` up to, but not including, `offsets[n + 1]`. Arrays read from a file are
-    memory-mapped.
+    The outputs are vectors (N, C) float32 and tokens (T, C) float16. The tokens of caption n are in
+    rows `offsets[n]` to `offsets[n + 1] - 1`. Arrays read from a file are memory-mapped.
     """
 
     def __init__(self, captions: Sequence[str], pooled: Tensor, tokens: Tensor, offsets: Tensor):
@@ -405,9 +404,9 @@ class EncodedCaptions:
     def gather(
         self, captions: Sequence[str], device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the outputs for the given captions in float32, on a device.
+        """Returns the outputs for the given captions as float32 tensors on a device.
 
-        The outputs are vectors (N, C), tokens (N, S, C) and the mask of the tokens (N, S).
+        The outputs are vectors (N, C), tokens (N, S, C) and a bool token mask (N, S).
         """
         rows = np.array([self.rows[caption] for caption in captions])
         begin, lengths = self.offsets[rows], self.offsets[rows + 1] - self.offsets[rows]

@@ -41,7 +41,7 @@ class LearnedTokens(ConditionEncoder):
     Args:
         features: C, the width of the tokens and of the pooled vector.
         buckets: number of rows in the word table.
-        max_words: maximum number of words per caption. Additional words are dropped.
+        max_words: maximum number of words per caption. Any further words are dropped.
         heads: number of attention heads, which must divide `features`.
         dropout: probability of dropout in the transformer layer.
         pretrain_steps: number of training steps in `pretrain`.
@@ -94,7 +94,7 @@ class LearnedTokens(ConditionEncoder):
         self._rows: dict[str, np.ndarray] = {}  # rows (T, 2) of the captions encoded so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
-        """Returns two table rows each for the start token and for every word of a caption."""
+        """Returns the two table rows for the start token and for each word of a caption."""
         words = vocabulary.words(caption)
         if self.seen:
             words = [form for word in words if (form := vocabulary.known_form(word, self.seen))]
@@ -103,8 +103,8 @@ class LearnedTokens(ConditionEncoder):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains the encoder with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
-        Pooled vectors of captions for the same clip are pulled together, and pooled vectors of
-        different clips are pushed apart. Each training step compares two captions from each of
+        The pooled vectors of captions for the same clip are pulled together, and those of captions
+        for different clips are pushed apart. Each training step compares two captions from each of
         `PAIRS` clips. Without this training, a small model learns many words slowly, because it
         learns them only from the motion loss. Clips that have only one caption are not used.
         """
@@ -163,7 +163,7 @@ class LearnedTokens(ConditionEncoder):
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def encode(self, words: Tensor, counts: Tensor) -> Condition:
-        """Encodes captions like `forward`, from their `rows` (B, S, 2) and lengths (B,).
+        """Encodes captions that are given as `rows` (B, S, 2) and lengths (B,); see `forward`.
 
         This method has no branches, so that it can be exported as a graph.
         """

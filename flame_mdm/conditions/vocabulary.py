@@ -78,16 +78,17 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
 def vocabulary(
     captions: Iterable[str], shared: Iterable[str] | None = None
 ) -> dict[str, list[str]]:
-    """Returns the words and captions of the training data that a checkpoint keeps.
+    """Returns the words and captions of the training data that are saved in a checkpoint.
 
     Args:
         captions: all captions of the training clips.
-        shared: the captions that a checkpoint may contain under the license of their data. None =
-            no captions.
+        shared: the captions that may be included in a checkpoint under the license of their data.
+            None = no captions.
 
     Returns:
         "vocabulary" contains all words of the captions, sorted. Unless `shared` is None,
-        "captions" contains up to `MAX_CAPTIONS` of `shared`, evenly spaced in their sorted list.
+        "captions" contains up to `MAX_CAPTIONS` captions from `shared`, evenly spaced in sorted
+        order.
     """
     facts = {"vocabulary": sorted({word for caption in set(captions) for word in words(caption)})}
     if shared is not None:
@@ -153,7 +154,7 @@ def _content(text: str) -> list[str]:
 
 
 def unread_words(text: str, max_words: int | None) -> list[str]:
-    """Returns the words of the text after the first `max_words`, or [] if `max_words` is None."""
+    """Returns the words that follow the first `max_words`, or [] if `max_words` is None."""
     return [] if max_words is None else words(text)[max_words:]
 
 

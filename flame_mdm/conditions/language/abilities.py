@@ -75,7 +75,7 @@ class Abilities:
         return all(word in self.vocabulary for word in text.replace("-", " ").split())
 
     def supports(self, action: str, name: str, value: Value) -> bool:
-        """Returns whether the model knows an action with this value of an attribute.
+        """Returns whether the model knows the action with the given attribute value.
 
         A caption must state both the action and the value. If the facts contain no captions, the
         vocabulary must contain all words for the action and the value.
@@ -119,11 +119,11 @@ class Abilities:
         return {name: values for name, values in listed.items() if values}
 
     def ranked(self, action: str) -> list[str]:
-        """Returns the actions that the model knows, sorted by similarity in meaning to `action`."""
+        """Returns the actions that the model knows, with the most similar to `action` first."""
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:
-        """Returns captions of the three known actions that are closest in meaning to a sentence.
+        """Returns captions for the three known actions that are closest in meaning to a sentence.
 
         The list is empty if none of the words has a known meaning.
         """

@@ -1,4 +1,4 @@
-"""Meanings of words outside the tables: similar actions, and detection of words for things."""
+"""Meanings of words that are not in the tables: similar actions, and detection of things."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -17,7 +17,7 @@ NEIGHBORS = 5  # number of nearest listed words that decide whether a word names
 
 
 def nearest_actions(word: str) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to a word, most similar first.
+    """Returns the actions with their similarities to a word, best first.
 
     The result is empty if the vector table does not contain the word.
     """
@@ -26,7 +26,7 @@ def nearest_actions(word: str) -> list[tuple[str, float]]:
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to the mean of some words, most similar first."""
+    """Returns the actions with their similarities to the mean of several words, best first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 
@@ -66,7 +66,7 @@ def is_thing(word: str) -> bool:
 
 
 def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
-    """Returns the actions with their scores, highest score first.
+    """Returns the actions with their scores, best first.
 
     The score is the mean of the similarity to the action's closest word and the similarity to the
     action's center.
@@ -82,9 +82,9 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 
 @cache
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns the names of the actions, and data about the single words that name them.
+    """Returns the names of the actions, and two arrays about the single words that name them.
 
-    The data consists of the index of each word's action, and the vector of each word.
+    The arrays contain the index of each word's action, and the vector of each word.
     """
     table, weak = word_table(), words_of("weak")
     names = list(actions())
@@ -105,7 +105,7 @@ def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
 
 @cache
 def _centers() -> np.ndarray:
-    """Returns an array (N, D) with the mean word vector of each action, scaled to norm 1."""
+    """Returns the mean word vectors (N, D) of the actions, each scaled to norm 1."""
     names, rows, vectors = _action_vectors()
     centers = np.array([vectors[rows == row].sum(0) for row in range(len(names))])
     return centers / np.maximum(np.linalg.norm(centers, axis=1, keepdims=True), 1e-9)

@@ -1,4 +1,4 @@
-"""Base forms of English words, based on rules and a list of irregular forms."""
+"""Base forms of English words, derived from rules and a list of irregular forms."""
 
 from collections.abc import Iterator
 from functools import cache
@@ -41,7 +41,7 @@ def _stems(word: str) -> Iterator[str]:
 
 @cache
 def inflections(verb: str) -> tuple[str, ...]:
-    """Returns the forms of a verb or noun: wave -> wave, waves, waving, waved."""
+    """Returns the forms of a verb or noun: wave, waves, waving and waved for "wave"."""
     irregular = [form for form, bases in _irregular().items() if verb in bases]
     sibilant = verb.endswith(("s", "sh", "ch", "x", "z"))
     stem = verb[:-1] if verb.endswith("e") and not verb.endswith("ee") else verb
@@ -54,7 +54,7 @@ def inflections(verb: str) -> tuple[str, ...]:
 
 
 def _doubles(verb: str) -> bool:
-    """Returns whether the last consonant of a verb may be doubled, as in hop, hopping."""
+    """Returns whether the last consonant of a verb may be doubled, as in "hopping"."""
     return (
         len(verb) > 2
         and verb[-1] not in f"{VOWELS}wxy"

@@ -65,9 +65,9 @@ def is_explained(word: str) -> bool:
 
 
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Returns the actions that are closest in meaning to the unexplained words of a sentence.
+    """Returns the actions that are closest in meaning to the unknown words of a sentence.
 
-    If the tables explain every word, all words are used.
+    If the tables contain every word, all words are used.
     """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
@@ -121,7 +121,7 @@ class _Sentence:
         return [_without_idle(step) for step in steps + during + later]
 
     def rest(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Returns the words for things, and the words that are not understood (as typed)."""
+        """Returns the words for things, and the original spellings of words not understood."""
         objects, unknown = [], []
         for number, token in enumerate(self.tokens):
             if not token.is_word or number in self.verbs:
@@ -138,7 +138,7 @@ class _Sentence:
         return tuple(dict.fromkeys(objects)), tuple(dict.fromkeys(unknown))
 
     def _choose(self, clause: Clause) -> None:
-        """Keeps the phrases of a clause that name its actions.
+        """Reduces the matches of a clause to the phrases that name its actions.
 
         If there are none, a word that is similar in meaning to an action is used.
         """
@@ -241,7 +241,7 @@ class _Sentence:
         )
 
     def _words(self, numbers: Sequence[int]) -> str:
-        """Returns the words of a clause, as typed."""
+        """Returns the words of a clause as the user typed them."""
         words: list[str] = []
         for number in numbers:
             token = self.tokens[number]
@@ -253,7 +253,7 @@ class _Sentence:
 
 
 def _is_same(step: Step, other: Step) -> bool:
-    """Returns whether two steps are the same action, named twice with compatible attributes."""
+    """Returns whether two steps name the same action with compatible attributes."""
     if len(step) > 1 or len(other) > 1 or step[0].action != other[0].action:
         return False
     first, second = step[0].attributes, other[0].attributes
@@ -261,6 +261,6 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Removes duplicates from a step, and "stands still" if the step contains another action."""
+    """Removes duplicate actions, and "stands still" if the step contains another action."""
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

@@ -1,4 +1,4 @@
-"""Reading of sentences: captions for the model, and words that it does not know."""
+"""Conversion of sentences to captions that a model knows, with a list of ignored words."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -23,12 +23,12 @@ class Reading:
     """A sentence as a model reads it.
 
     Attributes:
-        understanding: the content that is understood in the sentence.
+        understanding: the content of the sentence, as far as it is understood.
         steps: the actions to sample, in order. The model knows all of them.
         captions: the caption that the model reads for each step.
         texts: the words of the sentence that describe each step.
-        changes: differences between the sentence and the sampled motion, one line each.
-        ignored: words (as typed) and attributes (in words) that have no effect.
+        changes: one line per difference between the sentence and the sampled motion.
+        ignored: the words that have no effect, and descriptions of attributes that have no effect.
     """
 
     understanding: Understanding
@@ -56,7 +56,7 @@ class Reading:
         )
 
     def warnings(self) -> list[str]:
-        """Returns lines about differences between the sentence and the sampled motion."""
+        """Returns lines that describe how the sampled motion differs from the sentence."""
         ignored = [f"not understood: {', '.join(self.ignored)}"] if self.ignored else []
         return [*self.changes, *ignored]
 
@@ -83,10 +83,9 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are passed to the model unchanged. The first kind consists of
-        training captions with an action that the model does not list. The second kind consists of
-        sentences in which no action is understood, but whose unknown words are all in the model's
-        vocabulary.
+        Two kinds of sentences are passed to the model unchanged. The first are training captions
+        that name an action outside the model's list. The second are sentences in which no action is
+        understood, but whose unknown words are all in the model's vocabulary.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not
@@ -238,7 +237,7 @@ class Reader:
 class NotUnderstood(UserError):
     """Error for a sentence without an action that the model knows.
 
-    `nearest` contains captions of the known actions that are closest in meaning.
+    `nearest` contains captions for the known actions that are closest in meaning.
     """
 
     def __init__(self, message: str, nearest: Sequence[str]):
@@ -254,14 +253,14 @@ class NotUnderstood(UserError):
 
 @dataclass
 class _Notes:
-    """Lines about changes, and words without effect, collected while a sentence is read."""
+    """Changes to a sentence, and its words without effect, collected while it is read."""
 
     changes: list[str]
     ignored: list[str] = field(default_factory=list)
 
 
 def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
-    """Merges pairs of successive steps that the model knows as one action.
+    """Merges pairs of successive steps that the model knows as a single action.
 
     An example is "stretches both arms and leans to the left".
     """
@@ -293,16 +292,16 @@ def _shown(text: str) -> str:
 
 
 def _caption(step: Step, words: str, special: Set[str]) -> str:
-    """Returns the caption of a step.
+    """Returns the caption for a step.
 
-    If a word is in the model's vocabulary but not in the tables, the words themselves are used as
-    the caption.
+    If one of the step's words is in the model's vocabulary but not in the tables, the caption
+    consists of the words themselves.
     """
     return words if special & set(words.lower().split()) else caption(step)
 
 
 def _without_style(text: str) -> tuple[str, str]:
-    """Splits a style that adapters teach, such as "in limp style", off the end of a sentence."""
+    """Separates a style that adapters teach, such as "in limp style", from a sentence."""
     before, separator, style = text.rstrip(" .").rpartition(" in ")
     if separator and style.endswith(" style") and style.count(" ") == 1:
         return before, f" in {style}"

@@ -60,7 +60,7 @@ def phrases() -> dict[str, Any]:
 
 @cache
 def words_of(*keys: str) -> frozenset[str]:
-    """Returns the words of a list in `phrases.yaml`.
+    """Returns the words in a list of `phrases.yaml`.
 
     Several keys select a nested list: `words_of("speed", "slow")`.
     """
@@ -72,7 +72,7 @@ def words_of(*keys: str) -> frozenset[str]:
 
 @cache
 def word_values(key: str) -> dict[str, str]:
-    """Returns a mapping from each word of a table to the value that it states.
+    """Returns a mapping from each word in a table to the value that the word states.
 
     For example, `word_values("speed")["slowly"]` is "slow".
     """
@@ -81,7 +81,7 @@ def word_values(key: str) -> dict[str, str]:
 
 @cache
 def actions() -> dict[str, ActionEntry]:
-    """Returns a mapping from names to actions."""
+    """Returns the actions, keyed by name."""
     content = read_package_yaml(Path(__file__).with_name("actions.yaml"))
     return {name: _entry(name, values) for name, values in content.items()}
 

@@ -24,7 +24,7 @@ class Token:
     """A word or a punctuation mark.
 
     Attributes:
-        typed: the word as typed.
+        typed: the word as the user typed it.
         word: the word in lower case, with typos corrected.
         start, end: position of the token in the sentence.
     """
@@ -45,7 +45,7 @@ class Token:
 
 
 def tokenize(text: str) -> list[Token]:
-    """Returns the words and punctuation marks of a sentence, as typed."""
+    """Splits a sentence into words and punctuation marks."""
     matches = TOKEN.finditer(text)
     return [
         Token(match[0], HYPHEN.sub("", match[0].lower()), match.start(), match.end())
@@ -54,7 +54,7 @@ def tokenize(text: str) -> list[Token]:
 
 
 def is_known(word: str) -> bool:
-    """Returns whether a word is English: one of its forms is in the tables or is frequent."""
+    """Returns whether any form of a word is in the tables or is frequent in English."""
     if word.isdecimal() or word in _listed():
         return True
     # Base forms with three or fewer letters do not count, because most of these words are names,
@@ -92,7 +92,7 @@ def is_foreign(tokens: Sequence[Token]) -> bool:
 
 
 def is_english(word: str) -> bool:
-    """Returns whether a word is frequent, or is a form or a typo of a word in the tables."""
+    """Returns whether a word is frequent, or is a form or misspelling of a word in the tables."""
     rank = word_table().rank(word)
     is_frequent = rank is not None and rank < RARE
     return (

@@ -37,16 +37,16 @@ Step = Sequence[Mention]
 
 @dataclass(frozen=True)
 class Understanding:
-    """The understood content of a sentence.
+    """The content of a sentence, as far as it is understood.
 
     Attributes:
-        text: the sentence as typed.
+        text: the sentence as the user typed it.
         steps: actions in order.
         objects: words for things, which have no effect.
-        unknown: words that are not understood, as typed.
-        corrected: words that were read as other words, as a mapping from typed to corrected words.
+        unknown: words that are not understood, as the user typed them.
+        corrected: maps each word that was read as another word to this other word.
         is_foreign: whether the sentence is not in English.
-        nearest: the three actions that are closest in meaning, if no action is understood.
+        nearest: if no action is understood, the three actions that are closest in meaning.
     """
 
     text: str

@@ -1,4 +1,4 @@
-"""Meanings of words: a table of vectors for frequent English words and words for motion.
+"""Word meanings: a table of vectors for frequent English words and for words about motion.
 
 `tools/word_vectors.py` distills the table from MiniLM (all-MiniLM-L6-v2, Apache License 2.0).
 `word_vectors.md` documents the source and the license.
@@ -39,7 +39,7 @@ class WordTable:
         return None if row is None else self.vectors[row]
 
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
-        """Returns the mean vector (D,) of words, scaled to norm 1, or None if none is listed.
+        """Returns the mean vector (D,) of words, scaled to norm 1, or None if no word is listed.
 
         Frequent words have less weight, as in smooth inverse frequency (Arora et al. 2017). Word
         frequencies are estimated with Zipf's law.

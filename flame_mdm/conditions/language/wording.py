@@ -50,7 +50,7 @@ def times(count: int) -> str:
 
 
 def caption(step: Sequence[Mention]) -> str:
-    """Returns the caption of simultaneous actions, such as "a person walks while waving"."""
+    """Returns the caption for simultaneous actions, such as "a person walks while waving"."""
     first, *others = (predicate(mention) for mention in step)
     return " while ".join([f"{WHO} {first}", *(_participle(other) for other in others)])
 

@@ -109,7 +109,7 @@ class MotionSource(ABC):
 
     @cached_property
     def excluded(self) -> Counter[str]:
-        """Number of clips or labels that are left out for each reason, as saved in the store.
+        """The number of omitted clips or labels for each reason, as saved in the store.
 
         The numbers are complete once `clips` is exhausted.
         """
@@ -139,14 +139,14 @@ class MotionSource(ABC):
         return {}
 
     def findings(self) -> list[str]:
-        """Returns lines to print about the motions. They are complete once `clips` is exhausted."""
+        """Returns findings about the motions. They are complete once `clips` is exhausted."""
         return []
 
     def changed(self, store: Path) -> list[str]:
-        """Returns lines about files that were added or changed after the store was prepared.
+        """Returns messages about files that were added or changed after the store was prepared.
 
         Args:
-            store: a file of the store. Data files with a later modification time count as changed.
+            store: a file in the store. Data files with a later modification time count as changed.
         """
         return []
 
@@ -174,11 +174,11 @@ class MotionSource(ABC):
         """
 
     def failure_lines(self) -> list[str]:
-        """Returns the lines to print about `failures`."""
+        """Returns `failures` as lines to print."""
         return [f"error: {failure}" for failure in self.failures]
 
     def check(self, fps: float) -> list[str]:
-        """Returns lines to print about existing and missing files, without preparing the data.
+        """Reports which files exist and which are missing, without preparing the data.
 
         Args:
             fps: frames per second.
@@ -219,7 +219,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice for a split that contains no clips. It begins with a space.
+    """Returns advice for users whose split contains no clips. The advice begins with a space.
 
     The advice is "" for published data sets, because their splits are fixed.
     """
@@ -230,7 +230,8 @@ def required(path: Path, get_it: str) -> Path:
     """Returns `path` if it exists.
 
     Raises:
-        FileNotFoundError: If `path` does not exist. The message ends with the advice `get_it`.
+        FileNotFoundError: If `path` does not exist. The message ends with `get_it`, which explains
+            how to obtain the file.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: not found; {get_it}")
@@ -249,7 +250,7 @@ def name_hash(name: str) -> int:
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Returns a split that depends only on the name, so that new names do not change other splits.
+    """Returns a split that depends only on the name, so that new names do not affect other names.
 
     Args:
         name: name of a motion or of its source.
@@ -261,7 +262,7 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 
 
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
-    """Assigns each block of `size` consecutive clips to a split, using a hash of `name`.
+    """Assigns each block of `size` consecutive clips to a split, based on a hash of `name`.
 
     Neighboring clips may be similar, so all clips of a block are in the same split. `val` and
     `test` are fractions of the blocks. Each split gets at least one block.

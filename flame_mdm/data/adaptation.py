@@ -36,14 +36,14 @@ KEPT = "prior/"  # prefix of the names of the known clips
 
 
 class Lesson(MotionSource):
-    """Clips from the user's folder, with mirrored copies, and clips that the model already knows.
+    """The user's clips with mirrored copies, combined with clips that the model already knows.
 
     All clips in the folder are used for training unless the caption table says otherwise. Clips are
     normalized with the statistics of the store that contains the known clips.
 
     Args:
-        path: the user's motion folder.
-        prior: folder of the store with clips that the model was trained on.
+        path: folder with the user's motions.
+        prior: folder of the store that contains clips on which the model was trained.
         motion: "joints" for representations of joint positions, "smpl" for representations of
             rotations.
     """
@@ -56,7 +56,7 @@ class Lesson(MotionSource):
 
     @cached_property
     def store(self) -> Store:
-        """The store with clips that the model was trained on."""
+        """The store that contains clips on which the model was trained."""
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
@@ -90,7 +90,7 @@ class Lesson(MotionSource):
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips, with the style in their captions, and then the store's clips.
+        """Yields the user's clips, with the style added to their captions, then the store's clips.
 
         Raises:
             UserError: If one of the user's motions cannot be read. The folder contains only a few
@@ -106,17 +106,18 @@ class Lesson(MotionSource):
 
 
 def styled(caption: str, name: str) -> str:
-    """Returns the training caption of a clip in the style `name`."""
+    """Adds the style `name` to a caption for training."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 
 def check_clips(path: str | Path, fps: float) -> None:
     """Checks the motions in a folder before training.
 
-    Prints the skeletons of the motions, and which of their parts were left out.
+    Prints the number of motions for each skeleton, and findings about the files, such as frames
+    that were left out.
 
     Raises:
-        UserError: If a motion cannot be read, its floor rises, or its body floats.
+        UserError: If a motion cannot be read, if its floor rises, or if its body floats.
     """
     folder = Folder(str(path))
     faults = [
@@ -131,7 +132,7 @@ def check_clips(path: str | Path, fps: float) -> None:
 
 
 def fault_of(joints: np.ndarray, fps: float) -> str:
-    """Returns a message if the floor of a clip rises, or if the body floats above the floor.
+    """Returns a message if the floor rises during a clip, or if the body floats above the floor.
 
     The message is "" if the clip is within the limits `DRIFT` and `FLOAT`.
 

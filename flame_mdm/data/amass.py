@@ -72,7 +72,7 @@ class Recording(NamedTuple):
         return self.cut(slice(None, None, step))
 
     def cut(self, frames: slice) -> Recording:
-        """Returns a recording of the same body that contains only a slice of the frames."""
+        """Returns a copy of the recording that contains only a slice of the frames."""
         return self._replace(poses=self.poses[frames], translation=self.translation[frames])
 
     def parameters(self) -> np.ndarray:
@@ -87,9 +87,9 @@ def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
     Returns None if the path does not belong to a subset. A subset may have different names in index
-    files, archives and folders; they all map to the same key. Case is ignored, and spaces are
+    files, archives and folders; they all result in the same key. Case is ignored, and spaces are
     replaced by underscores, as in later releases. A file from the SMPL-X release has the same key
-    as the SMPL+H file.
+    as the corresponding SMPL+H file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -149,7 +149,7 @@ class Amass:
 
     @cached_property
     def archives(self) -> dict[str, Path]:
-        """Maps each subset to its archive, which is identified by its file name."""
+        """Maps each subset to its archive, which is recognized by its file name."""
         paths = ((path, ARCHIVE.fullmatch(path.name)) for path in sorted(self.root.rglob("*.tar*")))
         return {
             subset: path

@@ -156,9 +156,9 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """Reader that limits how far a compressed file of `packed` bytes may expand.
+    """Reader that limits the expanded size of a compressed file of `packed` bytes.
 
-    It raises an error if the file expands to an implausible size.
+    It raises an error if the size is implausible.
     """
 
     def __init__(self, file: IO[bytes], packed: int):

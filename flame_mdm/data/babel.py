@@ -59,14 +59,14 @@ class Babel(MotionSource):
     """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
 
     Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
-    start) to floor(20 end) - 1. A label that is longer than a clip yields one window every `STRIDE`
+    start) to floor(20 end) - 1. If a label is longer than a clip, one clip begins every `STRIDE`
     frames. If a label is shorter than a clip, the clip continues past the end of the label, and the
     label is left out if the motion is too short for the clip.
 
     Both splits use BABEL's entire train part for training, and 20 % of its val part for testing.
-    In the project's own split, 20 % of the motions (not of the clips) are drawn, so that no motion
-    is in both val and test. FLAME's split uses every fifth clip for testing, so windows in val
-    overlap with windows in test.
+    In the project's own split, these 20 % are drawn from the motions rather than the clips, so that
+    no motion is in both val and test. FLAME's split uses every fifth clip for testing, so clips in
+    val overlap with clips in test.
 
     Args:
         path: folder of BABEL v1.0.
@@ -90,7 +90,7 @@ class Babel(MotionSource):
         return {"labels": sum(1 for file in files for _ in self._annotations(file))}
 
     def count(self) -> int:
-        """Returns the number of clips, computed from the labels and the lengths of the motions."""
+        """Returns the number of clips, based on the labels and the lengths of the motions."""
         return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
@@ -117,7 +117,7 @@ class Babel(MotionSource):
     def windows(self) -> list[Window]:
         """All clips in FLAME's order.
 
-        They are computed from the labels and the lengths of the motions.
+        They follow from the labels and the lengths of the motions.
         """
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
@@ -143,8 +143,8 @@ class Babel(MotionSource):
     def labels(self, part: str) -> list[Label]:
         """Returns the labels of a part ("train" or "val") in FLAME's order.
 
-        For each file, the annotators' words come first, followed by the categories. Empty and
-        duplicate labels (same text, motion, start and end) are dropped.
+        For each file, the labels in the annotators' words come first, followed by the categories.
+        Empty and duplicate labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
@@ -185,7 +185,7 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns the fields of a label that this module uses.
+    """Returns those fields of a label that this module uses.
 
     Raises `TypeError` if a field has the wrong type.
     """
@@ -197,7 +197,7 @@ def _segment(label: dict[str, Any]) -> Segment:
 
 
 def _starts(label: Label, frames: int) -> tuple[range, str]:
-    """Returns the first frame of each clip for a label, and a reason if there are no clips.
+    """Returns the first frame of each clip for a label, or the reason why there are no clips.
 
     `frames` is the number of frames in the motion.
     """

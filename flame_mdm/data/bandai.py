@@ -130,7 +130,7 @@ class Take(NamedTuple):
 
 
 class Bandai(MotionSource):
-    """Both data sets, converted to SMPL's skeleton, with captions that state content and style.
+    """Both data sets, converted to SMPL's skeleton. The captions state the content and the style.
 
     Args:
         path: a clone of the original repository, a folder that contains the BVH files at any
@@ -140,9 +140,9 @@ class Bandai(MotionSource):
         mirror: whether a mirrored copy follows each clip of the training split.
         workers: number of processes; 0 = one per core.
         exclude: file names (without extension) of the takes to leave out.
-        split: with "takes", the takes that are held out have combinations of content and style that
-            occur in training. With "compositional", the combinations in `HELD_OUT` are held out, so
-            that their contents and styles occur in training only in other combinations.
+        split: with "takes", the combinations of content and style in the takes that are held out
+            also occur in training. With "compositional", the combinations in `HELD_OUT` are held
+            out, so training includes their contents and styles only in other combinations.
     """
 
     name = "bandai"
@@ -227,10 +227,10 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
     Args:
         file: the BVH file.
         fps: frames per second of the result.
-        kind: "joints", or "smpl" for the motion (F, 75) of `smpl_motion`.
+        kind: "joints" for joint positions, or "smpl" for the result (F, 75) of `smpl_motion`.
 
     Raises:
-        UserError: If the file has a different skeleton, or if a joint jumps.
+        UserError: If the skeleton of the file is not that of the data set, or if a joint jumps.
     """
     recording = read_recording(file, fps, standard=_standard)
     if recording.doubts.jump:
@@ -276,7 +276,7 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
 
 
 def mirror(motion: np.ndarray) -> np.ndarray:
-    """Returns the mirror image of joints (F, 22, 3) or of an SMPL motion (F, 75)."""
+    """Returns the mirror image of joint positions (F, 22, 3) or of an SMPL motion (F, 75)."""
     if motion.ndim == 3:
         return SMPL22.mirror(torch.from_numpy(motion)).numpy()
     vectors = motion[:, 3:].reshape(len(motion), 24, 3)[:, list(SMPL24.mirrored)] * np.array(
@@ -296,7 +296,7 @@ def side_of(content: str) -> str:
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Returns four captions for a take, worded like HumanML3D's captions."""
+    """Returns four captions for a take, in the style of HumanML3D's captions."""
     contents, styles = WORDS["contents"], WORDS["styles"]
     phrases = zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     filled = (
@@ -314,7 +314,7 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
     of them are used for training.
 
     With the rule "compositional", the combinations in `HELD_OUT` form the test split. All other
-    takes that the rule "takes" assigns to the test split are used for training.
+    takes that would be in the test split under the rule "takes" are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:
@@ -346,7 +346,7 @@ def _take(file: Path, rule: str) -> Take:
 
 
 def prompts() -> list[str]:
-    """Returns the prompts of this data set's recipes, which are worded like the captions.
+    """Returns the prompts of this data set's recipes, in the style of the captions.
 
     During training, samples are generated for these prompts.
     """

@@ -20,7 +20,8 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields the rows of a caption table.
 
-    Each row is a pair: its location (file and line) for error messages, and its cells by column.
+    Each row is a pair of its location (file and line), for error messages, and its cells, keyed by
+    column.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in
@@ -59,8 +60,8 @@ def drawn_splits(
 
     Splits are drawn with a hash of the source, so that all motions from the same source are in the
     same split. If no motion is drawn for training, the source with the highest hash in the largest
-    split is moved to training. With `SPLITTABLE` or more motions, val and test are filled in the
-    same way.
+    split is moved to training. With `SPLITTABLE` or more motions, the same applies to empty val and
+    test splits.
 
     Args:
         sources: maps the name of each motion to its source.

@@ -1,9 +1,9 @@
 """The CMU motion capture database, with captions from HumanML3D, KIT-ML or the user.
 
-The motions from http://mocap.cs.cmu.edu are read as ASF/AMC files, or as conversions to BVH. They
-are free for all uses. Captions: Guo et al., CVPR 2022 (HumanML3D), and Plappert et al., Big Data
-2016 (KIT-ML). `docs/cmu.md` lists the required downloads, and how this data differs from HumanML3D
-and KIT-ML.
+The motions from http://mocap.cs.cmu.edu are read from ASF/AMC files, or from BVH files that were
+converted from them. The motions are free for all uses. Captions: Guo et al., CVPR 2022 (HumanML3D),
+and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` lists the required downloads, and how
+this data differs from HumanML3D and KIT-ML.
 """
 
 import re
@@ -81,7 +81,7 @@ GET_IT = (
 
 
 class Item(NamedTuple):
-    """Captions for a recording, or for its part from frame `start` to frame `end` at 20 fps.
+    """Captions for a recording, or for the part from frame `start` to frame `end` at 20 fps.
 
     `action` is the label of a part in `captions.csv`. `is_own` is True for such parts, and False
     for captions from HumanML3D and KIT-ML.
@@ -109,10 +109,10 @@ class CMU(MotionSource):
 
     The clips are HumanML3D's clips, recordings with KIT-ML's captions, or motions with the user's
     captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
-    in the split of the HumanML3D clips that are cut from it. If these clips are in several splits,
-    the test split has priority, followed by val. If HumanML3D contains no clip of the recording,
-    the subject determines the split. If there is a table `captions.csv`, only its captions are
-    used, and each part of a recording that it lists is one clip.
+    in the same split as the HumanML3D clips that are cut from it. If these clips are in several
+    splits, the test split has priority, followed by val. If HumanML3D contains no clip of the
+    recording, the subject determines the split. If there is a table `captions.csv`, only its
+    captions are used, and each recording or part of a recording in the table becomes one clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -182,7 +182,7 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips from CMU recordings, and mappings from names to captions and splits.
+        """HumanML3D's clips from CMU recordings, and their captions and splits, keyed by name.
 
         All of them are empty if the user provides captions.
         """
@@ -206,7 +206,7 @@ class CMU(MotionSource):
 
     @cached_property
     def kit(self) -> list[tuple[str, str, str, float]]:
-        """KIT-ML's captions for CMU recordings: id, recording, text and seconds.
+        """KIT-ML's captions for CMU recordings, as tuples of id, recording, text and seconds.
 
         The list is empty if the file with these captions is missing.
         """
@@ -358,7 +358,7 @@ class _Part:
 
 
 def _parts(table: Path) -> dict[str, _Part]:
-    """Maps names to the parts of recordings that a table lists.
+    """Returns the parts of recordings in a table, keyed by name.
 
     Rows for the same part contain captions for the same clip.
     """
@@ -443,7 +443,7 @@ def _is_in(fact: str, trial: str) -> bool:
 def _rank(path: Path) -> int:
     """Returns the rank of a file: 0 = original, 1 = converted, 2 = Daz-friendly conversion.
 
-    The legs of Daz-friendly conversions often jump.
+    Daz-friendly conversions come last, because their legs often jump.
     """
     if path.suffix.lower() == ".amc":
         return 0
@@ -455,7 +455,7 @@ def _recording(key: str) -> str:
 
 
 def _test_captions(path: Path) -> dict[str, list[Description]]:
-    """Returns the captions of each motion from a JSON list of test captions.
+    """Reads a JSON list of test captions, and returns the captions of each motion.
 
     The field `segment` states the start and end of the described part in seconds.
     """
@@ -477,7 +477,7 @@ def decide_rate(
 
     KIT-ML's `seconds` have the highest priority, followed by HumanML3D's `last` frame at 20 fps,
     and by CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has the lowest
-    priority, because conversions state 120 for nearly all recordings.
+    priority, because converted files specify 120 fps for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
     if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
@@ -550,7 +550,7 @@ def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
 
 
 def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
-    """Returns a tree with additional joints.
+    """Adds joints to a tree.
 
     The keyword arguments map the name of each new joint to its parent and its offset (3,).
     """
@@ -585,7 +585,7 @@ def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.n
 
 
 def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Returns a recording, standardized by `standardize`, at its own frame rate."""
+    """Returns a recording after `standardize`, at its original frame rate."""
     tree, fields = standardize(tree)
     rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
     return replace(tree, fps=rate), fields

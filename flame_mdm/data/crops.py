@@ -1,4 +1,4 @@
-"""Rules that crop clips to training samples, and data sets of cropped clips.
+"""Rules for cropping clips to training samples, and data sets of cropped clips.
 
 The rules follow the authors' code.
 """
@@ -86,7 +86,7 @@ class Units(Crop):
             )
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns uniformly drawn first frames, and lengths that are multiples of `unit`."""
+        """Draws the first frames uniformly; lengths are multiples of `unit`."""
         length = np.minimum(frames, self.max_frames) // self.unit * self.unit
         if below is None:
             return np.zeros_like(length), length
@@ -123,7 +123,7 @@ class Fixed(Crop):
         return self.frames
 
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Returns uniformly drawn first frames and a constant length."""
+        """Draws the first frames uniformly; all lengths are equal."""
         spare = np.maximum(0, frames - self.frames - 1)
         first = np.zeros_like(spare) if below is None else below(spare + 1)
         return first, np.full_like(spare, self.frames)
@@ -200,7 +200,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """Index (clips,) of each clip's caption in evaluation, derived from the clip's id."""
+        """For each clip, the index of its caption in evaluation, derived from the clip's id."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

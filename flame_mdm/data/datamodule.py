@@ -94,14 +94,14 @@ class MotionDataModule(LightningDataModule):
         representation: representation that encodes the clips. It receives the statistics of the
             store.
         root: folder that contains all prepared data sets.
-        name: name of the data set. The name of its folder in `root` starts with this name.
+        name: name of the data set, and the beginning of its folder name in `root`.
         batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 = load in the training process.
         crop: rule that determines the frames of a sample and the minimum length of a clip.
         seed: seed for the order of the clips, their crops and their captions.
         resident: whether the data set is kept on the training device. The same batches are then
-            gathered on the device, without workers. "auto" = only if the data set takes at most a
-            quarter of the free memory.
+            gathered on the device, without workers. "auto" = only if the data set takes up at most
+            a quarter of the free memory.
         pad_multiple: batches are padded to a multiple of this number of frames, so that compiled
             networks process only a few shapes. No batch is padded beyond the maximum sample length
             of the crop rule.
@@ -213,7 +213,7 @@ class MotionDataModule(LightningDataModule):
         return store
 
     def counts(self, store: Store) -> list[str]:
-        """Returns lines about how many clips of each split are long enough for the crop rule."""
+        """Reports, for each split, how many clips are long enough for the crop rule."""
         shortest = self.crop.min_frames
         used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
         short = {split: total - used[split] for split, total in store.info["clips"].items()}

@@ -41,7 +41,7 @@ MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
-    """A motion file, and the number of an animation in it, or None if it contains only one."""
+    """A motion file, and the name of the animation in it, or None if it contains only one."""
 
     path: Path
     animation: str | None = None
@@ -63,7 +63,7 @@ class Folder(MotionSource):
 
     Motions are positions of SMPL's 22 joints, or raw motions of the SMPL representation. If the
     table does not specify splits, 85 % of the sources are used for training, 5 % for validation and
-    10 % for testing, selected by a hash of their names.
+    10 % for testing, based on a hash of their names.
 
     Args:
         path: the folder. Motions may be in subfolders.
@@ -78,9 +78,9 @@ class Folder(MotionSource):
             occurs at most 16 times. 0 = clips are not repeated.
         license: license of motions for which the table does not specify a license. This is a key in
             `licenses.yaml`, or "" if the license is unknown.
-        prefixes: words to insert before captions. Each word is mapped to the actions whose captions
-            it precedes. A model can then distinguish these motions from motions with the same
-            action name in another data set.
+        prefixes: words to insert before captions, each mapped to the actions whose captions it
+            precedes. A model can then distinguish these motions from motions with the same action
+            name in another data set.
     """
 
     name = "folder"
@@ -157,7 +157,7 @@ class Folder(MotionSource):
 
     @cached_property
     def copies(self) -> dict[str, int]:
-        """How often each motion occurs in the data set; see `balance`.
+        """The number of times that each motion occurs in the data set; see `balance`.
 
         A mirrored copy occurs as often as its original.
         """
@@ -204,7 +204,7 @@ class Folder(MotionSource):
         _check_upright(self.path, self._uprights)
 
     def _motions(self, fps: float) -> Iterator[tuple[str, np.ndarray]]:
-        """Yields the name and the motion in each readable file, and records findings about them."""
+        """Yields the name and content of each readable motion, and records findings about it."""
         self.failures = failures = list[str]()
         self._uprights, self._notes = defaultdict(list), Counter()
         attempts = in_order(
@@ -221,9 +221,10 @@ class Folder(MotionSource):
             yield name, attempt.motion
 
     def findings(self) -> list[str]:
-        """Returns lines about the motions that have been read so far.
+        """Returns findings about the motions that have been read so far.
 
-        The lines state the skeletons of the motions, and which of their parts were left out.
+        They state the number of motions for each skeleton and, for example, which frames were left
+        out.
         """
         skeletons = [
             f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
@@ -231,7 +232,7 @@ class Folder(MotionSource):
         return skeletons + [f"{count} motions: {note}" for note, count in self._notes.items()]
 
     def check(self, fps: float) -> list[str]:
-        """Reads all captions and motions, and returns lines about skeletons and failures."""
+        """Reads all captions and motions, and returns a report on skeletons and failures."""
         splits = Counter(self.splits[name] for name, _ in self._motions(fps))
         if self.failures:
             return [*self.findings(), *self.failure_lines()]
@@ -243,7 +244,7 @@ class Folder(MotionSource):
         ]
 
     def failure_lines(self) -> list[str]:
-        """Returns one line per motion that cannot be prepared, and a line that counts them."""
+        """Returns one line per motion that cannot be prepared, and a line with their number."""
         if not self.failures:
             return []
         summary = f"error: {len(self.failures)} of {len(self.files)} motions in {self.path} cannot be prepared"
@@ -326,7 +327,7 @@ class Folder(MotionSource):
 
     @cached_property
     def splits(self) -> dict[str, Split]:
-        """Maps motions to splits, which are specified in the table or drawn (`drawn_splits`)."""
+        """Maps motions to splits, which are specified in the table or drawn by `drawn_splits`."""
         sources = {name: note.source or name for name, note in self.notes.items()}
         return drawn_splits(sources, {name: note.split for name, note in self.notes.items()})
 
@@ -354,7 +355,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
 
 
 def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> None:
-    """Raises `UserError` if the body is lying in most motions of a layout.
+    """Raises `UserError` if the body is lying down in most motions of a layout.
 
     Args:
         folder: the folder to name in the error message.
@@ -420,7 +421,7 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
 
 @dataclass
 class _Attempt:
-    """A motion that was read for a data set, or a line that states why it cannot be used."""
+    """A motion that was read for a data set, or a message that states why it cannot be used."""
 
     error: str = ""
     motion: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))

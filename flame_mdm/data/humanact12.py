@@ -35,7 +35,7 @@ class HumanAct12(MotionSource):
 
     The file does not identify subjects or recordings. The project's own split (70 % train, 10 %
     val, 20 % test of each action) keeps neighboring clips together. The published split uses all
-    clips both for training and for testing, as in the papers.
+    clips for both training and testing, as in the papers.
     """
 
     name = "humanact12"
@@ -63,7 +63,7 @@ class HumanAct12(MotionSource):
         return len(self._motions)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips in the order of the file. They have actions, but no captions."""
+        """Yields the clips in the order of the file. The clips have actions, but no captions."""
         self.check_fps(fps, FPS)
         clips, seen = Counter(action for _, action in self._motions), Counter[int]()
         blocks = {
@@ -79,7 +79,7 @@ class HumanAct12(MotionSource):
 
     @cached_property
     def _motions(self) -> list[tuple[np.ndarray, int]]:
-        """Motion (F, 75) float32 and action of each clip, in the order of the file.
+        """The motion (F, 75) float32 and the action of each clip, in the order of the file.
 
         A motion consists of the position of the root joint (meters, camera axes), followed by 24
         axis-angle vectors.
@@ -126,7 +126,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
 
 def find(path: Path, name: str) -> Path:
-    """Returns `path` if it is a file, or the file called `name` in this folder or a subfolder.
+    """Returns `path` if it is a file, or else the file `name` in this folder or a subfolder.
 
     The error for a missing file states where the data set is published.
     """
@@ -140,7 +140,10 @@ def find(path: Path, name: str) -> Path:
 
 
 def read_lists(path: Path, *names: str) -> list[Any]:
-    """Returns the lists with these names from a pickled dictionary. Their lengths must be equal."""
+    """Returns the lists with the given names from a pickled dictionary.
+
+    All lists must have the same length.
+    """
     data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = (

@@ -1,4 +1,4 @@
-"""HumanML3D: motions from AMASS and HumanAct12 with descriptions, as features or SMPL parameters.
+"""HumanML3D: described motions from AMASS and HumanAct12, as features or SMPL parameters.
 
 Source: Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
 `docs/humanml3d.md`.
@@ -29,7 +29,7 @@ FPS = 20
 
 
 class IndexedClip(NamedTuple):
-    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps.
+    """A clip in `index.csv`: frames `start` to `end` of a recording, counted at 20 fps.
 
     `key` is the key of the recording (see `amass.key_of`) or, for a clip from HumanAct12, the name
     of its file.
@@ -58,7 +58,7 @@ def read_index(path: Path) -> list[IndexedClip]:
     """Reads `index.csv`.
 
     Raises:
-        UserError: If the file has a different layout, or refers to an unknown recording.
+        UserError: If the file has an unexpected layout, or refers to an unknown recording.
     """
     required(path, "it is index.csv from https://github.com/EricGuo5513/HumanML3D")
     rows = []
@@ -75,7 +75,7 @@ def read_index(path: Path) -> list[IndexedClip]:
 
 
 def by_recording(rows: Iterable[IndexedClip]) -> dict[str, list[IndexedClip]]:
-    """Returns the clips of each AMASS recording."""
+    """Groups the clips from AMASS by recording."""
     recordings = defaultdict(list)
     for row in rows:
         if not row.humanact12:
@@ -88,10 +88,10 @@ class HumanML3D(T2MFolder):
 
     Args:
         path: the folder, which must contain texts and splits.
-        exclude: names of motions to leave out. A mirrored copy has its own name.
-        amass: folder of AMASS's SMPL+H G release, as archives or unpacked, from which missing
-            motions are created. This also requires `index.csv` and HumanAct12's joints,
-            `pose_data/humanact12.zip`, in the folder or next to it.
+        exclude: names of motions to leave out. Mirrored copies have names of their own.
+        amass: folder of AMASS's SMPL+H G release, as archives or unpacked. Missing motions are
+            created from it. This also requires `index.csv` and HumanAct12's joint positions
+            (`pose_data/humanact12.zip`) in `path` or next to it.
         body_models: folder with the extended SMPL+H model.
         bone_lengths: 22 bone lengths, in meters, of the skeleton to which all motions are
             retargeted.
@@ -149,7 +149,7 @@ class HumanML3D(T2MFolder):
 
     @cached_property
     def humanact12_files(self) -> dict[str, Path]:
-        """Maps names to the files with HumanAct12's joint positions.
+        """The files with HumanAct12's joint positions, keyed by name.
 
         The dictionary is empty if the files are missing.
         """
@@ -158,7 +158,7 @@ class HumanML3D(T2MFolder):
         return {file.stem: file for file in folder.rglob("*.npy")}
 
     def _beside(self, *names: str) -> Path:
-        """Returns the first of these names that exists in the folder or next to it.
+        """Returns the path of the first of these names that exists in the folder or next to it.
 
         If none of them exists, returns the path that the first name would have in the folder.
         """
@@ -223,7 +223,7 @@ class HumanML3D(T2MFolder):
     def _write_statistics(self) -> None:
         """Writes the mean and std over all motions and their mirrored copies.
 
-        Motions of all lengths and splits are included.
+        Motions are included regardless of their length and split.
         """
         representation = HumanML("smpl22", "legacy")
         shapes = {name: self._load(name, mmap=True).shape for name in sorted(self._motions())}
@@ -244,7 +244,7 @@ class HumanML3D(T2MFolder):
 def _from_amass(
     write: partial[None], bodies: dict[str, Body], rows: Sequence[IndexedClip], recording: Recording
 ) -> int:
-    """Writes the features of all clips from a recording, and returns the number of clips.
+    """Writes the features of all clips of a recording, and returns the number of these clips.
 
     As in the published code, every gender other than "male" is treated as female.
     """
@@ -293,16 +293,16 @@ class HumanML3DSMPL(MotionSource):
     FLAME's code, there are no mirrored copies, length limits or cuts, and a caption that describes
     only a part is used for the entire motion. In five subsets, HumanML3D dropped the first frames
     of each recording. Unlike FLAME's code, this class accounts for the dropped frames, so that
-    motion and caption match.
+    motions and captions match.
 
     Args:
-        path: folder of HumanML3D with texts, splits and `index.csv`. The folder does not need to
+        path: folder of HumanML3D with texts, splits and `index.csv`. The folder does not have to
             contain motions.
         amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
         humanact12: path of FLAME's `humanact12_processed.pkl`. Without this file, the clips of
             HumanAct12 are left out.
-        published_split: whether to also train on the validation clips (called "final" in FLAME's
-            code), so that no clips are left for validation.
+        published_split: whether to also train on the validation clips, so that no clips are left
+            for validation. FLAME's code calls this "final".
     """
 
     name = "humanml3d-smpl"

@@ -35,13 +35,13 @@ class KITTemos(MotionSource):
     """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
 
     The recordings have 100 frames per second, and every eighth frame is used. Source: Petrovich,
-    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions of fewer than 10 or more
-    than 500 frames are left out of the training and validation splits. The test split contains all
-    motions, but only the first caption of each motion. The attribute `ghosh_test` states whether a
-    clip is in Ghosh et al.'s test split.
+    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions with fewer than 10 or
+    more than 500 frames are left out of the training and validation splits. The test split contains
+    all motions, but only the first caption of each motion. The attribute `ghosh_test` states
+    whether a clip is in Ghosh et al.'s test split.
 
-    `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`. `splits`
-    contains TEMOS's lists of these numbers.
+    The folder `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`
+    for each motion. The folder `splits` contains TEMOS's lists of these numbers.
     """
 
     name = "kit-temos"
@@ -64,7 +64,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def ghosh_test(self) -> set[str]:
-        """Names in Ghosh et al.'s test split, or an empty set if their list is missing."""
+        """The names in Ghosh et al.'s test split. The set is empty if their list is missing."""
         file = self.splits / "ghosh-test"
         return set(read_text(file).split()) if file.is_file() else set()
 
@@ -94,7 +94,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def frames(self) -> dict[str, int]:
-        """Length of each motion with captions, in frames at 12.5 frames per second."""
+        """The number of frames, at 12.5 frames per second, of each motion that has captions."""
         rows = {
             name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1
             for name in self.texts
@@ -108,7 +108,7 @@ class KITTemos(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         """Yields one clip per motion.
 
-        The `reference` of a test clip contains all frames of its recording.
+        The `reference` of a test clip includes every frame of its recording.
         """
         self.check_fps(fps, 12.5)
         for name, split in self.names.items():
@@ -135,7 +135,7 @@ class KITTemos(MotionSource):
             yield clip
 
     def counts(self) -> dict[str, int]:
-        """Returns the numbers of motions and captions, and the number of names in each split."""
+        """Returns the number of motions, of captions, and of names in each split."""
         texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))
         splits = list(read_splits(self.splits, "", self.get_it).values())
         counts = {split: splits.count(split) for split in SPLITS} | {
@@ -152,7 +152,7 @@ def _recording(task: tuple[Path, int]) -> np.ndarray:
 
 
 def read_joints(path: Path, step: int = 8) -> np.ndarray:
-    """Reads the joint positions (F, 21, 3) float32 in every `step`-th frame.
+    """Reads the joint positions (F, 21, 3) float32 of every `step`-th frame.
 
     The positions are in meters, with y up. KIT's unit is about 1/640 m.
     """

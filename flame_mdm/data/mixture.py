@@ -25,8 +25,8 @@ class Mixture(MotionSource):
 
     Args:
         parts: the data sets, each with a name of your choice.
-        use: purpose of the trained model. With "any", data sets with motions whose license is
-            unknown or permits only research are rejected. With "research", all data sets are
+        use: purpose of the trained model. With "any", a data set is rejected if it contains motions
+            whose license is unknown or permits only research. With "research", all data sets are
             accepted.
     """
 
@@ -52,7 +52,7 @@ class Mixture(MotionSource):
         """Returns the total number of clips in all parts.
 
         Raises:
-            UserError: If a license forbids this use of the data.
+            UserError: If a license forbids the use that is specified in the recipe.
         """
         self.check_licenses()
         return sum(part.count() for part in self.parts.values())
@@ -80,7 +80,7 @@ class Mixture(MotionSource):
                 )
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the clips of each part.
+        """Yields the clips of all parts, one part after the other.
 
         Actions with the same name have the same label in all parts.
         """
@@ -102,7 +102,7 @@ class Mixture(MotionSource):
         return [f"{name}: {line}" for name, part in self.parts.items() for line in part.findings()]
 
     def failure_lines(self) -> list[str]:
-        """Returns the lines to print about the failures of all parts."""
+        """Returns the failures of all parts as lines to print."""
         return [line for part in self.parts.values() for line in part.failure_lines()]
 
     def changed(self, store: Path) -> list[str]:
@@ -115,6 +115,6 @@ class Mixture(MotionSource):
             part.suit(representation)
 
     def check(self, fps: float) -> list[str]:
-        """Checks the licenses, and returns the lines to print about the files of all parts."""
+        """Checks the licenses, and returns the file reports of all parts."""
         self.check_licenses()
         return [line for part in self.parts.values() for line in part.check(fps)]

@@ -34,14 +34,15 @@ def in_order(
 ) -> Generator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks.
 
-    Only a few tasks are read ahead. If `tasks` is the result of another call of `in_order`, both
-    calls share one pool.
+    Only a few tasks are read ahead. If `tasks` is the result of another `in_order` call, both calls
+    share one pool.
 
     Args:
-        function: function to call with each task. It must be picklable, like its tasks and results.
+        function: function to call with each task. The function, the tasks and the results must be
+            picklable.
         tasks: the arguments of the function.
-        workers: number of processes. 1 = work in this process. 0 = start one process per core once
-            the work has taken `PATIENCE` seconds.
+        workers: number of processes. 1 = work in this process. 0 = start one process per core if
+            the work takes longer than `PATIENCE` seconds.
 
     Raises:
         UserError: If a worker process died, for example because the system ran out of memory.

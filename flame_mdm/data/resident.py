@@ -73,15 +73,15 @@ def adapts_cuts(representation: Representation) -> bool:
 
 
 class ResidentLoader:
-    """Loads the batches of a split by gathering features on the device.
+    """Loads the batches of a split by gathering their features on the device.
 
     The batches are bit-identical to the batches of the data loader.
 
     Args:
         clips: clips of the split.
-        batches: the draws that make up each batch.
+        batches: for each batch, the list of its draws.
         features: (N + 1, D), as returned by `resident_features`.
-        multiple: each batch is padded to a multiple of this number of frames.
+        multiple: number of frames; each batch is padded to a multiple of it.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class ResidentLoader:
             )
 
     def _features(self, rows: Tensor, mask: Tensor) -> Tensor:
-        """Returns the normalized features (B, F, D) at rows (B, F) of `features`."""
+        """Gathers rows (B, F) of `features` and returns normalized features (B, F, D)."""
         x = F.embedding(rows, self.features)
         if not adapts_cuts(self.clips.representation):
             return x

@@ -1,14 +1,15 @@
-"""Reader for pickles that does not run any code in them.
+"""Reader for pickles that does not run any code that they contain.
 
 The reader supports arrays, numbers, text, lists, tuples, and dictionaries with text keys. A pickle
-can name any function, which is then called when the pickle is loaded. This reader never calls these
-functions: it only records the arguments and the state of each object, and creates arrays from the
-recorded bytes. NumPy's own functions are not used for this purpose, because a wrong byte in a dtype
-makes them crash.
+can name any function, and Python calls this function when the pickle is loaded. This reader never
+calls these functions: it only records the arguments and the state of each object, and creates
+arrays from the recorded bytes. NumPy's own functions are not used for this purpose, because a wrong
+byte in a dtype can crash them.
 
 Python's C unpickler allocates as much memory as a file declares, even if the file has only ten
 bytes. Therefore, this reader is based on the Python version of the unpickler, and never reads more
-bytes than are left in the file. Repeated content counts toward the size limit each time.
+bytes than are left in the file. If content is repeated, each repetition counts toward the size
+limit.
 """
 
 import pickle
@@ -70,7 +71,8 @@ class _Dictionary(dict[str, Any]):
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    `opaque` contains prefixes of global names. An object of such a global is replaced by its state.
+    `opaque` contains prefixes of global names. Objects of these globals are replaced by their
+    state.
     """
 
     stack: list[Any]
@@ -94,7 +96,7 @@ class _Unpickler(pickle._Unpickler):
         return self.file.read(size)
 
     def find_class(self, module_name: str, global_name: str, /) -> type[_Object]:
-        """Returns the class that represents objects of a permitted global.
+        """Returns the class that stands for a permitted global.
 
         Raises:
             UnpicklingError: If the global is not permitted.
@@ -126,7 +128,7 @@ class _Unpickler(pickle._Unpickler):
     def plain_object(self, name: str, value: _Object) -> Any:
         """Returns the array, number or text that an object describes.
 
-        For an opaque object, its state is returned.
+        If the object is opaque, its state is returned.
         """
         if name == ARRAY:
             _, shape, dtype, is_fortran, data = value.state
@@ -187,8 +189,8 @@ class _Unpickler(pickle._Unpickler):
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle with protocol 0 to 5.
 
-    Objects of globals whose names begin with one of the prefixes in `opaque` are also permitted.
-    They are replaced by their state.
+    Objects of globals whose names begin with one of the prefixes in `opaque` are also permitted,
+    and are replaced by their state.
 
     Raises:
         UserError: If the file is damaged, or refers to other globals.

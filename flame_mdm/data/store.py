@@ -12,7 +12,7 @@ changed:
     store.json       representation, frame rate, options of the source, counts, hashes of the other
                      files, fingerprint
 
-Verification adds the report `verify.json` to the folder.
+Verifying the store adds the report `verify.json` to the folder.
 """
 
 import hashlib
@@ -62,7 +62,7 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 @dataclass(frozen=True)
 class Entry:
-    """One clip of a store: `length` frames of the packed array, beginning with frame `start`.
+    """A clip in a store: `length` frames of the packed array, beginning with frame `start`.
 
     All other fields have the same meaning as in `Clip`.
     """
@@ -79,7 +79,7 @@ class Entry:
 
 
 class Contents(Schema):
-    """The values in store.json that commands require."""
+    """The values in store.json that commands need."""
 
     format: Literal[1]
     dataset: str
@@ -150,7 +150,7 @@ class Store:
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
         """Returns the joint positions of clips at the frame rate of their recordings.
 
-        Returns None if they are missing for any of the clips.
+        The result is None if positions are missing for any of the clips.
         """
         if "references.npz" not in self.info["sha256"]:
             return None
@@ -159,7 +159,7 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Returns the number of clips, their total minutes and their actions for each license.
+        """Lists each license with the number of its clips, their total minutes and their actions.
 
         The list is empty if the data set does not specify licenses. Copies of a clip are counted
         once.
@@ -205,7 +205,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     existing intact store is replaced.
 
     Raises:
-        UserError: If `folder` contains anything except an intact store.
+        UserError: If `folder` contains anything other than an intact store.
     """
     source.suit(representation)
     total, before = source.count(), (folder / "store.json").exists()
@@ -225,7 +225,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 
 def _replaceable(folder: Path) -> list[Path]:
-    """Returns the files of the store in a folder, with `store.json` first.
+    """Returns the files of the store in a folder, beginning with `store.json`.
 
     The list is empty if the folder is missing or empty.
 
@@ -287,7 +287,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 def _line(entry: Entry) -> str:
-    """Returns the line of a clip in clips.jsonl.
+    """Returns the line that represents a clip in clips.jsonl.
 
     If the clip has no license, the key `license` is left out, as in older stores.
     """
@@ -357,7 +357,7 @@ def _pack(
 
 
 def _write_header(file: IO[bytes], frames: int, features: int) -> None:
-    """Writes the header of features.npy, which NumPy pads to the same size for any frame count."""
+    """Writes a header to features.npy. NumPy pads it to the same size for any frame count."""
     np.lib.format.write_array_header_1_0(
         file, {"descr": "<f4", "fortran_order": False, "shape": (frames, features)}
     )
@@ -366,7 +366,7 @@ def _write_header(file: IO[bytes], frames: int, features: int) -> None:
 def training_statistics(
     folder: Path, clips: Iterable[Entry], frames: int, representation: Representation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the mean and std (D,) of the training frames of a store.
+    """Returns the mean and std (D,) of the training frames in a store.
 
     The frames are read from the file in blocks.
     """
@@ -390,7 +390,7 @@ def _encoded(
 ) -> Generator[tuple[Clip, np.ndarray]]:
     """Yields each clip with the features of its entire motion, encoded in worker processes.
 
-    A motion with several clips is encoded only once.
+    If a motion has several clips, it is encoded only once.
     """
     groups: deque[list[Clip]] = deque()
 

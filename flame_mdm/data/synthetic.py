@@ -85,7 +85,7 @@ def content() -> dict[str, Any]:
 def draw_captions(
     rng: np.random.Generator, attributes: Attributes, count: int, incomplete: bool = False
 ) -> tuple[list[str], Attributes]:
-    """Draws `count` different captions for a clip, and returns them with the attributes they state.
+    """Draws `count` different captions for a clip, and also returns the attributes that they state.
 
     If `incomplete` is True, all captions omit the same attributes, provided that the grammar
     contains such captions.
@@ -164,7 +164,7 @@ def _template(rng: np.random.Generator, attributes: Attributes) -> str:
 
 
 def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str, int]]) -> str:
-    """Returns the text with all verbs in one tense, which is drawn from `tenses`."""
+    """Conjugates all verbs in the text in one tense, which is drawn from `tenses`."""
     auxiliary, column = _one(rng, tenses)
 
     def form(verb: re.Match[str]) -> str:
@@ -178,7 +178,7 @@ def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str,
 
 
 def entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
-    """Returns the entry for the action and one of its attributes, such as "walk left".
+    """Returns the table entry for the action and one of its attributes, such as "walk left".
 
     If there is no such entry, the result is the entry for the action alone, or None if that is also
     missing.
@@ -193,7 +193,7 @@ def _one(rng: np.random.Generator, choices: Any) -> Any:
 
 
 def _joints(rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> np.ndarray:
-    """Returns the joint positions (F, 22, 3) of a motion with these attributes.
+    """Returns the joint positions (F, 22, 3) of a motion with the given attributes.
 
     The times `t` (F,) are in seconds.
     """
@@ -220,12 +220,12 @@ class Synthetic(MotionSource):
 
     Args:
         clips: number of clips.
-        seed: seed of the clips, which must be 0 or more.
+        seed: seed for the clips, which must be 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
         actions: "core" for 22 actions, or "all" to add 54 actions, clips of two simultaneous
             actions, and parts of cycles.
-        core_share: if `actions` is "all", the fraction of clips that are drawn from the 22 core
-            actions, as with "core". All other clips are drawn from all actions.
+        core_share: if `actions` is "all", the fraction of clips whose action is drawn from the 22
+            core actions, as with "core". For all other clips, it is drawn from all actions.
         often: names of actions to show more often, each with the same probability. This helps with
             quick, small and rare motions, which models learn last.
         often_share: fraction of the clips whose action is drawn from `often`.
@@ -301,7 +301,7 @@ class Synthetic(MotionSource):
     def described(
         self, name: str, motion: np.ndarray, attributes: Attributes, words: np.random.Generator
     ) -> Clip:
-        """Returns the clip for a motion (F, 22, 3), including its captions.
+        """Returns a clip with the given motion (F, 22, 3) and with captions.
 
         The captions are drawn with the generator `words`. The split depends on the name of the
         clip.
@@ -374,7 +374,8 @@ def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
 def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
     """Returns joint positions (F, 22, 3) of a three-second motion with the given attributes.
 
-    The attributes may be incomplete, like the attributes of a prompt. Missing attributes are drawn.
+    The attributes may be incomplete, like the attributes of a prompt. Missing attributes are drawn
+    at random.
     """
     name = str(attributes["action"])
     drawn = attributes

@@ -2,8 +2,8 @@
 
 `CORE` contains the actions of the data set `synthetic`. `MORE` contains the actions that
 `Synthetic(actions="all")` adds. `CYCLES` contains the actions whose clips may begin and end in the
-middle of the action. Clips of two simultaneous actions combine an action of `BASES` with an action
-of `GESTURES`.
+middle of the action. Clips with two simultaneous actions combine an action from `BASES` with one
+from `GESTURES`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -182,7 +182,7 @@ def drawn_from(rng: np.random.Generator, actions: Mapping[str, Action]) -> str:
 
 
 def move(body: Body, rng: np.random.Generator, t: np.ndarray, attributes: Attributes) -> None:
-    """Moves a body through the action or the two simultaneous actions in the attributes."""
+    """Animates a body with one action or two simultaneous actions, as the attributes specify."""
     name, cyclic = str(attributes["action"]), attributes.get("ends") == "cycle"
     action = CYCLES[name] if cyclic else ACTIONS[name]
     action.motion(body, rng, t, attributes)

@@ -55,15 +55,15 @@ HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothin
 
 
 class SyntheticSequences(Synthetic):
-    """Clips with the end of a previous motion and the motion that the captions describe.
+    """Clips that show the end of a previous motion, followed by the motion in the captions.
 
     The previous motion is a different action, the same action, or standing still. The described
-    motion begins before the body comes to rest. People who sit, lie or kneel stand up first.
+    motion begins before the body comes to rest. A person who sits, lies or kneels stands up first.
     Motions such as walking continue until the end of the clip.
 
     Args:
         clips: number of clips.
-        seed: seed of the clips, which must be 0 or more.
+        seed: seed for the clips, which must be 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
         often: see `Synthetic`.
         often_share: see `Synthetic`.
@@ -100,7 +100,7 @@ class SyntheticSequences(Synthetic):
 
 
 def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Body:
-    """Returns a body that moves through an entire clip.
+    """Returns a body that performs the motion of an entire clip.
 
     The clip consists of the end of a previous motion, a transition to the required posture, and the
     motion itself.
@@ -160,9 +160,9 @@ def _way(rng: np.random.Generator, posture: str, fps: float, up: bool = False) -
 def _moved(
     rng: np.random.Generator, attributes: Attributes, fps: float, whole: bool = True
 ) -> Body:
-    """Returns a body that moves through the action.
+    """Returns a body that performs an action.
 
-    If the action is endless and `whole` is False, its end is cut off.
+    If the action can continue indefinitely and `whole` is False, its end is cut off.
     """
     action = ACTIONS[str(attributes["action"])]
     shortest = max(SECONDS[0], 0.35 + 0.8 * int(attributes.get("count", 0)), action.seconds)

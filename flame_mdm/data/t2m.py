@@ -54,7 +54,7 @@ class Cut(NamedTuple):
     def clip(
         self, motion: np.ndarray, split: Split, source: str, encoded: str = "", **facts: str
     ) -> Clip:
-        """Returns the clip that this cut selects from a motion.
+        """Cuts this part from a motion and returns it as a clip.
 
         `facts` are additional attributes. The attribute `tokens` is left out if any description has
         no tokens.
@@ -125,7 +125,7 @@ def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
 
 
 def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
-    """Maps each name to its split, in the order of the lists.
+    """Reads the lists of names, and maps each name to its split, in the original order.
 
     Raises:
         UserError: If a name is in two splits.
@@ -140,11 +140,11 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 
 
 class T2MFolder(MotionSource):
-    """Reader for a processed folder in the layout that this module describes.
+    """Reader for a processed folder with the layout of HumanML3D and KIT-ML.
 
     Cuts and mirrored copies are in the same split as their motion. The attribute `tokens` contains
-    the words with their parts of speech, one list per caption. Mirrored copies have names of their
-    own, so they can be excluded separately.
+    one list per caption, with its words and their parts of speech. Mirrored copies have names of
+    their own, so they can be excluded separately.
     """
 
     representation: str  # name of the representation of the features in the folder
@@ -220,7 +220,7 @@ class T2MFolder(MotionSource):
         return mean, std
 
     def counts(self) -> dict[str, float]:
-        """Returns the statistics that `published.yaml` lists.
+        """Returns the statistics that are listed in `published.yaml`.
 
         Motions, texts and words are counted without mirrored copies.
         """

@@ -40,7 +40,7 @@ NAME = re.compile(r"(a(\d+)_d(\d+)_p(\d+)_c(\d+))(_.*)?")
 
 
 class Video(NamedTuple):
-    """The fields of a video's file name.
+    """The fields in the file name of a video.
 
     `index` is the position of the video in the published lists.
     """
@@ -56,8 +56,8 @@ class Video(NamedTuple):
 class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl` as raw SMPL motions, rotated to the front view.
 
-    As in the published data set, training clips of fewer than 45 frames are left out, and all test
-    clips are kept. In the published split, all 51 training subjects are used for training. The
+    As in the published data set, training clips with fewer than 45 frames are left out, and all
+    test clips are kept. In the published split, all 51 training subjects are used for training. The
     project's own split uses 5 of these subjects for validation.
     """
 
@@ -71,7 +71,7 @@ class UESTC(MotionSource):
     def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Names of the actions.
 
-        They are read before any clip, because models require the number of actions.
+        The names are read before any clip, because models require the number of actions.
         """
         return tuple(self._lines("action_classes.txt"))
 
@@ -83,7 +83,7 @@ class UESTC(MotionSource):
         return len(self.used)  # including the few that are left out when their poses are read
 
     def counts(self) -> dict[str, int]:
-        """Returns the numbers of videos and subjects."""
+        """Returns the number of videos and the number of subjects."""
         return {"videos": len(self.videos), "subjects": len({video.subject for video in self.used})}
 
     @cached_property
@@ -178,7 +178,7 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
         pose: (F, 72), axis-angle vectors.
         root: (F, 3), position of the root relative to the body.
         camera: (F, 4), the scales sx and sy, followed by the shift. The scale sy is not used.
-        video: the fields of the video's file name.
+        video: the fields in the video's file name.
 
     Returns:
         The translation relative to the first frame, followed by the pose, both in camera axes.

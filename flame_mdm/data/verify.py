@@ -32,9 +32,9 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
     Returns:
         The content of the report: the data set, the hashes of its `files`, its `figures` next to
-        the published ones, the numbers of captions and clips per action, the lengths of the clips,
-        clips that are `still` or `duplicates`, deviations of the stored statistics, and `excluded`
-        clips.
+        the published ones, the number of captions and of clips per action, the lengths of the
+        clips, clips that are `still` or `duplicates`, deviations of the stored statistics, and
+        `excluded` clips.
 
     Raises:
         FileNotFoundError: If the data set is not prepared.
@@ -100,7 +100,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
 
 def lines(content: dict[str, Any]) -> list[str]:
-    """Returns the lines of a report as YAML. Long lists of clips are shortened."""
+    """Returns a report as lines of YAML. Long lists of clips are shortened."""
     groups = [" = ".join(group) for group in content["duplicates"]]
     shown = content | {
         "still": some(content["still"]) or "none",
@@ -112,7 +112,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns one line for each figure in a report that differs from the published figure."""
+    """Returns one line for each of a report's figures that differs from the published figure."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()
@@ -125,9 +125,9 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns the numbers for the store and its raw data, next to the published ones.
+    """Returns the figures for the store and its raw data, together with the published ones.
 
-    A number that exists for both is listed twice: the number for the store is then called `NAME of
+    If a figure exists for both, it is listed twice, and the figure for the store is called `NAME of
     the store`.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]

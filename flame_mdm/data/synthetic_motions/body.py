@@ -71,7 +71,7 @@ class Body:
     def __init__(
         self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
     ):
-        """`width` is half the distance between the feet in meters, or a range to draw it from.
+        """`width` is half the distance between the feet in meters, or a range to sample it from.
 
         None = the width of a relaxed stance.
         """
@@ -114,9 +114,9 @@ class Body:
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
 
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
-        """Blends the current pose of an arm with another pose, whose weight is `weight` (F,).
+        """Blends the current pose of an arm with another pose, which has the weight `weight` (F,).
 
-        The other pose consists of four angles: forward, sideways, outward rotation, and elbow.
+        The other pose consists of four angles: forward, sideways, outward rotation and elbow bend.
         """
         for angle, target in enumerate(pose):
             self.arms[side, angle] += weight * (target - self.arms[side, angle])
@@ -131,8 +131,8 @@ class Body:
         """Moves a wrist toward a point (3,) or (F, 3), in meters, by the fraction `weight` (F,).
 
         If the weight is 0, the angles of the arm determine the position of the wrist. `frame` is
-        "world", "chest" or "head". For chest and head, the point is relative to this joint, with x
-        to the left and z ahead.
+        "world", "chest" or "head". With "chest" and "head", the point is relative to this joint,
+        with x to the left and z ahead.
         """
         self.reaches.append((side, weight[:, None], np.asarray(target, float), frame))
 
@@ -220,7 +220,7 @@ class Body:
 def bent(
     start: np.ndarray, end: np.ndarray, upper: float, lower: float, toward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the middle and the end (F, 3) of a two-bone limb that reaches for `end`.
+    """Returns the middle joint and the end (F, 3) of a two-bone limb that reaches for `end`.
 
     The limb bends in the direction `toward` (F, 3).
     """
@@ -250,7 +250,7 @@ def step(
     lift: float = 0.09,
     heel: float = 0.3,
 ) -> None:
-    """Moves a foot by (x, y, z), in meters, between two points in time.
+    """Moves a foot by (x, y, z) meters between two points in time.
 
     The heel leaves the floor first; `heel` is its angle in radians. If the foot lands at another
     height (y is not 0), its horizontal motion begins later.

@@ -37,7 +37,7 @@ def stance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attri
 
 
 def dodge(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Steps aside or back within a fraction of a second, then returns to an upright stance."""
+    """Dodges to the side or back in a fraction of a second, then stands upright again."""
     start = rng.uniform(0.3, 0.7)
     quick = pulse(t, start, start + 0.28, start + 0.5, start + 1.1)
     guard(body, pulse(t, 0.05, 0.35, start + 0.7, t[-1]))
@@ -75,7 +75,7 @@ def duck(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def hit(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Is struck from the front: the head and trunk snap back, and one foot steps back."""
+    """Reacts to a blow from the front: the head and trunk snap back, and one foot steps back."""
     start, side = rng.uniform(0.3, 0.6), int(rng.integers(2))
     sign, snap = SIGN[side], rng.uniform(0.8, 1.1)
     jerk = pulse(t, start, start + 0.14, start + 0.2, start + 0.8)

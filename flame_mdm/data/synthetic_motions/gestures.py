@@ -106,7 +106,7 @@ def clap(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attribu
 
 
 def salute(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Brings a hand to the brow, holds it and lowers it."""
+    """Brings a hand to the brow, holds it there and lowers it."""
     (side,) = SIDES[str(requested["side"])]
     start = rng.uniform(0.1, 0.3)
     up = pulse(t, start, start + rng.uniform(0.45, 0.6), t[-1] - 0.6, t[-1])

@@ -1,6 +1,6 @@
 """Joins two motions.
 
-The second motion begins at the position and in the pose at the end of the first motion.
+The second motion begins in the position and pose in which the first motion ends.
 """
 
 import copy
@@ -21,7 +21,7 @@ STEP_SECONDS, STEP_HEIGHT = 0.35, 0.07
 
 
 def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) -> Body:
-    """Returns a body that moves like `first` and then, from the end of `first`, like `second`.
+    """Returns a body that moves like `first` until the end of `first`, and then like `second`.
 
     The changes during the second motion are added to the end of the first motion. The difference
     between the end of the first and the beginning of the second motion is faded out, except for the
@@ -63,7 +63,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
         getattr(joined, name)[..., 1] = after[name][..., 1] + height
 
     def world(points: np.ndarray) -> np.ndarray:
-        """Returns points of the second motion at their positions in the joined motion."""
+        """Converts points of the second motion to their positions in the joined motion."""
         return first.position[-1] * ground + (points - second.position[0] * ground) @ turn.T
 
     ground = np.array([1.0, 0.0, 1.0])
@@ -92,7 +92,7 @@ def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) ->
 
 
 def frames_of(body: Body, frames: np.ndarray) -> Body:
-    """Returns a body with selected frames (N,) of another body, at the same frame rate."""
+    """Returns a body that consists of selected frames (N,) of another body."""
     part = copy.copy(body)
     part.t = np.arange(len(frames)) * (body.t[1] - body.t[0])
     for name, axis in FRAMES.items():

@@ -51,10 +51,10 @@ class Gait:
 def walk_along(
     body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int
 ) -> np.ndarray:
-    """Moves the pelvis along a path at `speed` m/s, with footprints on both sides of the path.
+    """Moves the pelvis along a path at `speed` m/s, and places footprints on both sides of it.
 
-    The foot `first` takes the first step. Returns the distance (F,), in meters, by which the right
-    foot is in front of the left foot, along the heading of the pelvis.
+    The foot `first` takes the first step. Returns how far (F,) the right foot is in front of the
+    left foot, in meters along the heading of the pelvis.
     """
     # The pelvis accelerates, keeps its speed and stops. Each footprint is at the position of the
     # pelvis in the middle of the foot's next stance, shifted sideways by the width of the gait. On

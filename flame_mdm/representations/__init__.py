@@ -17,7 +17,7 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set, which can be read in parts and any number of times."""
+    """All frames (N, D) of a data set, which can be read in parts and more than once."""
 
     # Returns arrays (F, D) of arbitrary lengths, in the same order each time
     arrays: Callable[[], Iterable[np.ndarray]]
@@ -27,10 +27,7 @@ class Frames:
         return self.count
 
     def split(self, size: int) -> Iterator[Tensor]:
-        """Yields consecutive parts (size, D), like `Tensor.split`.
-
-        The last part may be shorter.
-        """
+        """Yields consecutive parts (size, D), like `Tensor.split`. The last part may be shorter."""
         pending: list[np.ndarray] = []
         for array in self.arrays():
             pending.append(array)
@@ -48,7 +45,7 @@ class Representation(nn.Module, ABC):
     The mean and std are buffers, so that sampling does not require the data set.
 
     Args:
-        name: name that is used in stores and checkpoints. Features of representations with
+        name: name of the representation in stores and checkpoints. Features of representations with
             different names are never combined.
         features: D, the number of features per frame.
         fps: frames per second, 1 to 1000.
@@ -119,7 +116,7 @@ class Representation(nn.Module, ABC):
         return features.new_zeros(*features.shape[:-1], 0, 6)
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Computes the mean and std (D,) for normalization from all training frames (N, D).
+        """Computes the mean and std (D,) of all training frames (N, D) for normalization.
 
         Without `slices`, features are not normalized: the mean is 0 and the std is 1.
         """
@@ -129,27 +126,27 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (D,) that is True for features of these joints.
+        """Returns a bool mask (D,) that is True for the features of the given joints.
 
         Features of the root trajectory belong to joint 0.
         """
 
     def joint_mask(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (J,) that is True for these joints."""
+        """Returns a bool mask (J,) that is True for the given joints."""
         mask = torch.zeros(len(self.skeleton), dtype=torch.bool)
         mask[list(joints)] = True
         return mask
 
     def contacts(self, features: Features) -> Features | None:
-        """Returns the columns (..., F, N) for the floor contacts of `skeleton.feet`.
+        """Returns the feature columns (..., F, N) with the floor contacts of `skeleton.feet`.
 
-        The values range from about 0 to 1. Returns None if the features contain no contacts.
+        The values range from about 0 to 1. The result is None if the features contain no contacts.
         """
         columns = self.slices.get("contacts")
         return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
-        """Adapts the features (..., F, D) of cut clips, so that they start like complete motions.
+        """Adapts the features (..., F, D) of cut clips to make them start like complete motions.
 
         By default, the features are returned unchanged.
         """
@@ -200,7 +197,7 @@ def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tu
 
 
 def moments(features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-    """Returns the float64 mean (D,) and sum of squared deviations (D,) of frames (N, D)."""
+    """Returns the mean (D,) and the sum of squared deviations (D,) of frames (N, D) in float64."""
     size, zero = 1 << 16, torch.zeros(())  # all frames of a data set would not fit in memory
     mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
     return mean, sum(

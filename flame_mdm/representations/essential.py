@@ -1,4 +1,4 @@
-"""MARDM's essential features: HumanML3D's features that determine the joint positions."""
+"""MARDM's essential features: those of HumanML3D's features that determine joint positions."""
 
 from flame_mdm.representations.humanml import HumanML
 
@@ -6,7 +6,7 @@ from flame_mdm.representations.humanml import HumanML
 class Essential(HumanML):
     """The first 67 of HumanML3D's 263 features (Meng et al. 2025, MARDM).
 
-    For KIT, these are the first 64 of 251 features. For J joints, there are 3 J + 1 features.
+    For KIT, the features are the first 64 of 251. For J joints, there are 3 J + 1 features.
     `HumanML` describes the arguments and the columns.
 
     Example:

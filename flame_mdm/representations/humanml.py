@@ -49,10 +49,10 @@ class HumanML(Representation):
     `decode` also follows the published code. If a bone points exactly opposite to its rest
     direction, the published code returns NaN. This implementation returns a half turn instead.
 
-    The variant "clean" has none of these peculiarities. Headings are unwrapped and padded
-    point-symmetrically at both ends before they are smoothed, which preserves steady turns and the
-    first and last heading. Rotations are computed after the body is turned to +z, and are relative
-    to the parent in the skeleton.
+    The variant "clean" has none of these peculiarities. Before headings are smoothed, they are
+    unwrapped and padded point-symmetrically at both ends, so that steady turns and the first and
+    last heading are preserved. Rotations are computed after the body is turned to face +z, and are
+    relative to the parent in the skeleton.
 
     Input and output joint positions are in meters. Features are in units of 1 / `units_per_metre`
     meters (KIT: 1/640).
@@ -63,14 +63,14 @@ class HumanML(Representation):
         fps: frames per second.
         bone_lengths: for each of the J joints, the length of the bone that ends there, in the
             features' unit. All motions are retargeted to these lengths. None = each motion keeps
-            its own lengths.
+            its own bone lengths.
         units_per_metre: number of the features' length units per meter.
         contact_threshold: squared displacement of a foot per frame, in the features' unit, below
             which the foot is considered to be in contact with the floor. HumanML3D uses 0.002, and
             KIT uses 0.05.
 
     Raises:
-        UserError: If the skeleton is unknown, or if `bone_lengths` do not fit the skeleton.
+        UserError: If the skeleton is unknown, or if `bone_lengths` does not match the skeleton.
 
     Example:
         >>> representation = HumanML()
@@ -167,10 +167,10 @@ class HumanML(Representation):
         return -2.0 if self.legacy else 1.0
 
     def root_steps(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the turns (..., F) and steps (..., F, 2) of the root from each frame to the next.
+        """Returns how the root turns (..., F) and moves (..., F, 2) from each frame to the next.
 
-        Turns are in radians, positive to the left. A step consists of the distances to the left of
-        the body and forward, in meters.
+        Turns are in radians, positive to the left. The movement consists of the distance to the
+        left of the body and the distance forward, in meters.
 
         Args:
             features: (..., F, D) in the data's units.
@@ -179,9 +179,9 @@ class HumanML(Representation):
         return turn, features[..., self.slices["root_velocity"]] / self.units_per_metre
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (D,) that is True for features of these joints.
+        """Returns a bool mask (D,) that is True for the features of the given joints.
 
-        For the joints of the lower body and the root, the mask equals MDM's `HML_LOWER_BODY_MASK`.
+        For the root and the joints of the lower body, the mask equals MDM's `HML_LOWER_BODY_MASK`.
         """
         part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
@@ -191,7 +191,7 @@ class HumanML(Representation):
         ]
 
     def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
-        """Returns all frames (N, J, 3) of the canonical motions, and the lengths of the motions.
+        """Makes motions canonical, and returns all their frames (N, J, 3) and their lengths.
 
         Frames are float64 in the features' unit.
         """
@@ -222,9 +222,9 @@ class HumanML(Representation):
         ), lengths
 
     def _retarget(self, joints: Tensor, first: Tensor, clip: Tensor) -> Tensor:
-        """Sets the bone lengths and scales the root trajectory.
+        """Changes the bone lengths and scales the root trajectory.
 
-        The scale is the ratio of leg lengths in the first frame.
+        The scale is the ratio of the new and old leg lengths in the first frame.
         """
         target = torch.tensor(self.bone_lengths, dtype=joints.dtype)
         bones = self.skeleton.bones(joints)
@@ -237,8 +237,8 @@ class HumanML(Representation):
     def _facing(self, joints: Tensor, hips: float = 1.0) -> Tensor:
         """Returns the x and z components (N, 2) of the direction that the hips and shoulders face.
 
-        The direction is the cross product of the vertical and the direction to the right. The
-        vector is shorter if the body lies on its side. `hips` is the weight of the hips.
+        The direction is the cross product of the vertical and the direction to the right. If the
+        body lies on its side, the vector is shorter. `hips` is the weight of the hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[
             :, list(self.skeleton.facing)
@@ -264,9 +264,10 @@ class HumanML(Representation):
         return torch.from_numpy(smooth - smooth[0])
 
     def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
-        """Returns the shortest arcs from the rest directions to the bones.
+        """Returns the shortest arcs from the rest directions to the directions of the bones.
 
-        The arcs (N, J - 1, 6) are 6D columns. Each arc is relative to the arc of the parent.
+        The arcs (N, J - 1, 6) are given as 6D columns. Each arc is relative to the arc of the
+        parent.
         """
         rest = joints.new_tensor(self.skeleton.raw_offsets)
         arcs = rotation.between(rest, self.skeleton.bones(joints))

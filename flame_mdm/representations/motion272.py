@@ -27,13 +27,13 @@ class Motion272(Representation):
 
     In the first row, `turn` is the identity, and velocities are 0. The heading is computed from the
     root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z. In
-    raw motions, which `smpl.read_pose` describes, z is up. Bones have the lengths of `offsets`,
-    whereas the authors keep the bone lengths of each subject.
+    raw motions (see `smpl.read_pose`), z is up. Bone lengths are determined by `offsets`, whereas
+    the authors keep each subject's bone lengths.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offset of each joint from its parent in the rest pose, in meters. The first
-            offset leads from the translation to the pelvis. Default: `ADULT`.
+        offsets: (24, 3), offsets of the joints from their parents in the rest pose, in meters. The
+            first offset leads from the translation to the pelvis. Default: `ADULT`.
 
     Example:
         >>> representation = Motion272()
@@ -66,7 +66,7 @@ class Motion272(Representation):
         return self.features_of(joints, rotations)
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
-        """Returns features (F, 272) float32 for joint positions and rotations (F, 22, 3, 3).
+        """Returns features (F, 272) float32 from joint positions and rotations (F, 22, 3, 3).
 
         The joint positions have the shape (F, 22, 3). In both arguments, y is up, and the body
         faces +z in the first frame.
@@ -154,7 +154,7 @@ class Motion272(Representation):
         return cut
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (272,) that is True for features of these joints.
+        """Returns a bool mask (272,) that is True for the features of the given joints.
 
         The root trajectory belongs to joint 0.
         """
@@ -174,7 +174,7 @@ def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor
 
 
 def _to_body(rotations: Tensor) -> Tensor:
-    """Returns rotations (F, 3, 3) about y that turn the z axis of the root to +z.
+    """Returns rotations (F, 3, 3) about y that turn the root's z axis to +z.
 
     The root is joint 0 of the rotations (F, J, 3, 3).
     """

@@ -20,7 +20,7 @@ The published code removes the root, but still uses the original indices of hips
 
 
 class Rifke(Representation):
-    """The 64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, which FLAME also uses.
+    """The 64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints; FLAME also uses them.
 
     A motion of T frames is encoded as T rows.
 
@@ -31,9 +31,9 @@ class Rifke(Representation):
     | 61 | heading change since the previous frame in radians; 0 in the first frame |
     | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |
 
-    Three peculiarities of the published code are kept. The floor is a soft minimum, which depends
-    on the unit of length. Heading changes are not unwrapped. The heading is computed from knees
-    and elbows instead of the intended hips and shoulders.
+    Three peculiarities of the published code are kept. The height of the floor is a soft minimum,
+    which depends on the unit of length. Heading changes are not unwrapped. The heading is computed
+    from knees and elbows instead of the intended hips and shoulders.
 
     Args:
         fps: frames per second.
@@ -89,9 +89,9 @@ class Rifke(Representation):
         )
 
     def floor(self, joints: Tensor) -> Tensor:
-        """Estimates the height of the floor from joint positions (T, 21, 3), both in KIT's unit.
+        """Estimates the height of the floor from joint positions (T, 21, 3).
 
-        The estimate is a soft minimum, over time, of the height of the lowest foot.
+        Both are in KIT's unit. The estimate is a soft minimum, over time, of the height of the lowest foot.
         """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()
@@ -100,15 +100,15 @@ class Rifke(Representation):
     def heading(self, joints: Tensor) -> Tensor:
         """Returns the heading (T,) of a body with joint positions (T, 21, 3).
 
-        Headings are in radians, in (-pi, pi]. A body with heading 0 faces +z. Positive headings
-        turn toward +x.
+        Headings are in radians in (-pi, pi]. A body with heading 0 faces +z. Positive headings are
+        turned toward +x.
         """
         left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (64,) that is True for features of these joints.
+        """Returns a bool mask (64,) that is True for the features of the given joints.
 
         The root trajectory belongs to joint 0.
         """

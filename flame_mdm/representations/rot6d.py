@@ -17,12 +17,12 @@ class Rot6D(Representation):
 
     The features are 24 rotations as 6D rows, followed by (x, y, z, 0, 0, 0). (x, y, z) is the
     root's translation relative to the first frame. It is in meters and in camera coordinates, where
-    y points down and z points away from the camera. `smpl.read_pose` describes raw motions.
+    y points down and z points away from the camera. For raw motions, see `smpl.read_pose`.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offset of each joint from its parent in the rest pose, in meters, for
-            decoding. Default: `ADULT`.
+        offsets: (24, 3), offsets of the joints from their parents in the rest pose, in meters; used
+            for decoding. Default: `ADULT`.
 
     Example:
         >>> representation = Rot6D()
@@ -44,7 +44,7 @@ class Rot6D(Representation):
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
 
     def rebase(self, features: Features) -> Features:
-        """Makes the root translation of cut clips (..., F, D) relative to their first frame."""
+        """Makes the root translation of each cut clip (..., F, D) relative to its first frame."""
         moved = deepcopy(features)
         translation = moved[..., 144:147]
         translation -= features[..., :1, 144:147]
@@ -67,7 +67,7 @@ class Rot6D(Representation):
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (150,) that is True for features of these joints.
+        """Returns a bool mask (150,) that is True for the features of the given joints.
 
         The translation belongs to joint 0.
         """

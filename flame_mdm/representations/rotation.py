@@ -89,10 +89,10 @@ def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
 def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     """Converts 6D vectors (..., 6), orthonormal or not, to matrices (..., 3, 3).
 
-    The vectors are orthonormalized with Gram-Schmidt (Zhou et al. 2019, eq. 15). Every finite pair
-    of vectors yields a rotation. If one vector has no direction, it is replaced by the basis vector
-    that is least parallel to the other vector. If the vectors are parallel, such a basis vector
-    replaces the second one. Two zero vectors yield the identity.
+    The vectors are orthonormalized with Gram-Schmidt (Zhou et al. 2019, eq. 15). Every pair of
+    finite vectors results in a rotation. If one vector has no direction, it is replaced by the
+    basis vector that is least parallel to the other vector. If the vectors are parallel, such a
+    basis vector replaces the second one. Two zero vectors result in the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
     # There are no branches here, because neither exported graphs nor torch.func.vmap, which
@@ -104,10 +104,10 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 
 
 def is_degenerate(rot6d: Tensor) -> Tensor:
-    """Returns a bool tensor (...,) that is True where two vectors (..., 6) define no rotation.
+    """Returns a bool tensor (...,) that is True where a 6D vector (..., 6) defines no rotation.
 
-    This is the case if a vector is 0, or if the vectors are parallel. `rot6d_to_matrix` completes
-    such pairs.
+    This is the case if one of its two vectors is 0, or if they are parallel. `rot6d_to_matrix`
+    replaces such vectors.
     """
     return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
 
@@ -115,18 +115,19 @@ def is_degenerate(rot6d: Tensor) -> Tensor:
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
     """Returns two orthogonal vectors from 6D vectors (..., 6).
 
-    These are the normalized first vector, and the part of the second vector that is perpendicular
-    to it.
+    The results are the normalized first vector, and the component of the second vector that is
+    perpendicular to it.
     """
     first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
     return first, second - (first * second).sum(-1, keepdim=True) * first
 
 
 def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
-    """Returns a bool tensor (..., 1) that is True where two vectors (..., 6) define no rotation.
+    """Returns a bool tensor (..., 1) that is True where a 6D vector (..., 6) defines no rotation.
 
-    `first` and `across` are the results of `_orthogonal`. If the vectors are parallel, `across`
-    consists of rounding errors. Vectors with NaN do not count as degenerate, so they stay NaN.
+    `first` and `across` are the results of `_orthogonal`. If the two vectors are parallel, `across`
+    consists of rounding errors. Vectors that contain NaN do not count as degenerate, so they stay
+    NaN.
     """
     length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
     parallel = (
@@ -139,7 +140,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 def _shorter(normalized: Tensor) -> Tensor:
     """Returns a bool tensor (..., 1) that is True where a normalized vector has a norm below 1.
 
-    In this case, the original vector was close to 0.
+    The original vector was close to 0 in this case.
     """
     return (
         torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
@@ -148,7 +149,7 @@ def _shorter(normalized: Tensor) -> Tensor:
 
 
 def _completed(rot6d: Tensor) -> Tensor:
-    """Returns pairs of vectors (..., 6) in which basis vectors replace one or both vectors."""
+    """Returns 6D vectors (..., 6) in which one or both vectors are replaced by basis vectors."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
     basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
     replaced = _shorter(first)
@@ -194,7 +195,7 @@ def standardize(quaternion: Tensor) -> Tensor:
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the Hamilton product (..., 4), which rotates first by b and then by a."""
+    """Returns the Hamilton product (..., 4) of a and b, which rotates first by b and then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     product = [
@@ -228,7 +229,7 @@ def _scaled(vectors: Tensor) -> Tensor:
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the shortest rotation from the directions of `a` (..., 3) to the directions of `b`.
+    """Returns the shortest rotation that turns the direction of `a` (..., 3) to that of `b`.
 
     The quaternions (..., 4) have w >= 0. For opposite directions, the result is a half turn about
     a perpendicular axis. If a vector is 0, the result is the identity.

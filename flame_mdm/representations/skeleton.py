@@ -49,7 +49,7 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """For each joint, the joint to which its rotation is relative in HumanML3D.
+        """For each joint, the joint to which its rotation in HumanML3D is relative.
 
         This is the parent or, at the start of a chain, the root.
         """
@@ -58,7 +58,7 @@ class Skeleton:
 
     @cached_property
     def mirrored(self) -> tuple[int, ...]:
-        """Index of the joint that replaces each joint in a left-right mirror image."""
+        """For each joint, the index of the joint that replaces it in a left-right mirror image."""
         swap = {"left": "right", "right": "left"}
         sides = [name.split("_") for name in self.joints]
         return tuple(
@@ -73,11 +73,11 @@ class Skeleton:
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def bones(self, joints: Tensor) -> Tensor:
-        """Returns the vectors (..., J, 3) from parents to joints. The vector of the root is 0."""
+        """Returns the vectors (..., J, 3) from parents to children. The root's vector is 0."""
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
-        """Returns joint positions (..., J, 3) from the vectors `bones` and the root position."""
+        """Computes joint positions (..., J, 3) from the vectors `bones` and the root position."""
         paths = [[0.0] * len(self)]
         for joint, parent in enumerate(self.parents[1:], 1):
             paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])

@@ -38,12 +38,12 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 
     The motion consists of a translation in meters, followed by the axis-angle vectors of K = 24, 52
     or 55 joints. The results have the shapes (F, 3) and (F, 24, 3, 3), and are float64. As in
-    FLAME's code, the first 24 of SMPL+H's 52 joints are used, so the hands are its left_index1 and
-    left_index2.
+    FLAME's code, the first 24 of SMPL+H's 52 joints are used, so SMPL+H's left_index1 and
+    left_index2 serve as the hands.
 
     Raises:
-        UserError: If the motion has the wrong shape, for example 24 rotation matrices, or if it
-            contains NaN or infinite values.
+        UserError: If the shape of the motion is wrong (for example because it contains rotation
+            matrices), or if it contains NaN or infinite values.
     """
     widths = [3 + numbers for numbers, joints in AXIS_ANGLES.items() if joints >= 24]
     if motion.ndim != 2 or not len(motion) or motion.shape[1] not in widths:
@@ -60,13 +60,14 @@ class SMPL(Representation):
     """The 147 unnormalized features of Kim et al. 2023 (FLAME).
 
     The features are the translation (3) and 24 rotations as 6D rows. Like AMASS, they use world
-    coordinates in meters, with z up, and are neither centered nor rotated. `read_pose` describes
-    raw motions.
+    coordinates in meters, with z up, and are neither centered nor rotated. For raw motions, see
+    `read_pose`.
 
     Args:
         fps: frames per second.
-        offsets: (24, 3) offset of each joint from its parent in the rest pose, in meters, for
-            decoding. The first offset leads from the translation to the pelvis. Default: `ADULT`.
+        offsets: (24, 3), offsets of the joints from their parents in the rest pose, in meters; used
+            for decoding. The first offset leads from the translation to the pelvis. Default:
+            `ADULT`.
 
     Example:
         >>> representation = SMPL()
@@ -95,7 +96,7 @@ class SMPL(Representation):
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, 147) to joint positions (..., F, 24, 3) in meters.
 
-        As in HumanML3D, y is up: the coordinates are (-x, z, y).
+        As in HumanML3D, y is up: the coordinates (x, y, z) become (-x, z, y).
         """
         rotations = rotation.rot6d_to_matrix(self.rotations6d(features), "rows")
         offsets = features.new_tensor(self.offsets)
@@ -105,7 +106,7 @@ class SMPL(Representation):
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns a bool mask (147,) that is True for features of these joints.
+        """Returns a bool mask (147,) that is True for the features of the given joints.
 
         The translation belongs to joint 0.
         """

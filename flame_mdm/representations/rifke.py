@@ -91,7 +91,8 @@ class Rifke(Representation):
     def floor(self, joints: Tensor) -> Tensor:
         """Estimates the height of the floor from joint positions (T, 21, 3).
 
-        Both are in KIT's unit. The estimate is a soft minimum, over time, of the height of the lowest foot.
+        Positions and heights are in KIT's unit. The estimate is a soft minimum, over time, of the
+        height of the lowest foot.
         """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()

@@ -63,7 +63,7 @@ class ConditionEncoder(nn.Module, ABC):
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Encodes these captions and writes them to a cache on disk.
+        """Encodes the given captions and writes the results to a cache on disk.
 
         Only one process calls this method. By default, it does nothing.
         """
@@ -83,7 +83,7 @@ class ConditionEncoder(nn.Module, ABC):
 
 
 class Unconditional(ConditionEncoder):
-    """Empty condition whose vectors and tokens have width 0. The null condition is identical.
+    """Encoder that returns empty conditions, whose vectors and tokens have width 0.
 
     Example:
         >>> x = torch.zeros(2, 5, 3)

@@ -30,9 +30,9 @@ class LearnedTokens(ConditionEncoder):
 
     The vector of a word is the sum of two rows of a table, which are selected by the hash of the
     word; see `vocabulary.hashed`. A word that does not occur in the training captions would have a
-    random vector. It is therefore replaced by another form that does occur (walked, walks), or
-    dropped. Samples with the same caption share the same dropout, because each caption is encoded
-    once. Linear layers skip the padding.
+    random vector. It is therefore replaced by another form that does occur (such as "walks" for
+    "walked"), or dropped. Samples with the same caption share the same dropout, because each
+    caption is encoded once. Linear layers skip the padding.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector. Therefore,
     all parameters receive gradients, regardless of whether a denoiser reads the pooled vector or

@@ -44,7 +44,7 @@ class Recording(NamedTuple):
 
     Args:
         poses: (F, 156), axis-angle vectors of SMPL+H's 52 joints.
-        translation: (F, 3) positions in meters, with z up.
+        translation: (F, 3), positions in meters, with z up.
         betas: shape parameters of the body.
         gender: "male", "female" or "neutral".
         fps: frames per second.

@@ -1,7 +1,7 @@
-"""The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes by three actors.
+"""Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes by three actors.
 
-The actors perform 25 contents in 19 styles. Source: Kobayashi et al., arXiv 2306.08861, 2023;
-CC BY-NC 4.0. `docs/bandai.md` describes the data set and its preparation.
+The actors perform 25 actions, called contents, in 19 styles. Source: Kobayashi et al., arXiv
+2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the data set and its preparation.
 """
 
 import re
@@ -252,7 +252,7 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
     """Converts a take to an SMPL motion (F, 75) float32 in AMASS's axes, with z up.
 
     Each frame contains the position of the pelvis in meters and the axis-angle vectors of 24
-    joints. The hands (22 and 23) do not rotate.
+    joints. The hands (joints 22 and 23) do not rotate.
 
     Args:
         skeleton: skeleton of the file.

@@ -119,8 +119,9 @@ class CMU(MotionSource):
             subfolders; or an archive of such a folder.
         captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a
             folder with `captions.csv`. Default: `path`. KIT-ML's captions for AMASS (kitml*.json)
-            are used if they are in either folder.
-        motion: "joints", or "smpl" for SMPL's rotations, which are computed from the joints.
+            are used if either folder contains them.
+        motion: "joints" for joint positions, or "smpl" for SMPL's rotations, which are computed
+            from the joint positions.
     """
 
     name = "cmu"

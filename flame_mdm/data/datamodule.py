@@ -76,9 +76,9 @@ class TrainingBatches(Sampler[list[Draw]]):
 def evaluation_batches(
     lengths: np.ndarray, batch_size: int, *, rank: int, world: int
 ) -> list[list[Draw]]:
-    """Returns the batches of this rank. Across all ranks, the batches contain each clip once.
+    """Returns the batches of this rank.
 
-    The longest clips come first.
+    Across all ranks, the batches contain each clip exactly once. The longest clips come first.
     """
     mine = np.argsort(-lengths, kind="stable")[rank::world]
     return [
@@ -269,7 +269,7 @@ class MotionDataModule(LightningDataModule):
         return self.device
 
     def clips(self, split: Split) -> Clips:
-        """Returns the clips of a split, which are cropped when they are drawn.
+        """Returns the clips of a split as a data set that crops each clip when it is drawn.
 
         If the published split has no test clips, as in HumanAct12, the training clips are used for
         testing.

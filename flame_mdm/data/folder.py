@@ -74,8 +74,8 @@ class Folder(MotionSource):
             `motion="joints"`.
         exclude: paths of motions to leave out, relative to the folder and without extension.
         balance: requested number of training clips per action, including mirrored copies. If an
-            action has fewer clips, its clips are repeated until there are about as many. Each clip
-            occurs at most 16 times. 0 = clips are not repeated.
+            action has fewer clips, its clips are repeated until there are about this many. Each
+            clip occurs at most 16 times. 0 = clips are not repeated.
         license: license of motions for which the table does not specify a license. This is a key in
             `licenses.yaml`, or "" if the license is unknown.
         prefixes: words to insert before captions, each mapped to the actions whose captions it

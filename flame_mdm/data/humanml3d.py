@@ -221,7 +221,7 @@ class HumanML3D(T2MFolder):
             remove_abandoned(folder)  # temporary files of workers that were stopped
 
     def _write_statistics(self) -> None:
-        """Writes the mean and std over all motions and their mirrored copies.
+        """Writes the mean and std of all motions and their mirrored copies.
 
         Motions are included regardless of their length and split.
         """

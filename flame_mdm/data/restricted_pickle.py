@@ -143,7 +143,7 @@ class _Unpickler(pickle._Unpickler):
         return self.plain(value.state)
 
     def array(self, data: Any, dtype: _Object, shape: Sequence[int], order: Any) -> np.ndarray:
-        """Returns an array: a view of its bytes, or a copy of a list of objects."""
+        """Returns an array, either as a view of its bytes or as a copy of a list of objects."""
         code, data = dtype.arguments[0], self.plain(data)
         if not DTYPE.fullmatch(code):
             raise pickle.UnpicklingError(

@@ -1,4 +1,4 @@
-"""A motion of a person standing still, which is the default start of streams."""
+"""A motion of a person standing still. By default, streams start with this motion."""
 
 import numpy as np
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""MotionStreamer's features: root trajectory, joint positions, velocities, SMPL's rotations."""
+"""MotionStreamer's features: root trajectory, joint positions, velocities and SMPL rotations."""
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy

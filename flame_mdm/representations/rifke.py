@@ -101,8 +101,8 @@ class Rifke(Representation):
     def heading(self, joints: Tensor) -> Tensor:
         """Returns the heading (T,) of a body with joint positions (T, 21, 3).
 
-        Headings are in radians in (-pi, pi]. A body with heading 0 faces +z. Positive headings are
-        turned toward +x.
+        Headings are in radians, from -pi to pi. A body with heading 0 faces +z. Positive headings
+        are turned toward +x.
         """
         left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow

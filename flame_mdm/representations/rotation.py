@@ -43,7 +43,7 @@ def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """Converts quaternions (..., 4), of any length other than 0, to matrices (..., 3, 3)."""
+    """Converts quaternions (..., 4) of any nonzero length to matrices (..., 3, 3)."""
     q = quaternion * (2**0.5 / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True))
     w, x, y, z = q.unbind(-1)
     elements = [
@@ -113,7 +113,7 @@ def is_degenerate(rot6d: Tensor) -> Tensor:
 
 
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns two orthogonal vectors from 6D vectors (..., 6).
+    """Converts each 6D vector (..., 6) to two orthogonal vectors.
 
     The results are the normalized first vector, and the component of the second vector that is
     perpendicular to it.

@@ -1,1 +1,1 @@
-"""Understanding of English prompts, independent of any model: actions, attributes and order."""
+"""Parsing of English prompts, independent of any model: actions, attributes and order."""

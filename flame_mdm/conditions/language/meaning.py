@@ -54,7 +54,7 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 
 
 def is_thing(word: str) -> bool:
-    """Returns whether a word names a thing, judging by the listed words with similar meanings."""
+    """Returns whether a word names a thing, based on listed words with similar meanings."""
     vector = word_table().vector(word)
     if vector is None:
         return False

@@ -228,7 +228,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause accompanies the previous action ("stands still, waving")."""
+        """Returns whether a clause describes part of the previous action ("stands still, waving")."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]

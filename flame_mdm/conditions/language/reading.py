@@ -73,7 +73,7 @@ class Reader:
 
     @staticmethod
     def fits(facts: Mapping[str, Any]) -> bool:
-        """Returns whether each caption of a model with these facts describes a single action."""
+        """Returns whether, judging by its facts, a model's captions describe single actions."""
         return (
             bool(facts.get("verbs"))
             and bool(facts.get("actions"))

@@ -1,4 +1,4 @@
-"""Correction of typos of one or two letters in words for motions, attributes and subjects."""
+"""Correction of typos (one or two letters) in words for motions, attributes and subjects."""
 
 from functools import cache
 

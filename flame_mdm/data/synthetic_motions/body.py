@@ -1,8 +1,8 @@
 """The body of the synthetic motions: its kinematics, and the curves that actions set.
 
-Forward kinematics computes the upper body from joint angles. The legs follow planned footprints
-through two-bone inverse kinematics, so that a foot on the ground does not move at all. Hands that
-reach for something also use inverse kinematics. The bone lengths are similar to those of
+The upper body is computed from joint angles with forward kinematics. Two-bone inverse kinematics
+makes the legs follow planned footprints, so that a foot on the ground does not move at all. Hands
+that reach for something also use inverse kinematics. The bone lengths are similar to those of
 HumanML3D's reference skeleton (Guo et al. 2022).
 """
 

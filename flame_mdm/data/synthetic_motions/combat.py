@@ -24,7 +24,7 @@ def guard(body: Body, weight: np.ndarray) -> None:
 
 
 def stance(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Waits with raised fists and one foot ahead, bouncing on bent knees."""
+    """Waits with raised fists and one foot forward, bouncing on bent knees."""
     sign, bounce = rng.choice(SIGN), beat(t, rng.uniform(1.2, 1.7), rng.random())
     guard(body, np.ones_like(t))
     body.ankles[..., 2] += 0.13 * sign * SIGN[:, None]
@@ -134,7 +134,7 @@ def slash(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def fall(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Loses balance, drops backward to the floor, and stays on the back.
+    """Loses balance, falls backward to the floor, and stays on the back.
 
     This motion is faster than lying down.
     """

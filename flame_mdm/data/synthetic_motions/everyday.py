@@ -78,7 +78,7 @@ def shrug(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attrib
 
 
 def celebrate(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Throws both fists up and pumps them, bouncing on the knees."""
+    """Throws both fists up and pumps them while the knees bounce."""
     up, frequency = hold(rng, t, 0.4), rng.uniform(1.6, 2.0)
     pump = beat(t, frequency, rng.random())
     for side in (0, 1):

@@ -135,9 +135,9 @@ def _tread(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lifts the feet alternately in place, the left foot first.
 
-    Each foot is lifted by `lift` meters, and moves forward by `ahead` meters in the air. Returns
-    two curves (F,). The first is a wave that is 1 when the left foot is up and -1 when the right
-    foot is up. The second curve indicates whether the body is moving.
+    Each foot is lifted by `lift` meters, and moves forward by `ahead` meters while it is in the
+    air. Returns two curves (F,). The first is a wave that is 1 when the left foot is up and -1 when
+    the right foot is up. The second curve indicates whether the body is moving.
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))
@@ -283,7 +283,7 @@ def stumble(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attr
 
 
 def skip(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> None:
-    """Skips along happily, with springy steps, raised knees and large swings of the arms."""
+    """Skips along happily, with springy steps, raised knees and large arm swings."""
     gait = Gait(rng.uniform(0.42, 0.48), 1.12, rng.uniform(0.3, 0.36), 0.7, -0.2, 0.08, 0.03, 0.055)
     apart = walk_along(body, rng, gait, rng.uniform(1.3, 1.6), straight(0, 1), RIGHT)
     swing_arms(body, apart, rng.uniform(1.0, 1.2))

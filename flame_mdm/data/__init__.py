@@ -250,7 +250,7 @@ def name_hash(name: str) -> int:
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Returns a split that depends only on the name, so that new names do not affect other names.
+    """Returns a split that depends only on the name, so adding names does not change other splits.
 
     Args:
         name: name of a motion or of its source.

@@ -106,7 +106,7 @@ class Lesson(MotionSource):
 
 
 def styled(caption: str, name: str) -> str:
-    """Adds the style `name` to a caption for training."""
+    """Adds the style `name` to a training caption."""
     return f"{caption.rstrip(' .')} in {name} style"
 
 

@@ -230,7 +230,7 @@ def convert(file: Path, fps: float, kind: str = "joints") -> np.ndarray:
         kind: "joints" for joint positions, or "smpl" for the result (F, 75) of `smpl_motion`.
 
     Raises:
-        UserError: If the skeleton of the file is not that of the data set, or if a joint jumps.
+        UserError: If the file does not have the skeleton of the data set, or if a joint jumps.
     """
     recording = read_recording(file, fps, standard=_standard)
     if recording.doubts.jump:

@@ -90,7 +90,7 @@ class Body(NamedTuple):
     def joints(self, recording: Recording) -> np.ndarray:
         """Returns the joint positions (F, 22, 3) float64 of a recording, in meters.
 
-        As in HumanML3D, y is up: AMASS's (x, y, z) becomes (-x, z, y).
+        As in HumanML3D, y is up: AMASS's coordinates (x, y, z) become (-x, z, y).
         """
         betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
         rest = self.rest + self.shape[..., : len(betas)] @ betas

@@ -586,7 +586,7 @@ def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.n
 
 
 def _standardized(is_original: bool, evidence: Evidence, tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Returns a recording after `standardize`, at its original frame rate."""
+    """Applies `standardize` to a recording and sets its frame rate."""
     tree, fields = standardize(tree)
     rate = decide_rate(len(tree.frames), None if is_original else tree.fps, *evidence)
     return replace(tree, fps=rate), fields

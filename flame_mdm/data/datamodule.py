@@ -94,7 +94,7 @@ class MotionDataModule(LightningDataModule):
         representation: representation that encodes the clips. It receives the statistics of the
             store.
         root: folder that contains all prepared data sets.
-        name: name of the data set, and the beginning of its folder name in `root`.
+        name: name of the data set. Its folder name in `root` begins with this name.
         batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 = load in the training process.
         crop: rule that determines the frames of a sample and the minimum length of a clip.

@@ -94,7 +94,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def frames(self) -> dict[str, int]:
-        """The number of frames, at 12.5 frames per second, of each motion that has captions."""
+        """For each motion with captions, the number of frames at 12.5 frames per second."""
         rows = {
             name: len(read_text(self.path / f"{name}_fke.csv").splitlines()) - 1
             for name in self.texts

@@ -112,7 +112,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns one line for each of a report's figures that differs from the published figure."""
+    """Returns one line for each figure that differs from the published one."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()

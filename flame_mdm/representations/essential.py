@@ -1,4 +1,4 @@
-"""MARDM's essential features: those of HumanML3D's features that determine joint positions."""
+"""MARDM's essential features: the HumanML3D features that determine the joint positions."""
 
 from flame_mdm.representations.humanml import HumanML
 

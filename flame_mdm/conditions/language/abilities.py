@@ -119,7 +119,7 @@ class Abilities:
         return {name: values for name, values in listed.items() if values}
 
     def ranked(self, action: str) -> list[str]:
-        """Returns the actions that the model knows, with the most similar to `action` first."""
+        """Returns the known actions, beginning with the one most similar to `action`."""
         return sorted(self.actions, key=lambda other: -similarity(action, other))
 
     def nearest(self, understood: Understanding) -> list[str]:

@@ -121,7 +121,10 @@ class _Sentence:
         return [_without_idle(step) for step in steps + during + later]
 
     def rest(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Returns the words for things, and the original spellings of words not understood."""
+        """Returns the words for things, and the words that are not understood.
+
+        The latter are returned as the user typed them.
+        """
         objects, unknown = [], []
         for number, token in enumerate(self.tokens):
             if not token.is_word or number in self.verbs:
@@ -228,7 +231,7 @@ class _Sentence:
         ]
 
     def _is_manner(self, clause: Clause, steps: Sequence[Step]) -> bool:
-        """Returns whether a clause describes part of the previous action ("stands still, waving")."""
+        """Returns whether a clause adds to the previous action, as in "stands still, waving"."""
         if clause.link or not clause.after_comma or not clause.matches:
             return False
         before = steps[-1][0]

@@ -73,7 +73,7 @@ class Reader:
 
     @staticmethod
     def fits(facts: Mapping[str, Any]) -> bool:
-        """Returns whether, judging by its facts, a model's captions describe single actions."""
+        """Returns whether a model's captions describe single actions, judging by its facts."""
         return (
             bool(facts.get("verbs"))
             and bool(facts.get("actions"))

@@ -44,7 +44,7 @@ class Understanding:
         steps: actions in order.
         objects: words for things, which have no effect.
         unknown: words that are not understood, as the user typed them.
-        corrected: maps each word that was read as another word to this other word.
+        corrected: maps each corrected word, as typed, to its correction.
         is_foreign: whether the sentence is not in English.
         nearest: if no action is understood, the three actions that are closest in meaning.
     """

@@ -42,8 +42,8 @@ is called `import_released.py`, because `import` is a Python keyword.
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command line and returns its exit code.
 
-    `argv` contains the arguments after `flame-mdm`. By default, these are the arguments of this
-    process.
+    `argv` contains the arguments after `flame-mdm`. By default, they are taken from this process's
+    command line.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):

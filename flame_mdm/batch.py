@@ -20,10 +20,10 @@ class MotionBatch:
     """Motions of different lengths, padded to the longest one.
 
     Attributes:
-        x: (B, F, D) float32, normalized features, which are 0 past the end of each motion.
+        x: (B, F, D) float32, normalized features, with zeros after the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, each unique in the data set. The name of a sample seeds its noise and
-            identifies it in results.
+        ids: B names, each unique in the data set. A sample's name seeds its noise and identifies
+            the sample in results.
         text: one caption per motion, or None if the data contains no captions.
         action: (B,) int64 class labels, or None if the data contains no classes.
 
@@ -102,7 +102,7 @@ class Condition:
         Only the text or action is replaced, not the prefix or the target.
 
         Args:
-            drop: (B,) bool, True = replace the condition of this sample.
+            drop: (B,) bool, True = replace this sample's condition.
         """
         if self.null is None:
             raise ValueError("there is no null condition with which to replace conditions")
@@ -155,7 +155,7 @@ class Condition:
 
 
 class Guide(Protocol):
-    """Interface of objects that guide motions (B, F, D) toward a goal, such as world positions."""
+    """Interface for objects that guide motions (B, F, D) toward a goal, such as world positions."""
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         """Returns a version of `x_t` whose clean estimate is closer to the goal.
@@ -167,7 +167,7 @@ class Guide(Protocol):
         ...
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns a version of a clean estimate that reaches the goal."""
+        """Returns the clean estimate, changed so that it reaches the goal."""
         ...
 
 
@@ -180,18 +180,18 @@ class Edit:
     Attributes:
         known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature in this frame.
-        mode: how the kept part is imposed. "x0" overwrites the clean estimate (MDM). "x_t" replaces
-            the kept part of the noisy sample with the known motion at the same noise level (FLAME,
-            RePaint). "trajectory" overwrites the beginning of the flow's path (MFM).
+        mode: how the kept features are imposed. "x0" overwrites them in the clean estimate (MDM).
+            "x_t" overwrites them in the noisy sample with the known motion at the same noise level
+            (FLAME, RePaint). "trajectory" overwrites the beginning of the flow's path (MFM).
         until: for "trajectory", the last flow time at which the path is overwritten.
-        blend: for "x_t", when the kept part is replaced. "after" = after each step (FLAME, eq. 6);
-            the result then contains the known motion itself. "before" = before each call of the
-            denoiser (FLAME's code); the result then contains the model's version of the known
+        blend: for "x_t", when the kept features are overwritten. "after" = after each step (FLAME,
+            eq. 6); the result then contains the known motion itself. "before" = before each call of
+            the denoiser (FLAME's code); the result then contains the model's version of the known
             motion.
-        resample: for "x_t", how many times each step is repeated. Noise is added again before each
-            repetition (RePaint, algorithm 1).
-        guide: for "x0", a guide toward a goal, which changes the clean estimate at each step before
-            the kept part is imposed. None = no goal.
+        resample: for "x_t", how many times each sampling step is repeated. Noise is added again
+            before each repetition (RePaint, algorithm 1).
+        guide: for "x0", a guide toward a goal, which changes the clean estimate at each sampling
+            step before the kept features are imposed. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`,
             noised to the level of the first of these steps (SDEdit). MDM's code sets the number of
             skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. If `strength`
@@ -280,8 +280,8 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 class Constant:
     """Constant numbers, stored in one tensor per device.
 
-    They are not stored in a module's buffer, so they do not change when a model is cast or is built
-    on the meta device.
+    They are not registered as a module's buffer, so they do not change when a model is cast or is
+    built on the meta device.
 
     Example:
         >>> table = Constant([1.0, 2.0])
@@ -315,7 +315,8 @@ def collate(
         samples: (id, normalized features (F, D), caption, action) for each motion.
         multiple: the length of the longest sample is rounded up to a multiple of this number of
             frames.
-        most: maximum number of frames after rounding. Longer samples are not cut.
+        most: maximum number of frames after rounding. Samples that are longer than this are not
+            cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])

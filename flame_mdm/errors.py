@@ -84,7 +84,7 @@ _shown: dict[str, str] = {}
 def show_as(path: str, name: str) -> None:
     """Makes all later messages show a name instead of a path.
 
-    A command that works on a temporary copy of a file uses this so that its messages contain the
+    Commands that work on a temporary copy of a file call this, so that their messages contain the
     name that the user typed.
     """
     _shown[path] = name
@@ -128,7 +128,7 @@ def renamed_names(module: str, names: Mapping[str, str], since: str) -> Callable
     Args:
         module: `__name__` of the module.
         names: mapping from old to new names.
-        since: version in which they were renamed.
+        since: version in which the names were changed.
     """
 
     def get(name: str) -> Any:

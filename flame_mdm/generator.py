@@ -80,7 +80,7 @@ def _length_unit(config: Config) -> int:
 def sampling_defaults(
     *, guidance_scale: float, sampler: str, num_inference_steps: int | Sequence[int] | None
 ) -> SamplerOptions:
-    """Returns the sampling options in the section `task` of a recipe.
+    """Returns the sampling options from the `task` section of a recipe.
 
     Raises:
         UserError: If a value is invalid.
@@ -154,7 +154,7 @@ class MotionGenerator(Model, nn.Module):
         actions: Sequence[str] = (),
         facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the generator of a recipe.
+        """Builds the generator that a recipe describes.
 
         Args:
             config: the recipe.
@@ -369,7 +369,7 @@ class Blocks:
             shape = None if prefix is None else tuple(prefix.shape)
             raise UserError(
                 f"the prefix has shape {shape}, but this model continues frames of shape {expected}. Pass "
-                "such frames"
+                "frames of this shape"
             )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options
         self.seed, self.replication, self.unconditioned = seed, replication, unconditioned
@@ -416,8 +416,8 @@ class Blocks:
 def joined(before: Tensor, x: Tensor, fade: int) -> Tensor:
     """Removes the jump at the seam between two successive blocks of frames.
 
-    The block is shifted so that the step at the seam is the mean of the steps before and after it.
-    The shift then decays to zero over the next frames ("inertialization", Bollo 2018).
+    The block is shifted so that the change at the seam is the mean of the changes before and after
+    it. The shift then decays to zero over the next frames ("inertialization", Bollo 2018).
 
     Args:
         before: (B, C, D) features of the frames before the block.

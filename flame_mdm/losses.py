@@ -16,8 +16,8 @@ CONTACT_SPEED = 0.01
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Returns the mean (B,) of `x` (B, F, ...) over the real frames of each sample.
 
-    The mean of a sample without real frames is 0. MDM's code adds 1e-8 to the number of entries,
-    which this function omits because it is below the resolution of float32.
+    The mean of a sample without real frames is 0. MDM's code adds 1e-8 to the number of entries.
+    This function does not, because 1e-8 is below the resolution of float32.
 
     Example:
         >>> x, mask = torch.tensor([[[1.0], [3.0], [9.0]]]), torch.tensor([[True, True, False]])
@@ -32,8 +32,8 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
     """Returns the squared error (B,) between `a` and `b` (B, F, ...), averaged over real frames.
 
-    `mask` is (B, F). Samples have equal weight, whatever their lengths (Tevet et al. 2022, eq. 2,
-    averaged as in their code).
+    `mask` is (B, F). All samples have equal weight, regardless of their lengths (Tevet et al. 2022,
+    eq. 2, averaged as in their code).
 
     Example:
         >>> masked_mse(torch.zeros(1, 2, 3), torch.full((1, 2, 3), 2.0), torch.ones(1, 2) > 0).tolist()
@@ -66,7 +66,7 @@ class _MaskedSquaredError(torch.autograd.Function):
 
 
 def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> Tensor:
-    """Returns the lengths (..., N) of N bones between joint positions (..., J, 3).
+    """Returns the lengths (..., N) of N bones, given joint positions (..., J, 3).
 
     `edges` (N, 2) contains the joint indices of the parent and the child of each bone.
     """
@@ -96,8 +96,8 @@ class MotionLosses(nn.Module):
             InterGen applies it only up to a certain level.
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of leading features that `velocity` uses. MDM's code omits the
-            last row of the feature matrix, and thus uses 144 of 25 x 6 or 262 of 263 features. None
-            = all features.
+            last row of the feature matrix, and thus uses 144 of the 25 x 6 features, or 262 of the
+            263. None = all features.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)
@@ -132,7 +132,7 @@ class MotionLosses(nn.Module):
         self.root_relative, self.velocity_features = root_relative, velocity_features
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns the weighted losses (B,) by name.
+        """Returns the weighted losses (B,), keyed by name.
 
         Args:
             x0_hat: (B, F, D), the clean estimate.

@@ -53,7 +53,7 @@ class Value(Schema):
 
 
 def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
-    """Returns the 95 % interval of a value from its bootstrap values, centered at the value.
+    """Returns the 95 % interval of a value from its bootstrap values, centered on the value.
 
     Source: Efron and Tibshirani 1993, section 13.3. Some metrics, such as Fréchet distances, are
     larger for sets with repeated motions (section 10.6), so the interval is shifted to the value.
@@ -145,7 +145,7 @@ class Cost(Schema):
 
 
 class Measured(Schema):
-    """Values that an evaluation measured, by metric.
+    """Values that an evaluation measured, keyed by metric.
 
     `values` describes the evaluated motions, and `ground_truth` describes real motions. None means
     that a value was not measured.
@@ -217,7 +217,7 @@ class Result(Measured):
 
 
 class AuditedGrade(ClosedSchema):
-    """One grade of a perturbation.
+    """Results for one grade of a perturbation.
 
     Each metric has four numbers: its value, the half width of the value's 95 % interval, the
     difference from real motions, and the half width of the interval of this difference. A number

@@ -90,8 +90,8 @@ def made_by(path: str | Path) -> str:
 class Run:
     """Content of a run directory.
 
-    `history` maps the name of each curve to a mapping from steps to values. `results` maps paths in
-    the directory to results.
+    `history` maps the name of each curve to a mapping from training steps to values. `results` maps
+    paths in the directory to results.
     """
 
     folder: Path
@@ -108,7 +108,7 @@ class Run:
 
     @property
     def samples(self) -> Path | None:
-        """Folder with the samples of the last step, or None if there are no samples."""
+        """Folder with the newest samples, or None if there are no samples."""
         folders = [path.parent for path in self.folder.glob("samples/step_*/motion_000.npz")]
         return max(
             (path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None
@@ -156,7 +156,7 @@ def read_run(folder: Path) -> Run:
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the training curves by name. Each curve maps steps to values, sorted by step.
+    """Returns the training curves, keyed by name. Each curve maps steps to values, in order.
 
     Raises:
         UserError: If the file is damaged.

@@ -27,7 +27,7 @@ Plain = str | bool | Int | Number | None
 
 
 class Schema(BaseModel):
-    """Schema of the content of a file.
+    """Schema of a file's content.
 
     Types are not converted: the string "1" is not accepted as a number. Unknown keys are ignored.
     """

@@ -33,7 +33,7 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 class Task(Model, LightningModule):
     """Base class of all tasks that `make train` can run.
 
-    A recipe names its class in `task._target_`.
+    A recipe names the class of its task in `task._target_`.
     """
 
     def __init__(self, *, optimizer: Config, seed: int):
@@ -52,7 +52,7 @@ class Task(Model, LightningModule):
         actions: Sequence[str] = (),
         facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task in a recipe and sets the sizes that depend on other parts.
+        """Builds a recipe's task and sets the sizes that depend on other parts.
 
         Args:
             config: the recipe.
@@ -356,7 +356,7 @@ class GeneratorTask(Task):
         u: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Returns the losses (B,) of the motions in a batch, by name; "loss" is their sum.
+        """Returns the losses (B,) of the motions in a batch, keyed by name; "loss" is their sum.
 
         Args:
             batch: the motions.

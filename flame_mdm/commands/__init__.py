@@ -45,7 +45,7 @@ def existing(key: str, source: str) -> None:
 def motion_file(key: str, source: str) -> None:
     """Checks that a motion file exists and that its extension is supported.
 
-    `dataset:id` is checked when the clip is read.
+    `dataset:id` is only checked when the clip is read.
     """
     if Path(source).suffix.lower() in ENDINGS:
         existing(key, source)
@@ -58,9 +58,9 @@ def motion_file(key: str, source: str) -> None:
 
 
 def finish(failures: Sequence[str], total: int, done: str) -> None:
-    """If motions failed, prints their errors and exits with code 1.
+    """If any motions failed, prints their errors and exits with code 1.
 
-    `done` is the participle in the error message, such as "converted".
+    `done` is the past participle in the error message, such as "converted".
     """
     if failures:
         say(*(f"error: {failure}" for failure in failures), error=True)
@@ -116,7 +116,7 @@ class ModelSettings:
     which: Which = option("last", "which checkpoint of a run directory: last or best")
 
     def model_file(self) -> Path:
-        """Returns the file of the model; see `flame_mdm.checkpoints.locating.find`."""
+        """Returns the path of the model file; see `flame_mdm.checkpoints.locating.find`."""
         return find(self.ckpt, self.which)
 
 
@@ -159,7 +159,7 @@ class FileSettings:
 def read_motions(
     source: str, settings: FileSettings, failures: list[str]
 ) -> tuple[str, int, Iterator[Motion]]:
-    """Returns the name of a file or folder, its number of motions, and the motions themselves.
+    """Returns the name of a file or folder, the number of motions in it, and the motions.
 
     If a file in the folder cannot be read, its error is added to `failures`.
     """
@@ -331,7 +331,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class DataSettings:
-    """Keys of commands that open a data set."""
+    """Keys for commands that open a data set."""
 
     data: str | None = option(
         None, "name of a data set in experiments/data; data.KEY=... overrides its keys"

@@ -11,7 +11,7 @@ from flame_mdm.config.options import option, required
 class AdaptSettings(ModelSettings):
     """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
 
-    Teaches a trained model the motions in a folder, without losing its other abilities. After
+    Teaches a trained model the motions in a folder while preserving its other abilities. After
     training, prompts that end with "in limp style" produce motions in this style. Writes the
     adapter OUT/limp.safetensors for `sample` and `load`, and a page that compares motions before
     and after training. Run the same command again to resume. docs/own-motion.md explains the steps.

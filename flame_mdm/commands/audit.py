@@ -20,7 +20,7 @@ class AuditSettings(DataSettings):
     generated, and writes a card. The card shows which perturbations each metric detects, and at
     which strength, and which ones it misses. extractor=none audits the metrics that are computed
     from joint positions. After an interruption, the same command continues where it stopped. cards=
-    renders one existing card again, or two of them side by side.
+    renders an existing card again, or two cards side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")

@@ -21,8 +21,8 @@ class BenchmarkSettings:
     """usage: flame-mdm benchmark NAME [out=FOLDER] [jobs=N]
 
     Trains a motion-CLIP and one model of each kind, evaluates the models, writes a table, and
-    compares its values with the expected ranges. After an interruption, the same command continues
-    where it stopped.
+    checks whether the values are within the expected ranges. After an interruption, the same
+    command continues where it stopped.
 
     NAME is a file in experiments/benchmark: synthetic, synthetic_medium, bandai, few_steps or
     bandai_full. The first two require no download, and bandai_full is meant for one GPU.
@@ -76,7 +76,7 @@ def main(settings: BenchmarkSettings) -> None:
 def check(
     table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
 ) -> list[tuple[str, bool]]:
-    """Returns a line for each expected range, and whether the value in the table is within it."""
+    """Returns a line for each expected range, paired with whether the measured value is in it."""
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():

@@ -17,8 +17,8 @@ class BrowseSettings(BodySettings, DataSettings):
            flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
     Writes a single web page that can be opened from disk. It shows clips of the data set NAME with
-    their captions, mirrored copies next to their originals, and statistics, and has a search field
-    and a split filter. motions=FOLDER also writes the shown clips as motion files, so that
+    their captions, mirrored copies next to their originals, and statistics. It also has a search
+    field and a split filter. motions=FOLDER also writes the shown clips as motion files, so that
     generated motions can be compared with them. Data sets are named as in `prepare`; for your own
     motions, use data=folder data.name=NAME.
     """

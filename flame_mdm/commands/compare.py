@@ -129,7 +129,7 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
 def _motions(
     compared: Sequence[ComparedRun], settings: CompareSettings
 ) -> list[dict[Prompt, Motion]]:
-    """Returns the motions of each run and folder, by prompt.
+    """Returns the motions of each run and folder, keyed by prompt.
 
     Motions are sampled from each run's last checkpoint, for the requested prompts or, if there are
     none, for the captions and lengths of the motions in the first folder. Without prompts or
@@ -174,14 +174,14 @@ def _texts(prompts: PromptFile) -> list[str]:
 def _sampled(
     entry: ComparedRun, prompts: Mapping[Prompt, float | None], seed: int
 ) -> dict[Prompt, Motion]:
-    """Samples motions from a run's last checkpoint for texts or action labels.
+    """Samples motions for texts or action labels from a run's last checkpoint.
 
     Args:
         entry: the run.
         prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
             numbers, or all of them are None (the default length). Lengths above the model's maximum
             are reduced to it.
-        seed: seed of the noise, which differs between the motions of a prompt that is listed twice.
+        seed: seed of the noise. If a prompt is listed twice, its motions have different noise.
     """
     import torch
 

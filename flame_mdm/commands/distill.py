@@ -45,7 +45,7 @@ class DistillSettings(ModelSettings):
 
 
 def main(settings: DistillSettings) -> None:
-    """Writes the recipe of a student and trains it."""
+    """Writes the recipe of a student and trains the student."""
     recipe = student_recipe(settings)
     folder = Path(recipe["run"]["dir"])
     path, new = folder / RECIPE, not folder.exists()

@@ -1,4 +1,4 @@
-"""Configuration: command lines, recipes composed by Hydra, checks of signatures, instantiation.
+"""Configuration: command lines, recipes composed by Hydra, signature checks and instantiation.
 
 These modules import neither torch nor Lightning, so that `--help` and errors about misspelled keys
 appear immediately.

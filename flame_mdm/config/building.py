@@ -1,4 +1,4 @@
-"""Instantiates configurations, checks untrusted ones, and reads and writes their files."""
+"""Instantiates configurations, checks untrusted ones, and reads and writes configuration files."""
 
 import ast
 import copy
@@ -55,7 +55,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     """Checks that an untrusted configuration contains only plain values and no interpolations.
 
     Hydra and OmegaConf would resolve interpolations (`${...}`), which can run any code and read any
-    environment variable. Only the interpolation `but` is allowed, at the start of a string. Raises
+    environment variable. The only interpolation allowed is `but`, at the start of a string. Raises
     a `UserError` that names the file `where` if the check fails or if the content is too large, is
     nested too deeply or contains itself.
     """
@@ -65,7 +65,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
         nonlocal count
         count += 1
         if count > MOST_VALUES or len(path) > MOST_LEVELS:
-            raise UserError(f"{where}: not a configuration: too many values, or nested too deeply")
+            raise UserError(
+                f"{where}: not a configuration: it has too many values or is nested too deeply"
+            )
         if isinstance(value, dict | list | tuple):
             for name, child in value.items() if isinstance(value, dict) else enumerate(value):
                 if not isinstance(name, str | int):

@@ -52,7 +52,7 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def checked_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Reads the settings of a command and runs the checks that their fields declare."""
+    """Reads the settings of a command and runs the checks declared by their fields."""
     settings = read_settings(kind, words)
     for entry in fields(kind):  # type: ignore[arg-type]
         value, check = getattr(settings, entry.name), entry.metadata.get("check")
@@ -145,7 +145,7 @@ def is_text(kind: type[Any], key: str) -> bool:
 
 
 def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
-    """Adds keys to the leading words, which specify a command's objects without a key."""
+    """Adds the omitted keys to the leading words, which specify a command's objects."""
     objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])

@@ -64,7 +64,7 @@ def compose_data(
 ) -> Config:
     """Composes the configuration of a data set in experiments/data, including its representation.
 
-    The result has the keys `data` and `representation`. The errors are the same as in `compose`.
+    The result has the keys `data` and `representation`. Raises the same errors as `compose`.
     """
     source = ConfigSource(EXPERIMENTS, None)
     first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
@@ -87,8 +87,9 @@ def prepare_overrides(
 ) -> tuple[list[str], Config]:
     """Checks the overrides (except those in `first`) and prepares them for Hydra.
 
-    Keys that the recipe lacks but a `_target_` accepts get the prefix `++`. Also returns the recipe
-    with its groups chosen, before individual keys are overridden, or {} if there are no overrides.
+    Keys that are missing from the recipe but accepted by a `_target_` get the prefix `++`. Also
+    returns the recipe in which groups have been replaced but individual keys have not yet been
+    overridden, or {} if there are no overrides.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -220,7 +221,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 
 
 def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
-    """Composes a configuration with prepared overrides; Hydra's errors become a `UserError`."""
+    """Composes a configuration with prepared overrides; raises Hydra's errors as `UserError`."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):

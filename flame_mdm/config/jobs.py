@@ -1,4 +1,4 @@
-"""Command lines that start several jobs: sweeps over values of keys, and jobs of launchers."""
+"""Command lines that start several jobs: sweeps over the values of keys, and launchers."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -76,7 +76,7 @@ def _is_of_launcher(word: str) -> bool:
 
 
 def _alternatives(kind: type[Any], word: str) -> list[str]:
-    """Returns one word `key=value` for each value that a word lists."""
+    """Splits a word that lists several values into one word `key=value` per value."""
     key, separator, _ = word.partition("=")
     if not separator or is_text(kind, key):
         return [word]

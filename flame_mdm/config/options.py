@@ -1,4 +1,4 @@
-"""Fields of settings dataclasses, with help texts for the command line and checks."""
+"""Fields of settings dataclasses, with help texts and checks for the command line."""
 
 from collections.abc import Callable
 from dataclasses import MISSING, field, fields
@@ -21,7 +21,7 @@ def option(default: Any, help: str, check: Check | None = None) -> Any:
 
 
 def required(help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field as `option` does, but without a default."""
+    """Returns a dataclass field, like `option`, but without a default."""
     return option(MISSING, help, check)
 
 

@@ -1,4 +1,4 @@
-"""Checks of recipes against the signatures of the classes and functions that they name.
+"""Checks recipes against the signatures of the classes and functions that they name.
 
 Signatures are read from source files, so that misspelled keys are reported immediately and a class
 in a recipe is checked without running its code.
@@ -77,7 +77,10 @@ DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that reci
 
 
 def check_top_level(config: Config) -> None:
-    """Raises `UserError` if a key outside mappings with a `_target_` is unknown or invalid."""
+    """Checks the keys outside mappings with a `_target_`.
+
+    Raises `UserError` if one of these keys is unknown or has an invalid value.
+    """
     for key, annotation in TOP_LEVEL.items():
         group, _, name = key.rpartition(".")
         node = config.get(group) if group else config
@@ -99,9 +102,9 @@ def check_top_level(config: Config) -> None:
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Raises `UserError` if the annotation of a parameter does not permit a value.
+    """Raises `UserError` if a value does not match the annotation of its parameter.
 
-    Unsupported annotations permit any value.
+    Any value matches an unsupported annotation.
     """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
@@ -263,7 +266,7 @@ def parameters(target: str) -> frozenset[str]:
 
 @functools.cache
 def _signature(target: str) -> dict[str, str]:
-    """Returns the annotations of a class's or function's arguments by name; "" = no annotation."""
+    """Returns the annotations of a class's or function's arguments, keyed by name; "" = none."""
     module, _, name = target.rpartition(".")
     node = definition(module, name)
     if node is None:

@@ -146,7 +146,7 @@ LATE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a recipe is incomplete or has a value that would fail only later."""
+    """Raises `UserError` if a recipe is incomplete or a value would cause an error later."""
     plain(config, name)  # otherwise, the run's checkpoints would be rejected
     parts = ["trainer", "data", "representation", "task", "optimizer"]
     parts += [key for key in ("denoiser", "process", "condition") if key in config]

@@ -93,7 +93,7 @@ def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
 
 
 class Server(uvicorn.Server):
-    """A server that, on shutdown, ends the streams of open pages before it waits for requests."""
+    """A server that ends the streams of open pages at shutdown, before it waits for requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]

@@ -101,7 +101,7 @@ POSTS: dict[str, type[Post]] = {
 
 
 class Guard:
-    """ASGI middleware that checks a request before the application receives it.
+    """ASGI middleware that checks requests before the application receives them.
 
     It checks the host, origin, path, size and content of the request. `hosts` contains the names of
     this server, in addition to localhost and numeric addresses. A request with any other host name

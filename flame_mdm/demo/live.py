@@ -91,10 +91,10 @@ class LiveStreams:
         Args:
             name: name of the stream, or "" to begin a new stream, whose name is in the result.
             text: description of the motion.
-            begin: index of the first frame to return. The stream's existing frames from there on
-                are dropped and replaced.
-            path: waypoints (x, z) in meters that are still ahead in frame `begin`. `reached` in the
-                result lists the indices of the frames in which waypoints are reached, in order.
+            begin: index of the first frame to return. Existing frames of the stream from this index
+                on are dropped and replaced.
+            path: waypoints (x, z), in meters, that are still ahead in frame `begin`. `reached` in
+                the result lists the indices of the frames in which waypoints are reached, in order.
 
         Raises:
             UserError: If the text is not understood, if the stream has ended, or if a limit is

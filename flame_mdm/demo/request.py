@@ -102,7 +102,7 @@ class DemoRequest(BaseModel):
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
 
     def targets(self, kind: str) -> dict[str, Any]:
-        """Returns the path as targets for `flame_mdm.generate`; `kind` is the model's condition."""
+        """Returns the path as targets for `flame_mdm.generate`; `kind` is the kind of condition."""
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
         return path_targets(self.path, self.total_seconds(parts))
 
@@ -149,7 +149,7 @@ class DemoRequest(BaseModel):
         return steps
 
     def python(self, kind: str, device: str) -> str:
-        """Returns Python code that generates the same motions; `kind` is the model's condition."""
+        """Returns Python code that generates the same motions; `kind` is the kind of condition."""
         model, _, adapter = self.model.partition(PLUS)
         options = ("" if device == "cpu" else f", {device!r}") + (
             f", adapter={adapter!r}" if adapter else ""
@@ -198,7 +198,7 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
 
 
 def checked(values: dict[str, Any]) -> DemoRequest:
-    """Builds a request, in which empty values are replaced by the defaults.
+    """Builds a request, replacing empty values with the defaults.
 
     If a value is invalid, raises a `UserError` that quotes it.
     """

@@ -135,7 +135,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request, in which a sentence with several actions has become a sequence.
+        """Returns the request, with a sentence of several actions converted to a sequence.
 
         Raises the same errors as `generate`.
         """
@@ -154,7 +154,7 @@ class Studio:
         return [reader.read(words) for words, _ in read_parts(request.text)]
 
     def advice(self, request: DemoRequest) -> list[str]:
-        """Returns messages about words that the model has not seen in training or does not read."""
+        """Returns messages about words that the model never saw in training or does not read."""
         model = self.model(request.model)
         if model.conditioned_on != "text" or self.readings(request):
             return []
@@ -169,7 +169,7 @@ class Studio:
     def file(
         self, request: DemoRequest, number: int, extension: str, rig: str | None = None
     ) -> bytes:
-        """Returns the content of a file that contains the motion with index `number`.
+        """Returns the content of a motion file with the motion at index `number`.
 
         The motion must be in memory, so that downloads do not wait for requests.
         """

@@ -100,13 +100,14 @@ def edit(
         fps: frames per second of an array or an .npy file. For other files, it overrides the frame
             rate stated in the file.
         cut: the part of the motion to use, as [begin, end] in seconds. Default: the entire motion.
-        stages: list to which clean estimates of the first motion, taken at equal intervals during
-            sampling, and then the motion itself are appended.
+        stages: list that receives clean estimates of the first motion, taken at equal intervals
+            during sampling, followed by the motion itself.
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
-            `method`, `until` and `resample` select how it is resampled. All of them are described
-            in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of `flame_mdm.generate`
-            also apply, such as `samples` (1), `seed` (0) and `guidance_scale`. `cleanup` also
-            changes the kept part, usually by millimeters; `Edited.joint_error` says by how much.
+            `method`, `until` and `resample` determine how it is resampled. All of them are
+            described in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of
+            `flame_mdm.generate` also apply, such as `samples` (1), `seed` (0) and `guidance_scale`.
+            `cleanup` also changes the kept part, usually by millimeters; `Edited.joint_error`
+            states by how much.
 
     Returns:
         The edited motions, with `samples` motions for each text: all samples of the first text come
@@ -210,7 +211,7 @@ def _original(
     fps: float | None,
     cut: Sequence[float] | None,
 ) -> Motion:
-    """Returns the motion to edit, or its part `cut`, with features of the representation."""
+    """Returns the motion to edit, or its part `cut`, with features in the representation."""
     if isinstance(motion, str | Path):
         return read_motion(representation, motion, fps=fps, cut=cut)
     if not isinstance(motion, Motion):
@@ -242,7 +243,7 @@ def kept_parts(
 ) -> tuple[Tensor, Tensor]:
     """Returns which features (F, D) and joints (F, J) an edit keeps in each of F frames.
 
-    `length` is F, the number of frames of the motion.
+    `length` is F, the number of frames in the motion.
     """
     new_frames = _new_frames(length, representation.fps, editing)[:, None]
     if editing.joints is None:

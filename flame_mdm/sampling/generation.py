@@ -48,12 +48,12 @@ def generate(
     Args:
         model: the model, from `flame_mdm.load`.
         texts: what the person does, as one string or several.
-        score: function that scores the `candidates` without faults. The candidate with the highest
-            score is kept. By default, the candidate with the fewest faulty frames is kept.
+        score: function that scores those `candidates` that have no faults. The candidate with the
+            highest score is kept. By default, the candidate with the fewest faulty frames is kept.
         edit: an edit that keeps part of a motion in every sample. The motion is as long as the
             samples; `known` and `keep` have the shape (1, F, D).
-        stages: list to which clean estimates of the first motion, taken at equal intervals during
-            sampling, and then the motion itself are appended (MFM, figure 5).
+        stages: list that receives clean estimates of the first motion, taken at equal intervals
+            during sampling, followed by the motion itself (MFM, figure 5).
         keywords: fields of `flame_mdm.sampling.motion_request.SamplingRequest`, which describes
             them: `actions` (instead of texts), `seconds` or `frames` (default: 3 seconds, or less
             for one or two repetitions, as in "kicks twice"), `samples` per text (1), `candidates`
@@ -68,7 +68,7 @@ def generate(
 
     Raises:
         UserError: If the request is invalid, if the model cannot fulfill it, or if the model knows
-            no content word of a text.
+            none of the content words of a text.
 
     Example:
         >>> import flame_mdm

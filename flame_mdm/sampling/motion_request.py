@@ -388,7 +388,7 @@ class SamplingRequest:
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
 
     def lengths(self, fps: float) -> list[float | None]:
-        """Returns the requested length of each prompt as an unrounded number of frames.
+        """Returns the requested length for each prompt as an unrounded number of frames.
 
         The entries are None if no length was requested.
         """
@@ -454,7 +454,7 @@ def is_range(value: Any) -> bool:
 
 
 def read_path(path: str | Waypoints) -> tuple[tuple[float, float], ...]:
-    """Returns the waypoints (x, z), in meters, in a string "x,z x,z ..." or a sequence of pairs.
+    """Reads waypoints (x, z), in meters, from a string "x,z x,z ..." or a sequence of pairs.
 
     Raises:
         UserError: If there are no waypoints or if they cannot be read.

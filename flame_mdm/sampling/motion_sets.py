@@ -67,7 +67,7 @@ FAULTY = 0.2
 
 
 class SetMotion(ClosedSchema):
-    """A motion of a set."""
+    """A motion in a set."""
 
     text: str
     kind: Literal["loop", "gait", "turn"]
@@ -149,7 +149,7 @@ def _check_rig(content: MotionSet, name: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class MadeSet:
-    """The clips of a set, and the reasons why motions were omitted, by motion name."""
+    """The clips of a set, and the reasons for omitting other motions, keyed by motion name."""
 
     clips: list[Clip]
     left_out: dict[str, str]
@@ -298,7 +298,7 @@ def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> l
 def write_set(
     folder: Path, clips: MadeSet, content: MotionSet, facts: Mapping[str, Any], body: Mesh | None
 ) -> list[str]:
-    """Writes the files of a set to a folder, all or none of them, and returns their names.
+    """Writes all files of a set to a folder, or none if an error occurs, and returns their names.
 
     Each clip is written to two files, one with the root trajectory and one in place. `set.json`
     describes the clips, and `set.png` and `player.html` show them.

@@ -58,7 +58,7 @@ class Placement:
 
 
 def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
-    """Returns the placement at which the frames after `last` start when they are decoded.
+    """Returns the placement from which the frames after `last` are decoded.
 
     It does not depend on the later frames, because each frame contains the turn and the step of the
     root to the next frame.

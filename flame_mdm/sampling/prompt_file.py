@@ -79,7 +79,7 @@ class PromptFile:
         ]
 
     def report(self) -> list[str]:
-        """Returns one line per refused prompt that states the reason."""
+        """Returns one line per refused prompt, with the reason."""
         return [
             f"{self.path}, line {number}: {first_line(self.refused[number])}"
             for number in sorted(self.refused)

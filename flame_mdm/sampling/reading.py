@@ -1,5 +1,5 @@
 # pyright: standard
-"""Reads motions from files and prepared data sets and computes a model's features."""
+"""Reads motions from files and prepared data sets, and computes their features for a model."""
 
 import math
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def read_motion(
     joints were fitted, the `notes` of the result describe the fit and its error.
 
     Args:
-        representation: the representation of the model.
+        representation: the model's representation.
         source: a motion file, or `dataset:id` for a clip of a prepared data set.
         fps, unit, up, animation: how to read the file; see `flame_mdm.formats.readers.read`.
         cut: the part to use, as [begin, end] in seconds. Default: the entire motion.
@@ -76,7 +76,7 @@ def read_motion(
 
 
 def part_of(representation: Representation, motion: Motion, cut: Sequence[float]) -> Motion:
-    """Returns the part [begin, end] (in seconds) of a motion that has features.
+    """Returns the part `cut` of a motion, as [begin, end] in seconds.
 
     The returned motion begins at the origin.
 
@@ -96,7 +96,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns the motion with features of the representation.
+    """Returns the motion with features in the representation.
 
     If the motion has no features, they are computed from its joint positions.
     """

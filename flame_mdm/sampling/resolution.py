@@ -59,7 +59,7 @@ class ResolvedPrompt:
 
 @dataclass(frozen=True)
 class ResolvedRequest:
-    """A request for one model: its sentences are split, lengths are in frames, and files are read.
+    """A request resolved for a model: sentences are split, lengths are in frames, files are read.
 
     Attributes:
         request: the original request.

@@ -72,8 +72,8 @@ def stream(
         An iterator of blocks; see `Stream`.
 
     Raises:
-        UserError: If the model does not continue frames or knows no content word of the text, or if
-            the motion to continue cannot be read or is too short.
+        UserError: If the model does not continue frames or knows none of the text's content words,
+            or if the motion to continue cannot be read or is too short.
 
     Example:
         >>> import flame_mdm
@@ -134,7 +134,7 @@ class Stream(Iterator[Motion]):
             at: time in seconds since the start of the stream. Default: the end of the last block.
 
         Raises:
-            UserError: If the model knows no content word of the text, or if the time is in the
+            UserError: If the model knows none of the text's content words, or if the time is in the
                 past.
         """
         fps = self._streams.model.representation.fps
@@ -309,8 +309,8 @@ class Streams(Iterator[list[Motion]]):
 
     Attributes:
         schedules: for each stream, the condition of each frame.
-        texts: the text as it was typed, by condition. It becomes the text of the blocks; if a
-            condition has no entry, the condition itself is used.
+        texts: maps a condition to the text that the user typed, which becomes the text of the
+            blocks. If a condition has no entry, the condition itself is used.
         frames: number of frames of each stream so far.
         targets: positions that a single stream should reach, or None. Guidance leads the motion to
             them. If the model was trained with targets, they are also part of its condition.
@@ -563,8 +563,8 @@ def check_streams(model: MotionGenerator) -> None:
     if not model.representation.relative:
         name = model.representation.name
         raise UserError(
-            f"representation {name} contains world positions, whose range a stream would leave. Use a "
-            "model with humanml3d features"
+            f"representation {name} contains world positions, and a stream would leave their range. Use "
+            "a model with humanml3d features"
         )
 
 

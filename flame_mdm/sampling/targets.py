@@ -105,7 +105,7 @@ class PositionGuide:
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns a clean estimate (B, F, D) that reaches the positions and keeps the poses."""
+        """Returns the clean estimate, changed to reach the positions and keep the poses."""
         imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
         return reach(
             imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps
@@ -132,7 +132,7 @@ class Targets:
             )
 
     def window(self, begin: int, frames: int, here: Sequence[float]) -> "Targets":
-        """Returns the targets in a window of `frames` frames from `begin` on.
+        """Returns the targets in the window of `frames` frames that starts at `begin`.
 
         Frames are counted from the beginning of the window. If the root has a target after the
         window, a target is added at the end of the window: the point that the root reaches by then
@@ -220,7 +220,7 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
-    """Reads targets from a JSON file or from its content, which docs/targets.md describes.
+    """Reads targets from a JSON file or from its content; see docs/targets.md.
 
     Raises:
         UserError: If the targets are invalid.

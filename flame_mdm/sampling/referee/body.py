@@ -48,7 +48,7 @@ class Body:
         joints = np.asarray(joints, np.float64)
         if joints.ndim != 3 or joints.shape[1:] != (22, 3) or not len(joints):
             raise UserError(
-                f"joints have shape {joints.shape}. The referee requires SMPL's joints, (frames, 22, 3)"
+                f"joints have shape {joints.shape}. The referee requires shape (frames, 22, 3)"
             )
         if not np.isfinite(joints).all():
             raise UserError("joints contain NaN or infinity. Did the model diverge?")
@@ -159,7 +159,7 @@ class Body:
 
 
 def rate_of(values: np.ndarray) -> np.ndarray:
-    """Returns how fast values (F, ...) change per second."""
+    """Returns the rate of change per second of values (F, ...)."""
     if len(values) < 2:
         return np.zeros_like(values)
     return np.gradient(values, 1 / RATE, axis=0)

@@ -32,7 +32,7 @@ class Claim:
         when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
             time.
         seconds: claimed duration; None = not stated.
-        parts: for an order, its two claims, the first of which happens earlier.
+        parts: for a claim about order, its two claims, of which the first happens earlier.
     """
 
     kind: str
@@ -67,7 +67,7 @@ class Claim:
 
 
 def falsified(claim: Claim) -> list[tuple[str, Claim]]:
-    """Returns variants of a claim that are false if the claim is true, and their kinds of change.
+    """Returns the variants of a claim that are false if it is true, each with its kind of change.
 
     The kinds of change are "side", "direction", "speed", "count" (one more, and one fewer),
     "duration" (twice as long, and half as long), "start or end" (the other end), "posture" (one

@@ -29,7 +29,7 @@ BREAK = 0.5
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer to whether a claim about a motion is true, with the evidence.
+    """The verdict on whether a claim about a motion is true, with the evidence.
 
     Attributes:
         claim: the claim.
@@ -212,7 +212,7 @@ def _order(body: Body, claim: Claim) -> Reading:
 
     If an event happens several times, the pair of starts with the largest difference counts. The
     order is undecided if the answer for either event is not "yes", or if the reverse order also
-    happens.
+    occurs.
     """
     first, second = (decide(body, part) for part in claim.parts)
     firsts = [start for start, _ in first.reading.spans]

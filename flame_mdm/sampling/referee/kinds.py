@@ -160,7 +160,7 @@ def threshold_key(claim: Claim) -> str:
 
 @cache
 def thresholds() -> dict[str, Any]:
-    """Returns the calibrated thresholds and the numbers of motions used, by `threshold_key`."""
+    """Returns the calibrated thresholds and numbers of motions, keyed by `threshold_key`."""
     return read_package_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 

@@ -311,7 +311,7 @@ def strike(body: Body, claim: Claim) -> Reading:
 
 
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
-    """Compares how much a limb moves with how much its counterpart on the other side moves.
+    """Compares the movement of a limb with that of its counterpart on the other side.
 
     The score is the binary logarithm of the ratio of their movements.
     """

@@ -214,7 +214,7 @@ def hands_together(body: Body, claim: Claim) -> Reading:
 
 
 def hand_on_hip(body: Body, claim: Claim) -> Reading:
-    """Measures the distance between a wrist and the side of the waist, with the elbow out."""
+    """Measures the distance between a wrist and a point beside the waist."""
     waist = body.joints[:, HIPS] + 0.6 * (body.joints[:, [PELVIS]] - body.joints[:, HIPS])
     waist = waist + np.array([0.0, 0.1, 0.0])
     outward = (body.joints[:, HIPS] - body.joints[:, HIPS[::-1]]) * 0.9

@@ -153,7 +153,7 @@ def _of_clause(text: str) -> list[Claim]:
 
 
 def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
-    """Returns the claims of a clause about the start or the end, as in "ends seated"."""
+    """Returns a clause's claims about the start or the end, as in "ends seated"."""
     text, returns = clause.text, _content()["returns"]
     for kind in ("return pose", "return place"):
         if re.search(rf"\b(?:{returns[kind]})\b", text):

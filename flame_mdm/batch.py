@@ -17,7 +17,7 @@ from torch import Tensor
 
 @dataclass
 class MotionBatch:
-    """Motions of different lengths, padded to the longest one.
+    """Motions of different lengths, padded to the length of the longest one.
 
     Attributes:
         x: (B, F, D) float32, normalized features, with zeros after the end of each motion.
@@ -138,7 +138,7 @@ class Condition:
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
 
     def select(self, rows: Tensor) -> Condition:
-        """Returns the conditions of the samples whose indices are `rows` (N,), int64."""
+        """Returns the conditions of the samples with the indices `rows`, (N,) int64."""
 
         def selected(x: Tensor | None) -> Tensor | None:
             return None if x is None else x[rows]
@@ -240,7 +240,7 @@ Sampling starts from draw 0; stochastic samplers use the later draws.
 
 
 def pad_to(x: Tensor, size: int) -> Tensor:
-    """Pads dimension 1 of x (B, N, ...) to `size` entries with zeros, or with False in masks."""
+    """Pads dimension 1 of x (B, N, ...) to `size` entries, with zeros (False in masks)."""
     missing = size - x.shape[1]
     return x if missing == 0 else torch.cat([x, x.new_zeros(x.shape[0], missing, *x.shape[2:])], 1)
 
@@ -278,7 +278,7 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 
 
 class Constant:
-    """Constant numbers, stored in one tensor per device.
+    """Constant numbers, stored as one tensor per device.
 
     They are not registered as a module's buffer, so they do not change when a model is cast or is
     built on the meta device.
@@ -296,7 +296,7 @@ class Constant:
     def on(self, device: torch.device) -> Tensor:
         """Returns the numbers as a tensor on a device.
 
-        Only the first call for a device waits for a copy.
+        Only the first call for each device waits for the copy.
         """
         if device not in self.tensors:
             # The first call may happen during validation, but training cannot use inference

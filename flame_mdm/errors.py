@@ -69,7 +69,7 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns text, such as text from an untrusted file, as one `printable` line."""
+    """Returns text (for example, from an untrusted file) as one `printable` line."""
     return printable(re.sub(r"[\t\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+", " ", text))
 
 

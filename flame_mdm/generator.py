@@ -96,7 +96,7 @@ def sampling_defaults(
 
 
 class Model:
-    """Base class of the models that are stored in checkpoints."""
+    """Base class for the models that are stored in checkpoints."""
 
     # Noun for this kind of model in messages about its checkpoints
     noun = "a model"
@@ -224,9 +224,9 @@ class MotionGenerator(Model, nn.Module):
             edit: part of a motion to keep.
             windows: overlapping windows that together cover motions longer than the training
                 motions. The windows' conditions replace the conditions of the batch.
-            prefix: (B, C, D) normalized features of the frames before the motions. They are
-                required if the denoiser has `context_frames` C. Such a model continues the prefix
-                block by block and does not support `edit`, `windows` or `trajectory`.
+            prefix: (B, C, D) normalized features of the frames before the motions. Required if the
+                denoiser has `context_frames` C. Such a model continues the prefix block by block
+                and does not support `edit`, `windows` or `trajectory`.
             unconditioned: whether to sample a conditional model with its null condition.
             shared_noise: whether the noise depends only on (seed, replication), so that it is the
                 same for all ids.
@@ -339,7 +339,7 @@ class Blocks:
 
     Args:
         model: the model. Its denoiser has `context_frames` C.
-        ids: B names of the motions, which seed the noise.
+        ids: names of the B motions, which seed the noise.
         prefix: (B, C, D) normalized features of the frames before the first block.
         options: sampler options, none of which may be None.
         seed: seed of the noise.

@@ -88,12 +88,12 @@ class MotionLosses(nn.Module):
         edges: joint indices (parent, child) of each bone, used by `bone_length`.
         joints: weight of the squared error of the joint positions (eq. 3).
         velocity: weight of the squared error of the features' velocity (eq. 5).
-        foot_contact: weight of the squared velocity of the feet that are in contact in the data
-            (eq. 4). As in the paper's sum over all frames, feet that are not in contact contribute
-            0 to the mean.
+        foot_contact: weight of the squared velocity of feet that touch the ground in the data (eq.
+            4). As in the paper's sum over all frames, feet that are not in contact contribute 0 to
+            the mean.
         bone_length: weight of the squared error of the bone lengths, in square meters. This is
-            InterGen's bone-length loss (arXiv:2304.05684), but applied at all noise levels, whereas
-            InterGen applies it only up to a certain level.
+            InterGen's bone-length loss (arXiv:2304.05684), but at all noise levels; InterGen
+            applies it only up to a certain noise level.
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of leading features that `velocity` uses. MDM's code omits the
             last row of the feature matrix, and thus uses 144 of the 25 x 6 features, or 262 of the

@@ -100,7 +100,7 @@ class ExtractorRecord(Schema):
 
 
 class Checkpoint(Schema):
-    """The checkpoint that generated the motions, with its training and the sampling options."""
+    """The checkpoint that generated the motions, with facts about its training and sampling."""
 
     path: str
     sha256: str

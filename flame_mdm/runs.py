@@ -65,7 +65,7 @@ class FaultyBatch(Schema):
 
 
 class Fault(Schema):
-    """The batch whose loss stopped a run, with the parts of all ranks."""
+    """The batch whose loss stopped a run, with each rank's part of it."""
 
     step: Int
     usual_loss: str

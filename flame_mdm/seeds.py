@@ -37,8 +37,8 @@ def key(*parts: str | int) -> int:
 def seed_generator(number: int, device: torch.device) -> None:
     """Seeds torch's random number generators for the CPU and for `device`.
 
-    `torch.manual_seed` is slower, because it seeds the generators for all devices. This takes about
-    a millisecond if CUDA is not initialized.
+    `torch.manual_seed` seeds the generators for all devices, which takes longer: about a
+    millisecond if CUDA is not initialized.
     """
     torch.default_generator.manual_seed(number)
     if device.type != "cpu":
@@ -81,7 +81,7 @@ def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
 def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
     """Returns two independent uniform draws in (0, 1) for keys (B,).
 
-    Each draw is (B, *shape), float32.
+    Each draw is a float32 tensor of shape (B, *shape).
     """
     positions = torch.arange(math.prod(shape), device=keys.device).reshape(1, *shape)
     bits = _hash(_hash(keys).reshape(-1, *[1] * len(shape)) + positions * _GOLDEN)
@@ -113,7 +113,7 @@ def seeded_noise(
     """Returns the noise of a sampling run.
 
     Args:
-        ids: B names of the motions.
+        ids: names of the B motions.
         frames: number of frames F.
         features: number of features D.
         seed: seed of the sampling run.

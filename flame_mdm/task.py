@@ -31,7 +31,7 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
 class Task(Model, LightningModule):
-    """Base class of all tasks that `make train` can run.
+    """Base class for all tasks that `make train` can run.
 
     A recipe names the class of its task in `task._target_`.
     """

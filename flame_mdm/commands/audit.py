@@ -17,10 +17,10 @@ class AuditSettings(DataSettings):
            flame-mdm audit cards="A.json B.json"
 
     Perturbs a data set's real motions at several strengths, evaluates them as if they had been
-    generated, and writes a card. The card shows which perturbations each metric detects, and at
-    which strength, and which ones it misses. extractor=none audits the metrics that are computed
-    from joint positions. After an interruption, the same command continues where it stopped. cards=
-    renders an existing card again, or two cards side by side.
+    generated, and writes a card. The card shows which perturbations each metric detects, at which
+    strength it does so, and which ones it misses. extractor=none audits the metrics that are
+    computed from joint positions. After an interruption, the same command continues where it
+    stopped. cards= renders an existing card again, or two cards side by side.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")

@@ -202,7 +202,7 @@ def _help(kind: type[Any]) -> list[str]:
 
 
 def make_variables() -> list[str]:
-    """Returns the variables passed to make as command-line arguments.
+    """Converts the variables that were passed to make to command-line arguments.
 
     `EXP` names the recipe, and other upper-case variables are keys. Make lists the variables in
     MAKEFLAGS after ` -- `, the latest one first, with escaped spaces and doubled dollar signs.

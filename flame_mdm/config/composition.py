@@ -1,4 +1,4 @@
-"""Composition of recipes by Hydra. The result is resolved to plain dicts."""
+"""Composes recipes with Hydra and resolves them to plain dicts."""
 
 import re
 from collections.abc import Mapping, Sequence

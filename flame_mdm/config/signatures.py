@@ -175,7 +175,7 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
 
 
 def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
-    """Returns what the annotation of a tuple, such as `tuple[float, float]`, requires.
+    """Returns what a tuple annotation, such as `tuple[float, float]`, requires.
 
     Returns "" if the items satisfy the annotation.
     """

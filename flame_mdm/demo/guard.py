@@ -106,9 +106,9 @@ class Guard:
     It checks the host, origin, path, size and content of the request. `hosts` contains the names of
     this server, in addition to localhost and numeric addresses. A request with any other host name
     may come from a page whose domain name was made to resolve to this computer (DNS rebinding).
-    `calls` maps the index of each function that the page can call to its path and a check of its
-    arguments. `is_open` returns whether a session has called a function and may therefore read
-    results.
+    `calls` maps the index of each function that the page can call to the function's path and a
+    check of the arguments. `is_open` returns whether a session has called a function and may
+    therefore read results.
     """
 
     def __init__(

@@ -86,7 +86,7 @@ class LiveStreams:
     def block(
         self, name: str, text: str, begin: int, path: Sequence[tuple[float, float]] = ()
     ) -> dict[str, Any]:
-        """Returns the frames of a stream from frame `begin` on, in the format of the player.
+        """Returns the frames of a stream from frame `begin` on, in the player's format.
 
         Args:
             name: name of the stream, or "" to begin a new stream, whose name is in the result.

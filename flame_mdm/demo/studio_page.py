@@ -1,6 +1,6 @@
 """The demo page: form, player, edits, downloads and links.
 
-Links are written by `page.js` and answered by the server.
+`page.js` writes the links, and the server handles them.
 """
 
 import re
@@ -326,7 +326,7 @@ def _understood(studio: Studio, request: DemoRequest) -> str:
 
 
 def _refusal(error: NotUnderstood) -> str:
-    """Returns the message for a text that contains no action that the model knows.
+    """Returns the message for a text that contains no action known to the model.
 
     The actions that are closest in meaning are shown as buttons with pictures.
     """

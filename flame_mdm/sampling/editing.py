@@ -38,8 +38,8 @@ With this number and `until` = 0.2, the paper's "first 6 time steps" agree with 
 class Edited(Motion):
     """An edited motion, with the original motion and the errors of the kept part.
 
-    The joint error can be large even if the features are kept: they are relative to the root, so a
-    kept part starts where the resampled part before it ends.
+    The joint error can be large even if the features are kept: features are relative to the root,
+    so a kept part starts where the resampled part before it ends.
 
     Example:
         >>> import flame_mdm
@@ -223,7 +223,7 @@ def _original(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the number of frames of each part whose duration the text does not state.
+    """Returns the lengths, in frames, of the parts whose durations the text does not state.
 
     The parts must add up to the length of the motion.
     """

@@ -41,9 +41,9 @@ def generate(
     """Generates motions for texts or actions, or unconditioned motions if neither is given.
 
     A motion depends only on its text, its length, its sample number and the seed, not on the other
-    texts. If the same text is given several times, sample numbers continue, so all of its samples
-    differ. "A man walks, then sits down" becomes the sequence "A man walks | sits down", unless
-    `split=False`.
+    texts. If the same text is given several times, its sample numbers continue, so all of its
+    samples differ. "A man walks, then sits down" becomes the sequence "A man walks | sits down",
+    unless `split=False`.
 
     Args:
         model: the model, from `flame_mdm.load`.

@@ -1,8 +1,8 @@
 # pyright: standard
 """Keywords of `flame_mdm.generate` and `flame_mdm.edit`, with their types.
 
-The keywords are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`. Their defaults
-and help texts are in these classes.
+The keywords are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`. These classes
+define their defaults and help texts.
 """
 
 from collections.abc import Mapping, Sequence

@@ -30,10 +30,10 @@ class Placement:
 
     @classmethod
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
-        """Returns the placement that best moves the poses `local` (B, J, 3) to `world` (B, J, 3).
+        """Returns the placement that best maps the poses `local` (B, J, 3) to `world` (B, J, 3).
 
         It minimizes the squared error (Kabsch 1976, for a rotation about one axis). Heights do not
-        change. If the poses are equal, the error is 0.
+        change. If the poses differ only in their placement, the error is 0.
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])

@@ -35,9 +35,9 @@ def read_motion(
 ) -> Motion:
     """Reads a motion and computes its features in a model's representation.
 
-    If the file contains features of the same representation and frame rate, they are kept.
-    Otherwise, the motion is converted as in `flame_mdm.formats.conversion` and made canonical. If
-    joints were fitted, the `notes` of the result describe the fit and its error.
+    If the file contains features in the same representation and at the same frame rate, they are
+    kept. Otherwise, the motion is converted as in `flame_mdm.formats.conversion` and made
+    canonical. If joints were fitted, the `notes` of the result describe the fit and its error.
 
     Args:
         representation: the model's representation.

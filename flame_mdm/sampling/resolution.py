@@ -1,5 +1,5 @@
 # pyright: standard
-"""Resolution of requests: determines everything that depends on the model, before sampling."""
+"""Resolves requests: determines everything that depends on the model, before sampling."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -38,7 +38,7 @@ class ResolvedPrompt:
         is_split: whether the original prompt was a sentence with several actions.
         conditions: caption or action of each part, as the model reads it.
         texts: the words of the prompt that belong to each part.
-        frames: number of frames of each part. If the motion continues another one, the first part
+        frames: number of frames in each part. If the motion continues another one, the first part
             includes the frames in which they overlap.
         unknown: words of the text that do not occur in the training captions or that the model does
             not read.
@@ -155,7 +155,7 @@ def resolve(
 def _usual_frames(
     prompt: ReadPrompt, requested: float | None, model: MotionGenerator
 ) -> list[float | None]:
-    """Returns the number of frames of each part whose duration the prompt does not state.
+    """Returns the lengths, in frames, of the parts whose durations the prompt does not state.
 
     The result has one entry per part; None stands for the default length. The requested number of
     frames, if any, applies to all parts. Otherwise, a part that states a number of repetitions is
@@ -241,8 +241,8 @@ def _read(
 def _warnings(prompts: Sequence[ResolvedPrompt], model: MotionGenerator) -> list[str]:
     """Returns warnings about prompts.
 
-    They concern differences between a text and what is sampled, and words that the model does not
-    know or does not read.
+    The warnings report differences between a text and what is sampled, and words that the model
+    does not know or does not read.
     """
     lines = []
     for prompt in prompts:

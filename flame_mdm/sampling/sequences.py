@@ -41,11 +41,11 @@ def part_frames(
         model: the model that samples the motion.
         text: the prompt, as it is quoted in error messages.
         parts: the parts of the prompt, with their durations in seconds if the prompt states them.
-        usual: the (unrounded) number of frames of each part whose duration the prompt does not
+        usual: the unrounded length, in frames, of each part whose duration the prompt does not
             state. None stands for `USUAL_SECONDS` or, if that is too long for one window, as many
             frames as fit into it.
         is_sequence: whether the motion is sampled in windows. If not, the prompt has a single part.
-        loop: whether the last frame should lead to the first one.
+        loop: whether the last frame should lead back to the first one.
 
     Raises:
         UserError: If a part is too short or too long for the model.
@@ -111,7 +111,7 @@ def windows(
     """Returns the windows of several sequences.
 
     For each sequence, `conditions` contains the texts or actions of its parts, and `lengths`
-    contains their numbers of frames.
+    contains their lengths in frames.
     """
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
     spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]

@@ -97,8 +97,8 @@ class Stream(Iterator[Motion]):
     """An endless motion, as an iterator of blocks; created by `flame_mdm.stream`.
 
     Each block is a `Motion` that is placed in the world where the previous block ends. A block is
-    computed when it is requested; with `cleanup`, so is the next block. With the same seed and the
-    same changes of the text at the same times, the motion is the same.
+    computed when it is requested; with `cleanup`, so is the next block. The same seed and the same
+    text changes at the same times produce the same motion.
 
     Example:
         >>> import itertools, flame_mdm
@@ -155,8 +155,8 @@ class Stream(Iterator[Motion]):
         person who is standing stays in place. After the last waypoint, the path no longer bends.
 
         Args:
-            waypoints: (x, z) in meters in the world, in order. They replace all earlier waypoints;
-                an empty list only removes them.
+            waypoints: world positions (x, z) in meters, in order. They replace all earlier
+                waypoints; an empty list only removes them.
 
         Raises:
             UserError: If a waypoint does not consist of two finite numbers or is too far away, or
@@ -264,7 +264,7 @@ class Schedule:
 
     @classmethod
     def of_parts(cls, conditions: Sequence[str], lengths: Sequence[int]) -> Self:
-        """Returns the schedule of consecutive parts; `lengths` contains their numbers of frames."""
+        """Returns the schedule of consecutive parts, whose `lengths` are in frames."""
         schedule, begin = cls(conditions[0]), 0
         for condition, length in zip(conditions[1:], lengths, strict=False):
             begin += length
@@ -296,7 +296,7 @@ class Streams(Iterator[list[Motion]]):
 
     Args:
         model: a model that continues frames.
-        ids: B names of the streams, which seed the noise.
+        ids: names of the B streams, which seed the noise.
         conditions: B texts or actions with which the streams begin, or "" for unconditioned
             motions.
         prefix: (B, C, D) normalized features of the frames before the streams.
@@ -311,7 +311,7 @@ class Streams(Iterator[list[Motion]]):
         schedules: for each stream, the condition of each frame.
         texts: maps a condition to the text that the user typed, which becomes the text of the
             blocks. If a condition has no entry, the condition itself is used.
-        frames: number of frames of each stream so far.
+        frames: number of frames in each stream so far.
         targets: positions that a single stream should reach, or None. Guidance leads the motion to
             them. If the model was trained with targets, they are also part of its condition.
         waypoints: waypoints along which a single stream without targets is led.

@@ -141,7 +141,7 @@ class Targets:
 
         Args:
             begin: first frame of the window.
-            frames: number of frames of the window.
+            frames: number of frames in the window.
             here: x and z of the root at the beginning of the window.
         """
         end = begin + frames

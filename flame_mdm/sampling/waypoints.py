@@ -55,9 +55,10 @@ def bends(
     too near, the path stays straight until there is room for a curve.
 
     Args:
-        turns: (F,) turns of the root from each frame to the next in radians, positive to the left.
-        steps: (F, 2) displacements of the root from each frame to the next in meters, to the left
-            of the body and forward.
+        turns: (F,) turns of the root from each frame to the next, in radians; turns to the left are
+            positive.
+        steps: (F, 2) displacements of the root from each frame to the next, in meters: to the left
+            of the body, and forward.
         heading: direction of the body in the first frame in radians, as in `Placement.turn`.
         position: position of the root in the first frame, in meters.
         points: positions of the waypoints, in order.

@@ -80,8 +80,8 @@ class Judgment:
 
     Attributes:
         text: the sentence.
-        verdicts: one verdict per claim, in the order of the sentence. The list is empty if no claim
-            in the sentence can be checked.
+        verdicts: one verdict per claim, in the order in which the sentence states the claims. The
+            list is empty if no claim in the sentence can be checked.
     """
 
     text: str
@@ -210,7 +210,7 @@ def decide(body: Body, claim: Claim) -> Verdict:
 def _order(body: Body, claim: Claim) -> Reading:
     """Measures the time in seconds between the starts of two events whose order is claimed.
 
-    If an event happens several times, the pair of starts with the largest difference counts. The
+    If an event happens several times, the pair of starts with the largest difference is used. The
     order is undecided if the answer for either event is not "yes", or if the reverse order also
     occurs.
     """

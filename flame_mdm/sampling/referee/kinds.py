@@ -1,8 +1,8 @@
 """All kinds of claims: their measurements, groups and thresholds.
 
 A kind consists of a function in `postures.py` or `movements.py`, a row in `KINDS` and a pattern in
-`sentences.yaml`. Its thresholds are in `thresholds.yaml`, which `tools/referee.py` calibrates on
-captioned motions. If they are missing or were calibrated on too few motions, the values `no` and
+`sentences.yaml`. Its thresholds, which `tools/referee.py` calibrates on captioned motions, are in
+`thresholds.yaml`. If they are missing or were calibrated on too few motions, the values `no` and
 `yes` in the row are used.
 """
 
@@ -146,8 +146,8 @@ def group_of(claim: Claim) -> str:
 def threshold_key(claim: Claim) -> str:
     """Returns the name of the thresholds for a claim.
 
-    The name consists of the kind and the speed that the claim states. If it states no speed, the
-    name says whether the claim has a side or a direction.
+    The name consists of the kind and the speed that the claim states. If the claim states no speed,
+    the name indicates whether the claim has a side or a direction.
     """
     if claim.parts:
         return ORDER
@@ -167,7 +167,7 @@ def thresholds() -> dict[str, Any]:
 def band(claim: Claim) -> tuple[float, float]:
     """Returns the two thresholds of a claim; scores between them leave it undecided.
 
-    They do not depend on whether the claim is about the start, the end or any time.
+    The thresholds do not depend on whether the claim is about the start, the end or any time.
     """
     if claim.seconds is not None:
         return DURATION

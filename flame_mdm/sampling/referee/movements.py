@@ -58,10 +58,10 @@ def travel(body: Body, claim: Claim) -> Reading:
 def veer(body: Body, claim: Claim) -> Reading:
     """Measures the largest displacement to the claimed side, in meters.
 
-    The larger of two displacements counts: the displacement from the start, relative to the initial
-    heading, and the sum of all sideways steps, relative to the current heading. The reading is
-    unclear if this displacement exceeds 0.2 m and the displacement to the other side exceeds half
-    of it.
+    The larger of two displacements is used: the displacement from the start, relative to the
+    initial heading, and the sum of all sideways steps, relative to the current heading. The reading
+    is unclear if this displacement exceeds 0.2 m and the displacement to the other side exceeds
+    half of it.
     """
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0

@@ -49,7 +49,7 @@ def upright(body: Body, claim: Claim) -> Reading:
 def sit(body: Body, claim: Claim) -> Reading:
     """Measures how far the pelvis is below its standing height.
 
-    Only frames in which the thighs are raised and the trunk is upright count.
+    Only frames with raised thighs and an upright trunk are considered.
     """
     lowered = STANDING - body.height[:, PELVIS]
     is_folded = (thighs(body).min(1) > 40) & (body.tilt < 60)
@@ -152,7 +152,7 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 def return_pose(body: Body, claim: Claim) -> Reading:
     """Measures the distances between the joints of the first and the last pose.
 
-    Distances are measured in body coordinates, and the largest one counts.
+    Distances are measured in body coordinates, and the largest one is used.
     """
     ends = max(1, round(0.2 * RATE))
     first, last = body.seen[:ends].mean(0), body.seen[-ends:].mean(0)

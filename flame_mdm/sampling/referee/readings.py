@@ -79,7 +79,7 @@ def existence(
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
     """Combines the readings of the left and the right limb into the reading for a side.
 
-    For "both", the lower reading counts, and for "", the higher one. For "left" and "right", the
+    For "both", the lower reading is used, and for "", the higher one. For "left" and "right", the
     reading is unclear if the two readings differ by less than `margin`, because the other limb then
     does the same.
     """
@@ -128,8 +128,8 @@ def counted(
     """Returns a reading of the number of repetitions, counted as peaks of a signal.
 
     Peaks are counted twice, with a lower and a higher minimum depth. The score is 0 if both counts
-    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, it is minus
-    the distance from the claimed count to the nearer count, and thus at most -1.
+    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, it is the
+    negative distance from the claimed count to the nearer of the two counts, and thus at most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))

@@ -123,7 +123,7 @@ def _plain(text: str) -> str:
 
 
 def _clauses(plain: str) -> list[Clause]:
-    """Splits a sentence into clauses at its connectives, and cuts clauses off at a comparison."""
+    """Splits a sentence into clauses at its connectives, and truncates clauses at comparisons."""
     clauses: list[Clause] = []
     start, is_later = 0, False
     for match in [*BOUNDARY.finditer(plain), None]:
@@ -253,7 +253,7 @@ def _is_turning(text: str) -> bool:
 def _way(text: str) -> str | None:
     """Returns the direction that a clause states: left, right, clockwise or counterclockwise.
 
-    Returns None if it states no direction or several.
+    Returns None if the clause states no direction or several directions.
     """
     ways = set()
     for match in re.finditer(r"\b(left|right|clockwise|counterclockwise)\b", text):
@@ -269,7 +269,7 @@ def _way(text: str) -> str | None:
 def _direction(text: str) -> str:
     """Returns the direction of travel that a clause states: forward or backward.
 
-    Returns "" if it states neither or both, or if the direction is diagonal.
+    Returns "" if the clause states neither or both, or if the direction is diagonal.
     """
     if re.search(r"\b(?:diagonal|diagonally|sideways|backandforth|zig ?zag)\b", text):
         return ""
@@ -323,7 +323,7 @@ def _amount(text: str, kind: str) -> int | None:
 def _speed(text: str) -> str:
     """Returns "slow" or "fast" if a clause states that speed.
 
-    Returns "" if it states neither speed or both, or "normal".
+    Returns "" if the clause states both of these speeds, another speed, or none.
     """
     words = text.split()
     values = {value for word, value in word_values("speed").items() if word in words}

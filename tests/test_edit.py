@@ -334,7 +334,7 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
             suffix | {"method": "repaint"},
             "method=repaint is unknown. Use one of mdm, flame, flame_code",
         ),
-        (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
+        (diffusion, suffix | {"until": 0.3}, "until=0.3 applies only to method=mfm, not to mdm"),
         (diffusion, suffix | {"seconds": 3}, "an edit is as long as the motion. Omit seconds"),
         (diffusion, suffix | {"texts": "walks | jumps"}, "an edit changes a single motion"),
         (

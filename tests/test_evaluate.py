@@ -680,7 +680,7 @@ def test_what_does_not_fit_is_refused(runs, tmp_path, subtests):
         ("Did you mean synthetic", {"protocol": "synthetical"}),
         ("condition text", {"protocol": "action_to_motion"}),
         ("does not edit motions", {"method": "mdm"}),
-        ("option of method=mfm", {"protocol": "editing_prediction", "until": 0.3}),
+        ("only to method=mfm", {"protocol": "editing_prediction", "until": 0.3}),
         ("use exactly one of", {"baseline": "real"}),
         ("needs a protocol", {"ckpt": None, "baseline": "real", "data": {"name": "synthetic"}}),
     ):

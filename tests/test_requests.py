@@ -310,7 +310,7 @@ def test_a_faultless_candidate_is_kept_even_if_a_faulty_one_has_a_higher_score()
         ({"candidates": 2, "stages": []}, "single motion"),
         (
             {"samples": 5_000, "candidates": 3},
-            "samples times candidates=15000 for each text: a request may have at most 10,000 motions",
+            "samples times candidates=15000 for each text: a request may contain at most 10,000 motions",
         ),
     ],
     ids=str,

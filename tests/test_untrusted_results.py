@@ -172,7 +172,7 @@ def test_long_names_and_many_texts(attacked, bad, tmp_path, trained, capfd):
         says=": the text has 1,000,005 characters",
     )
     with pytest.raises(
-        UserError, match=r"samples=2 for each text: a request may have at most 10,000 motions"
+        UserError, match=r"samples=2 for each text: a request may contain at most 10,000 motions"
     ):
         flame_mdm.generate(
             flame_mdm.load(trained), [f"text {number}" for number in range(5001)], samples=2

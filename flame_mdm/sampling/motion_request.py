@@ -149,12 +149,12 @@ class EditRequest:
         options = METHODS[method] | {"resample": self.resample, "strength": self.strength}
         if self.resample != 1 and options["mode"] != "x_t":
             raise UserError(
-                f"resample={self.resample} is an option of method=flame and flame_code, not of {method}"
+                f"resample={self.resample} applies only to method=flame and flame_code, not to {method}"
             )
         if self.until is None:
             return options
         if options["mode"] != "trajectory":
-            raise UserError(f"until={self.until:g} is an option of method=mfm, not of {method}")
+            raise UserError(f"until={self.until:g} applies only to method=mfm, not to {method}")
         return options | {"until": self.until}
 
 
@@ -311,7 +311,7 @@ class SamplingRequest:
         if len(self.prompts) * copies > MAX_SAMPLES:
             key = "samples" if self.candidates == 1 else "samples times candidates"
             raise UserError(
-                f"{key}={copies} for each text: a request may have at most {MAX_SAMPLES:,} motions"
+                f"{key}={copies} for each text: a request may contain at most {MAX_SAMPLES:,} motions"
             )
         _ = self.parts  # raises an error if a part is invalid
 

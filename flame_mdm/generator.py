@@ -182,7 +182,7 @@ class MotionGenerator(Model, nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of the model."""
+        """The model's device."""
         return self.representation.mean.device
 
     def describe(self) -> str:

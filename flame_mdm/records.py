@@ -127,9 +127,9 @@ class Checkpoint(Schema):
 
 
 class UsedSkeleton(Schema):
-    """Origin of the bone lengths when joint positions are computed from SMPL rotations.
+    """Source of the bone lengths when joint positions are computed from SMPL rotations.
 
-    They come from SMPL's model file or from a stand-in for it.
+    The source is SMPL's model file or a stand-in for it.
     """
 
     stand_in: bool

@@ -35,7 +35,7 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """Entry `data` of a provenance file. It may contain additional facts about the data."""
+    """The `data` entry of a provenance file. It may contain additional facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"

@@ -1,4 +1,4 @@
-"""Signal handlers that end a command cleanly, or stop training at the end of a step."""
+"""Signal handlers that end a command cleanly, or stop training at the end of a training step."""
 
 import os
 import signal
@@ -51,13 +51,13 @@ def stoppable(signums: Sequence[int]) -> Iterator[None]:
 
 
 def raise_received() -> None:
-    """Raises the exception of a received signal again, in case a library has swallowed it."""
+    """Re-raises the exception for a received signal, in case a library has swallowed it."""
     if _received is not None:
         raise _received
 
 
 class StopRequest:
-    """Records a signal that asks training to stop at the end of a step.
+    """Records a signal that asks training to stop at the end of a training step.
 
     `signum` is the signal number; 0 = no signal. A second SIGINT stops immediately. So does a
     second SIGTERM, unless it arrives within one second of the first one: `timeout` sends two at

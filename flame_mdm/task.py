@@ -1,8 +1,5 @@
 # pyright: standard
-"""Lightning modules for training.
-
-They train the models in `flame_mdm.generator`, such as `MotionGenerator`.
-"""
+"""Lightning modules that train the models in `flame_mdm.generator`, such as `MotionGenerator`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Small pictures of actions, for buttons."""
+"""Small pictures of actions for the page's buttons."""
 
 from functools import cache
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Motions for the page.
+"""Generates the motions for the page.
 
 The model handles one request at a time, and the latest results stay in memory.
 """

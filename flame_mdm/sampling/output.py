@@ -48,7 +48,7 @@ def default_folder(model: MotionGenerator, title: str, *request: object) -> Path
 
 
 def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
-    """Returns a line that summarizes the files that `write_motions` wrote to a folder."""
+    """Returns a one-line summary of the files that `write_motions` wrote to a folder."""
     count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
     files = f"{folder / 'player.html'}, motions.gif" + (", motions.mp4" if mp4 else "")
     return f"{count} of {len(motions[0].joints)} frames: {files}"

@@ -1,4 +1,4 @@
-"""Waypoints on the floor for streams.
+"""Guides streams along waypoints on the floor.
 
 The path of the person bends toward the waypoints, while the text determines how the person moves.
 """

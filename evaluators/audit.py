@@ -118,7 +118,7 @@ def _measured(
     texts: Sequence[Text],
     bar: ProgressBar,
 ) -> dict[str, Any]:
-    """Returns the parts of a card: metrics, and values for each perturbation at each grade."""
+    """Returns the parts of a card: the metrics, and their values for each perturbation at each grade."""
     base = measure(measure.inputs[BASE], texts)
     scores, listed = [measure.scores(measure.inputs[BASE], texts)], []
     for perturbation in perturbations:
@@ -162,7 +162,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> 
 
 
 def audited_metrics(evaluator: Evaluator) -> dict[str, SampleMetric]:
-    """Returns, by name, the metrics for which the audit can provide all inputs."""
+    """Returns the metrics for which the audit can provide all inputs, keyed by name."""
     metrics = make_metrics(evaluator.metrics)
     return {
         name: metric
@@ -206,7 +206,7 @@ class _Measure:
         self.real_texts, self.of_motions = texts, {}
 
     def __call__(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns the values (1 + R,) of each metric: for all motions, and for R resamples."""
+        """Returns each metric's values as (1 + R,): for all motions, and then for R resamples."""
         values: dict[str, np.ndarray] = {}
         for name, metric in self.metrics.items():
             reused = self.of_motions.get(name) if inputs is self.inputs[BASE] else None
@@ -232,7 +232,7 @@ class _Measure:
         return values
 
     def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns the values (N,) for individual motions or pairs, by metric."""
+        """Returns the values for N individual motions or pairs, keyed by metric."""
         values = {}
         for name, metric in self.metrics.items():
             rows = self._rows(name, metric, inputs, texts)
@@ -246,7 +246,7 @@ class _Measure:
         return self.metrics[metric].direction_of(part)
 
     def facts_of(self, name: str) -> dict[str, Any]:
-        """Returns the properties of a value that a card lists; see `AuditedMetric`.
+        """Returns the properties that a card lists for a value; see `AuditedMetric`.
 
         The direction is not included.
         """
@@ -270,7 +270,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Values that rate motion-text pairs by features: {name: 1, or -1 if lower is better}."""
+        """Values that rate motion-text pairs by their features: {name: 1, or -1 if lower is better}."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -314,7 +314,7 @@ class _Measure:
         }
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
-        """Returns features (N, E) of texts in float64. Each distinct caption is encoded once."""
+        """Encodes texts as float64 features (N, E). Each distinct caption is encoded once."""
         assert self.extractor is not None
         new = {text.caption: text for text in texts if text.caption not in self.encoded}
         if new:
@@ -349,12 +349,12 @@ def _agreement(
     scores: Sequence[Mapping[str, np.ndarray]],
     perturbations: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, float | None]]:
-    """Returns, by metric, how well metrics that rate pairs agree with the exact attributes.
+    """Returns how well each metric that rates pairs agrees with the exact attributes.
 
     "auc" is the probability that a pair with every requested attribute has a better score than a
-    pair that lacks an attribute. It is computed from pairs with real motions and from pairs with
-    the strongest perturbations of the meaning. "correlation" is Spearman's rank correlation over
-    these perturbations at all grades. Returns {} if the exact attributes are unknown.
+    pair that lacks one. It is computed from pairs with real motions and from pairs with the
+    strongest perturbations of the meaning. "correlation" is Spearman's rank correlation over these
+    perturbations at all grades. Returns {} if the exact attributes are unknown.
     """
     truth = measure.truth
     if truth is None or truth not in scores[0]:

@@ -26,9 +26,10 @@ class Evaluate(Callback):
     val/<protocol>/<metric> (<unit>), next to the value for real motions (.../real). With several
     replications, .../ci is the half width of the 95 % interval.
 
-    The evaluation runs at the first validation and then at multiples of `every_n_steps`. It uses
-    averaged weights if the recipe averages weights. The motions are divided among all ranks. Raises
-    `UserError` before training begins if the extractor does not exist.
+    The evaluation is part of validation: it runs at the first one, and then whenever another
+    multiple of `every_n_steps` has been reached. If the recipe averages weights, the averaged
+    weights are evaluated. The motions are divided among all ranks. Raises `UserError` before
+    training begins if the extractor does not exist.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
@@ -36,7 +37,7 @@ class Evaluate(Callback):
             a model in the package or a run directory. None = the extractor named in the protocol;
             "none" = skip metrics that need features.
         every_n_steps: number of training steps between evaluations.
-        samples: number of motions per replication. None = the protocol's number.
+        samples: number of motions per replication. None = the number in the protocol.
         replications: number of replications.
         batch_size: number of motions per batch.
     """
@@ -74,7 +75,7 @@ class Evaluate(Callback):
         self.next = trainer.global_step
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluates the averaged weights if `every_n_steps` steps have passed since the last evaluation."""
+        """Evaluates the averaged weights if another multiple of `every_n_steps` has been reached."""
         if trainer.global_step < self.next or not hasattr(self, "evaluation"):
             return
         assert isinstance(pl_module, GeneratorTask)

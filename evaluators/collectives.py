@@ -41,7 +41,7 @@ def shared(value: T) -> T:
 
 
 def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
-    """Returns the results for all items on every rank. Each of N ranks computes every N-th one."""
+    """Returns the results for all items on every rank. Each of N ranks computes every N-th result."""
     count = world_size()
     if count == 1:
         return [function(item) for item in items]

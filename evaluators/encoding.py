@@ -13,7 +13,7 @@ Joints = np.ndarray
 
 
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
-    """Encodes motions as features (F, D) float32 with one row per frame, at their original height.
+    """Encodes motions as float32 features (F, D), one row per frame, at their original height.
 
     The encoder of a representation requires an additional frame and places the lowest joint on the
     floor, which would hide floating and sinking. This function adds the frame and restores the

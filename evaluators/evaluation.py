@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluations: measures real motions, generates motions, measures them, and writes the result."""
+"""Evaluations: measures real motions, generates and measures motions, and writes the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -106,7 +106,7 @@ class Evaluation:
 
         Args:
             source: source of the motions; None = only real motions are measured.
-            ground_truth: whether to measure real motions, too.
+            ground_truth: whether to measure real motions as well.
             force: whether to generate motions even if real motions do not have the expected values.
             resamples: number of bootstrap sets to draw from the motions of the first replication,
                 for intervals over motions.
@@ -254,7 +254,7 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns notes on limitations: repeated clips, and unchecked values of real motions."""
+        """Returns notes on limitations: repeated clips and unchecked values of real motions."""
         lines = []
         clips = len(self.protocol.selected(self.clips))
         drawn = {
@@ -370,7 +370,7 @@ class Evaluation:
         features: list[np.ndarray],
         captions: list[str] | None = None,
     ) -> Motions:
-        """Returns motions with the conditions of their rows.
+        """Combines motions with the conditions of their rows.
 
         If `captions` is not None, it replaces the captions of the rows.
         """

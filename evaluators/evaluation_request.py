@@ -22,7 +22,7 @@ MIN_RESAMPLES = 100
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationKeys:
-    """Keys of an evaluation that the command line and Python share, with their help texts."""
+    """Evaluation keys that the command line and Python share, with their help texts."""
 
     protocol: str | None = option(
         None,

@@ -208,10 +208,10 @@ class Evaluator:
         """Computes all metrics for generated motions and their paired real motions, in the same order.
 
         Metrics that compare sets use `real`, a separate draw of real motions, because the distance
-        from a set to itself is 0. Returns the values by name (`metric` or `metric/part`), and the
-        reasons for missing values by metric. A value that cannot be computed is None. Both mappings
-        are empty in all processes except the first. Raises `UserError` if the motions lack an input
-        that a metric requires.
+        from a set to itself is 0. Returns the values, keyed by name (`metric` or `metric/part`),
+        and the reasons for missing values, keyed by metric. A value that cannot be computed is
+        None. Both mappings are empty in every process except the first. Raises `UserError` if the
+        motions lack an input that a metric requires.
         """
         if not is_first():
             return {}, {}
@@ -225,7 +225,7 @@ class Evaluator:
 
         For metrics that compare two sets, motions are drawn from both sets. The draws depend only
         on `seed` and the numbers of motions, so that two models are compared on the same draws. See
-        `score` for the arguments. Returns values (resamples,) by name.
+        `score` for the arguments. Returns one value per resample, keyed by name.
         """
         count, others = len(generated["keys"]), len(real["keys"])
         if not is_first() or not count or not resamples:
@@ -249,7 +249,7 @@ class Evaluator:
     def _updated(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, SampleMetric], dict[str, SampleMetric]]:
-        """Updates the metrics with motions. Returns all metrics, and those that can be computed."""
+        """Updates the metrics with motions. Returns all metrics, and the subset that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
             # `bool()` returns False: metrics are not synchronized, because this process has all
@@ -272,7 +272,7 @@ class Evaluator:
 
     @cached_property
     def declared(self) -> dict[str, SampleMetric]:
-        """The metrics by name, for reading the properties that they declare."""
+        """The metrics, keyed by name, for looking up the properties that they declare."""
         return make_metrics(self.metrics)
 
     def unit_of(self, name: str) -> str:

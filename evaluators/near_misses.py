@@ -17,7 +17,7 @@ _Stated = frozenset[tuple[str, str | int | float]]
 
 
 def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
-    """Returns, for each clip, its sorted near misses by the attribute that differs.
+    """Returns the sorted near misses of each clip, keyed by the attribute that differs.
 
     A caption of another clip is a near miss if both clips show the same action but differ in
     exactly one of the attributes (side, style, count, ...) that they both have. For example,

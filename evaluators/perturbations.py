@@ -37,7 +37,7 @@ SHARES = (5, 10, 20, 50, 100)
 
 
 def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
-    """Adds Gaussian noise to all coordinates, independently per frame."""
+    """Adds Gaussian noise to all coordinates, independently in each frame."""
     return joints + millimeters / 1000 * draws.standard_normal(joints.shape)
 
 
@@ -68,7 +68,7 @@ def resize(joints: Joints, percent: float) -> Joints:
 
 
 def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False) -> Joints:
-    """Moves the whole body in a random direction, in one random inner frame or in the last frame."""
+    """Displaces the whole body in a random direction in one frame: a random interior frame or the last."""
     frame = int(draws.integers(1, len(joints) - 1))
     direction = draws.standard_normal(3)
     popped = joints.copy()
@@ -125,7 +125,7 @@ def crop(joints: Joints, percent: float) -> Joints:
 
 
 def drop_repetition(joints: Joints, count: int) -> Joints:
-    """Cuts one of `count` repetitions out of a motion, which shortens it.
+    """Shortens a motion by cutting out one of its `count` repetitions.
 
     The cut joins the two frames with the most similar poses among all pairs of frames that are
     about one period apart (within 20 %). The second part continues at the position where the first
@@ -193,7 +193,7 @@ class Perturbation:
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns, by name, the sets of motions from which `apply` takes motions."""
+        """Returns the sets of motions from which `apply` takes motions, keyed by name."""
         return {}
 
     def apply(
@@ -226,7 +226,7 @@ class ChangedJoints(Perturbation):
     sign: int = 1
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns the changed motions of each grade, by name."""
+        """Returns the changed motions of each grade, keyed by name."""
         return {self._set(grade): partial(self._motions, scene, grade) for grade in self.grades}
 
     def _set(self, grade: float) -> str:
@@ -257,7 +257,7 @@ class ChangedSet(Perturbation):
     make: Callable[[Scene], list[np.ndarray]] = lambda scene: scene.features
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns the new motions, by name."""
+        """Returns the new motions, keyed by name."""
         return {self.name: partial(self.make, scene)}
 
     def apply(
@@ -277,7 +277,7 @@ class ReplacedShare(ChangedSet):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions with this share (in percent) replaced, and the same texts."""
+        """Returns the motions after replacing this share (in percent), with the same texts."""
         count = round(len(scene) * grade / 100)
         replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
         base, other = sets[BASE], sets[self.name]
@@ -298,7 +298,7 @@ class DroppedRepetition(ReplacedShare):
 class ReplacedCaptions(Perturbation):
     """Replaces a share of the captions, in percent, with wrong captions.
 
-    `name` is the kind of the wrong captions in `Scene.wrong`.
+    `name` is the kind of wrong captions in `Scene.wrong`.
     """
 
     unit: str = "% of captions"
@@ -321,7 +321,7 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same motions, and the texts with this share (in percent) replaced."""
+        """Returns the same motions, with texts of which this share (in percent) has been replaced."""
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]
@@ -344,7 +344,7 @@ class DroppedActions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns as many motions and texts as before, but only of the remaining actions."""
+        """Returns as many motions and texts as before, but only for the remaining actions."""
         actions = sorted(set(scene.actions), key=lambda action: key("missing", scene.seed, action))
         gone = set(actions[: max(1, round(len(actions) * grade / 100))])
         kept = [i for i in self.order(scene) if scene.actions[i] not in gone]

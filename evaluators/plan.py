@@ -99,7 +99,7 @@ class Plan:
         self.path = Path(request.out or path.with_name(f"{path.name}{suffix}.json"))
 
     def _motions_folder(self, request: EvaluationRequest, file: Path, protocol: Protocol) -> Path:
-        """Returns the folder for the motions of a checkpoint with these options.
+        """Returns the folder for motions generated from a checkpoint with these options.
 
         The folder is in the checkpoint's run directory or, if there is none, next to the
         checkpoint. Motions of models in this package or on the hub go to runs/NAME in the working
@@ -171,7 +171,7 @@ def sampling_options(
 ) -> tuple[SamplerOptions, dict[str, Any]]:
     """Returns the options of the sampler and of `Edit`.
 
-    Options that are not requested have the values in the recipe.
+    Options that are not requested keep their values from the recipe.
     """
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}

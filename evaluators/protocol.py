@@ -344,7 +344,7 @@ def protocol_config(name: str) -> Config:
 
 
 def _protocols(path: Path) -> dict[str, Config]:
-    """Returns the protocols in a file by name: its variants and, if it has metrics, the file itself."""
+    """Returns the protocols in a file, keyed by name: its variants and, if it has metrics, the file itself."""
     content = (read_package_yaml if path.parent == FOLDER else read_yaml)(path)
     variants = content.pop("variants", {}) if isinstance(content, dict) else None
     if not isinstance(variants, dict) or not all(
@@ -404,7 +404,7 @@ def _value_names(metrics: Mapping[str, SampleMetric]) -> list[str]:
 
 
 def digest(values: Any) -> str:
-    """Returns the sha256 of JSON values."""
+    """Returns the SHA-256 hash of JSON values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 

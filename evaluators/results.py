@@ -82,7 +82,7 @@ class Outcome:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Reasons for missing values, by metric."""
+        """Reasons for missing values, keyed by metric."""
         reasons: dict[str, str] = {}
         for scores in self.scores:
             reasons |= scores.reasons
@@ -112,7 +112,7 @@ def mean_cost(costs: Sequence[Cost]) -> Cost:
 
 
 def make_result(request: EvaluationRequest, plan: Plan) -> Result:
-    """Returns a result with its provenance, but still without values."""
+    """Returns a result that contains its provenance, but no values yet."""
     info, extractor, protocol = plan.data.store.info, plan.extractor, plan.protocol
     device, crop, short = plan.representation.mean.device, plan.data.crop, plan.clips.too_short
     reason = f"{request.split} clips shorter than {crop.min_frames} frames"

@@ -52,7 +52,7 @@ class Scene:
 
     @cached_property
     def joints(self) -> list[np.ndarray]:
-        """Joint positions (F, J, 3) of each motion in meters, y up, float64."""
+        """Joint positions of each motion: float64 (F, J, 3) in meters, y up."""
         return [
             self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features
         ]

@@ -59,7 +59,7 @@ class Source(Interface):
 
 
 def real_motions(clips: Clips, rows: Sequence[DrawnClip]) -> list[np.ndarray]:
-    """Returns features (F, D) of the real motions for the rows, in the data's units."""
+    """Returns the real motions for the rows as features (F, D) in the data's units."""
     store, rebase = clips.store, clips.representation.rebase
     return [
         np.ascontiguousarray(rebase(store.motion(row.clip)[row.frames]), np.float32) for row in rows

@@ -46,7 +46,7 @@ class Extractor(ABC):
 
     @abstractmethod
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns the "features" (B, E) of motions and, for classifiers, their "logits" (B, A).
+        """Returns "features" (B, E) and, for classifiers, "logits" (B, A).
 
         Motions are passed both as `features` (B, F, D) in the data's units and as joint positions
         `joints` (B, F, J, 3) in meters, y up, with the mask (B, F).
@@ -55,14 +55,14 @@ class Extractor(ABC):
     def texts(
         self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]
     ) -> Tensor | None:
-        """Returns the features (B, E) of captions, or None if the extractor does not read text.
+        """Encodes captions as features (B, E). Returns None if the extractor does not read text.
 
         `tokens` contains the "word/PART" tokens of each caption, or None if they are unknown.
         """
         return None
 
     def reference(self) -> Tensor | None:
-        """Features (N, E) of the network's own real motions, with which sets are compared.
+        """The network's own real motions as features (N, E), with which sets are compared.
 
         None = sets are compared with motions from the data set.
         """
@@ -108,7 +108,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Computes "features" (B, E) from motions (B, F, D), in the data's units, and mask (B, F)."""
         return {"features": self.task(features, mask)}
 
 
@@ -122,7 +122,7 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
         self.encoded: dict[str, Tensor] = {}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns the features (B, E) of captions. Each distinct caption is encoded only once."""
+        """Encodes captions as features (B, E). Each distinct caption is encoded only once."""
         new = sorted(set(captions) - self.encoded.keys())
         if new:
             self.encoded |= dict(zip(new, self.task.text(new), strict=True))
@@ -160,9 +160,10 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
         return reads_part or super().reads(other)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns the features (B, E) of captions.
+        """Encodes captions as features (B, E).
 
-        They are computed from the words or, if the extractor reads tags, from the tagged words.
+        The features are computed from the words or, if the extractor reads tags, from the tagged
+        words.
         """
         return self.task.text(
             list(map(words, captions)) if self.task.learns_words else _tagged(self.path, tokens)
@@ -175,7 +176,7 @@ class OwnClassifierExtractor(OwnExtractor[ClassifierTask]):
     trained, recipes = ClassifierTask, "classifier"
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) and "logits" (B, actions) of joints (B, F, J, 3), with mask (B, F)."""
+        """Computes "features" (B, E) and "logits" (B, actions) from joints (B, F, J, 3) and mask (B, F)."""
         return {
             "features": self.task(joints, mask),
             "logits": self.task.network.logits(joints, mask),
@@ -192,7 +193,7 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 
 
 class ReleasedExtractor(Extractor, Generic[Network]):
-    """A network with its authors' released weights, loaded from a file or a folder of `FILES`."""
+    """A network with its authors' released weights, loaded from a file or from a folder with `FILES`."""
 
     FILES: tuple[str, ...] = ()
     network: Network
@@ -226,7 +227,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Computes "features" (B, E) from motions (B, F, D), in the data's units, and mask (B, F)."""
         return {"features": self.network(features, mask)}
 
 
@@ -255,7 +256,7 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
         )
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of the tagged words of captions."""
+        """Encodes the tagged words of captions as features (B, E)."""
         return self.network.text(
             self.words(_tagged(self.path, tokens), full_length=self.full_length)
         )
@@ -264,9 +265,8 @@ class T2MExtractor(ReleasedExtractor[T2MEvaluator]):
 class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
     """The second evaluator that MARDM released.
 
-    MARDM's CLIP-score is the `MotionCLIPScore` computed from the features of this evaluator. The
-    files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and
-    eval_std).
+    MARDM's CLIP-score is the `MotionCLIPScore` computed from this evaluator's features. The files
+    are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and eval_std).
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy")
@@ -280,7 +280,7 @@ class MARDMClipExtractor(ReleasedExtractor[MARDMClip]):
         )
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Returns features (B, E) of captions."""
+        """Encodes captions as features (B, E)."""
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
 
 
@@ -325,7 +325,7 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Returns "features" (B, E) and "logits" (B, actions) of motions, with mask (B, F)."""
+        """Computes "features" (B, E) and "logits" (B, actions) from motions and their mask (B, F)."""
         network = self.network
         x = features if isinstance(network, UESTC) else joints
         if not (self.random_start and isinstance(network, ActionGRU)):
@@ -348,7 +348,7 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
 class UnconstrainedExtractor(ClassifierExtractor):
     """Classifier and reference motions for unconstrained HumanAct12 synthesis.
 
-    They are loaded from a folder with two files.
+    Both are loaded from a folder with the two `FILES`.
     """
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
@@ -358,7 +358,7 @@ class UnconstrainedExtractor(ClassifierExtractor):
         self.real = torch.from_numpy(read_unconstrained(self.path / self.FILES[1])).to(device)
 
     def reference(self) -> Tensor:
-        """Features (N, 256) of the reference motions."""
+        """The reference motions as features (N, 256)."""
         assert isinstance(self.network, Unconstrained)
         mask = torch.ones(self.real.shape[:2], dtype=torch.bool, device=self.real.device)
         pairs = zip(self.real.split(64), mask.split(64), strict=True)

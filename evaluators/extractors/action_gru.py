@@ -34,7 +34,7 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) in (-1, 1) of joint positions (B, F, J, 3) with mask (B, F).
+        """Computes features (B, 30), in (-1, 1), from joint positions (B, F, J, 3) and mask (B, F).
 
         The positions are in meters, y up.
         """
@@ -42,7 +42,7 @@ class ActionGRU(nn.Module):
         return self.published(joints - joints[:, :1, :1], mask, state)
 
     def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Returns features (B, 30) of joint positions (y down) relative to the initial pelvis."""
+        """Computes features (B, 30) from joint positions (y down) relative to the initial pelvis."""
         outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))

@@ -23,7 +23,7 @@ def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.Transfo
 
 
 class _MotionEncoder(nn.Module):
-    """A transformer with a learned first token. Its output is the embedding of the motion."""
+    """A transformer with a learned first token, whose output is the embedding of the motion."""
 
     def __init__(self, features: int, width: int, transformer: nn.TransformerEncoder):
         super().__init__()
@@ -73,12 +73,12 @@ class MARDMClip(nn.Module):
         self.logit_scale = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns vectors (B, 512) of motions (B, F, D >= 67) in the data's units, with mask (B, F)."""
+        """Computes vectors (B, 512) from motions (B, F, D >= 67), in the data's units, and mask (B, F)."""
         x = (x[..., : len(self.mean)] - self.mean) / self.std * mask[..., None]
         return F.normalize(self.motion_encoder(x, mask), dim=-1)
 
     def text(self, tokens: Tensor) -> Tensor:
-        """Returns vectors (B, 512) of captions, which are passed as CLIP tokens (B, S).
+        """Encodes captions, which are passed as CLIP tokens (B, S), as vectors (B, 512).
 
         The tokens after the end of a caption are 0.
         """
@@ -89,7 +89,7 @@ class MARDMClip(nn.Module):
 
 
 def clip_tokens(captions: Sequence[str]) -> Tensor:
-    """Returns the CLIP tokens (B, 77) of captions, padded with 0. Long captions are truncated."""
+    """Converts captions to CLIP tokens (B, 77), padded with 0. Long captions are truncated."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
     encoded = tokenizer(
         list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt"

@@ -47,11 +47,11 @@ class MotionCLIP(nn.Module):
         in_features: D, the number of features per frame of the motions.
         text_features: C, the number of features of the pooled condition.
         embedding_dim: E, the number of features in the joint space.
-        blind_features: number of features at the beginning of each frame that are set to 0.
-            FLAME's code sets the first 3 features (the translation of the root) to 0, so that
-            scores do not depend on position and height.
-        roughness: whether absolute second differences over time, which reveal noise, are used as
-            additional inputs.
+        blind_features: how many features at the beginning of each frame are set to 0. FLAME's code
+            sets the first 3 features (the translation of the root) to 0, so that scores do not
+            depend on position and height.
+        roughness: whether absolute second differences over time are additional inputs, so that
+            noise is easier to detect.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class MotionCLIP(nn.Module):
         self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F).
+        """Computes features (B, E) from normalized motions (B, F, D) and mask (B, F).
 
         F must not exceed `max_frames`.
         """
@@ -104,7 +104,7 @@ class MotionCLIP(nn.Module):
         return self.output(self.transformer(x, with_prefix(mask, 2))[:, 0])
 
     def text(self, pooled: Tensor) -> Tensor:
-        """Returns features (B, E) of texts from the pooled outputs (B, C) of the text encoder."""
+        """Converts the text encoder's pooled outputs (B, C) to features (B, E)."""
         return self.text_projection(pooled)
 
 
@@ -169,7 +169,7 @@ class PooledLoss(SampleMetric):
         super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
-        """Returns the mean loss of features (N, E) in pools of `POOL` motions and texts."""
+        """Returns the mean loss over pools of `POOL` motions and texts, given their features (N, E)."""
         losses = []
         for begin in range(0, len(motion), POOL):
             pool = slice(max(0, min(begin, len(motion) - POOL)), begin + POOL)
@@ -223,17 +223,17 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         return task.eval()
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Computes features (B, E) from motions (B, F, D), in the data's units, and mask (B, F)."""
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """Returns features (B, E) of captions."""
+        """Encodes captions as features (B, E)."""
         x = torch.zeros(len(captions), 1, self.representation.features, device=self.device)
         mask = torch.ones(len(captions), 1, dtype=torch.bool, device=self.device)
         return self.text_features(MotionBatch(x, mask, ids=list(captions), text=list(captions)))
 
     def text_features(self, batch: MotionBatch) -> Tensor:
-        """Returns features (B, E) of the captions of a batch."""
+        """Encodes the captions of a batch as features (B, E)."""
         cond = self.condition(batch)
         # A learned null condition is not used here, but DDP requires a gradient for it.
         if cond.null is not None:

@@ -41,13 +41,13 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     - Texts: motions of clips with the same captions or attributes are not negatives of each other's
       captions. Near-miss captions (see `near_misses`) are additional negatives.
     - Motions: half of them are accompanied by a noisy copy. The strength of the noise is drawn from
-      [0, 1], where small values are more likely. The distance between the features of a motion and
-      its copy, both scaled to norm 1, is trained to equal this strength. Half of the copies have
-      white noise on the joints and are encoded again, like motions from files. The other half have
-      noise on normalized features, like generated motions.
+      [0, 1], with small values more likely. The distance between the features of a motion and its
+      copy, both scaled to norm 1, is trained to equal this strength. Half of the copies have white
+      noise on the joints and are encoded again, like motions from files. The other half have noise
+      on normalized features, like generated motions.
 
-    All features are scaled to the same norm. Otherwise, their norms, which cosines leave
-    undetermined, would distort Euclidean distances.
+    All features are scaled to the same norm. Otherwise, their norms, which do not affect cosines,
+    would distort Euclidean distances.
     """
 
     representation: HumanML
@@ -67,14 +67,14 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         return super().parts(config, representation, actions)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns the features (B, E) of motions, scaled to the norm `LENGTH`.
+        """Encodes motions as features (B, E), scaled to the norm `LENGTH`.
 
         The motions (B, F, D) with mask (B, F) are in the data's units.
         """
         return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """Returns the features (B, E) of captions, scaled to the norm `LENGTH`."""
+        """Encodes captions as features (B, E), scaled to the norm `LENGTH`."""
         return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:

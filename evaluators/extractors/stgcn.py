@@ -15,10 +15,10 @@ TEMPORAL_KERNEL = 9
 
 
 def adjacency(parents: Sequence[int]) -> Tensor:
-    """Returns the matrices (3, V, V) of a graph convolution.
+    """Returns the three matrices of a graph convolution, as (3, V, V).
 
-    They gather from a vertex itself, its neighbors that are not nearer the root, and its neighbors
-    that are nearer the root.
+    They gather from a vertex itself, from its neighbors that are not nearer to the root, and from
+    its neighbors that are.
 
     Entry (v, w) is the weight of vertex v in the sum for vertex w, divided by the number of
     vertices that contribute to w. In the authors' code, all vertices beyond distance 1 from the
@@ -41,11 +41,11 @@ def adjacency(parents: Sequence[int]) -> Tensor:
 class STGCN(nn.Module):
     """A stack of graph convolutions and temporal convolutions over 9 frames.
 
-    The output is averaged over frames and joints. The dropout of the published training code is
-    omitted. Past the end of a motion, the convolutions read zeros, so that features do not depend
-    on the other motions in a batch. In the published evaluations, all motions have 60 frames, and
-    the last frame of shorter clips is repeated. `widths` and `strides` contain one number per
-    block.
+    The output is averaged over frames and joints. Dropout, which the published training code uses,
+    is omitted. Past the end of a motion, the convolutions read zeros, so that features do not
+    depend on the other motions in a batch. In the published evaluations, all motions have 60
+    frames, and the last frame of shorter clips is repeated. `widths` and `strides` contain one
+    number per block.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class STGCN(nn.Module):
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of motions (B, F, V, C) with mask (B, F)."""
+        """Computes features (B, E) from motions (B, F, V, C) and mask (B, F)."""
         x = self.data_bn(x.flatten(2).transpose(1, 2)).unflatten(1, x.shape[2:]).permute(0, 2, 3, 1)
         for block, importance in zip(self.st_gcn_networks, self.edge_importance, strict=True):
             x = block(x, self.A * importance, mask)
@@ -109,7 +109,7 @@ class _Block(nn.Module):
 
 
 class UESTC(STGCN):
-    """The classifier for UESTC's 40 actions in the tables of ACTOR, MDM and MFM.
+    """The classifier for UESTC's 40 actions that was used for the tables of ACTOR, MDM and MFM.
 
     It reads joint rotations.
     """
@@ -119,18 +119,18 @@ class UESTC(STGCN):
         super().__init__(SMPL24.parents, 40, widths, (1, 1, 1, 1, 2, 1, 1, 2, 1, 1), channels=6)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of motions (B, F, 25 x 6). The root trajectory is ignored."""
+        """Computes features (B, 256) from motions (B, F, 25 x 6). The root trajectory is ignored."""
         return super().forward(x.unflatten(-1, (25, 6))[:, :, :24], mask)
 
 
 class Unconstrained(STGCN):
-    """The classifier in MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
+    """The classifier used in MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
 
     def __init__(self):
         super().__init__(UNCONSTRAINED_PARENTS, 12, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joint positions (B, F, 24, 3) in meters, y up.
+        """Computes features (B, 256) from joint positions (B, F, 24, 3) in meters, y up.
 
         The network itself expects y down.
         """
@@ -139,7 +139,7 @@ class Unconstrained(STGCN):
         )
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joint positions (B, F, 15, 3).
+        """Computes features (B, 256) from joint positions (B, F, 15, 3).
 
         As in the reference motions, the y axis points down, and the pelvis has index 8.
         """
@@ -153,5 +153,5 @@ class JointSTGCN(STGCN):
     """
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, 256) of joint positions (B, F, J, 3) in meters, with mask (B, F)."""
+        """Computes features (B, 256) from joint positions (B, F, J, 3), in meters, and mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)

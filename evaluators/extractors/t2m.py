@@ -167,7 +167,7 @@ class T2MEvaluator(nn.Module):
         self.motion_encoder = _MotionEncoder(movement_latent, motion_hidden, embedding)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns embeddings (B, E) of motions (B, F, D) with mask (B, F).
+        """Computes embeddings (B, E) from motions (B, F, D) and mask (B, F).
 
         The motions must have 4 to `max_frames` frames.
         """
@@ -184,7 +184,7 @@ class T2MEvaluator(nn.Module):
         return self.motion_encoder(movements, lengths // UNIT)
 
     def text(self, words: Words) -> Tensor:
-        """Returns embeddings (B, E) of captions from the output of `WordVectors` or `LearnedWords`."""
+        """Computes embeddings (B, E) of captions from the output of `WordVectors` or `LearnedWords`."""
         weight = self.text_encoder.input_emb.weight
         return self.text_encoder(words.vectors.to(weight), words.parts.to(weight), words.lengths)
 
@@ -261,7 +261,7 @@ def _read_numbers(path: Path) -> np.ndarray:
 
 
 def read_statistics(folder: Path) -> list[Tensor]:
-    """Reads mean.npy and std.npy (D,) that were released with an evaluator."""
+    """Reads an evaluator's released mean.npy and std.npy, each (D,)."""
     return [torch.from_numpy(_read_numbers(folder / name)) for name in ("mean.npy", "std.npy")]
 
 

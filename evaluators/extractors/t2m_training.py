@@ -42,7 +42,7 @@ class _MovementDecoder(nn.Module):
 def reconstruction_terms(
     network: T2MEvaluator, decoder: nn.Module, batch: MotionBatch
 ) -> dict[str, Tensor]:
-    """Returns the loss terms (B,) of the movement autoencoder, over the real frames of each motion."""
+    """Returns the movement autoencoder's loss terms, each (B,), over the real frames of each motion."""
     frames = batch.x.shape[1] // UNIT * UNIT
     x, mask = batch.x[:, :frames, : network.used], batch.mask[:, :frames]
     latents, units = network.movement_encoder(x), mask[:, UNIT - 1 :: UNIT]
@@ -98,7 +98,7 @@ class MatchingLoss(SampleMetric):
         self.margin = margin
 
     def value(self, motion: Tensor, text: Tensor) -> float | None:
-        """Returns the loss of features (N, E) of motions and texts, or None for a single pair."""
+        """Computes the loss from motion and text features, both (N, E), or returns None for a single pair."""
         return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 
@@ -108,7 +108,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct
     motions. Then the movement encoder is frozen, and the text and motion encoders are trained so
     that the embeddings of matching pairs are close. A motion counts as wrong for a text only if the
-    text is not among its captions. Checkpoints contain the word vectors.
+    text is not one of the motion's captions. Checkpoints contain the word vectors.
 
     Args:
         words: folder with our_vab_data.npy and our_vab_idx.pkl (see `WordVectors`), which is needed
@@ -199,7 +199,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
-        """Returns the word vectors (words, 300) that were read from a file. `facts` maps words to rows."""
+        """Returns the word vectors that were read from a file, (words, 300). `facts` maps words to rows."""
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
@@ -216,7 +216,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         self.words = WordVectors(self.facts["words"], state.cpu())
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """Returns the features (B, E) of captions.
+        """Encodes captions as features (B, E).
 
         A caption is a list of "word/PART" tokens or, if the vectors are learned, of words.
         """
@@ -245,7 +245,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return loss + 0 * sum(parameter.sum() for parameter in self._idle())
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Removes the gradients of idle parameters.
+        """Removes the gradients of parameters that are not being trained.
 
         Even with a gradient of 0, momentum would change these parameters.
         """

@@ -73,7 +73,7 @@ class ExtractorTask(Task, Generic[Network]):
         raise NotImplementedError
 
     def metrics(self) -> Mapping[str, Metric]:
-        """Returns the validation metrics. Their "loss" selects the best checkpoint."""
+        """Returns the validation metrics. The best checkpoint is selected by the metric "loss"."""
         raise NotImplementedError
 
     def setup(self, stage: str) -> None:
@@ -82,7 +82,7 @@ class ExtractorTask(Task, Generic[Network]):
         self.val_metrics.update(self.metrics())
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of motions (B, F, ...) in the data's units, with mask (B, F)."""
+        """Computes features (B, E) from motions (B, F, ...), in the data's units, and mask (B, F)."""
         return self.network(x, mask)
 
     def seed_step(self, batch_idx: int) -> None:
@@ -111,7 +111,7 @@ class ExtractorTask(Task, Generic[Network]):
     def on_validation_epoch_end(self) -> None:
         """Logs and resets the validation metrics.
 
-        Except for the loss, metrics with too few samples are skipped.
+        Metrics with too few samples, except for the loss, are skipped.
         """
         for name, metric in self.val_metrics.items():
             assert isinstance(metric, Metric)

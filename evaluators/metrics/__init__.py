@@ -1,7 +1,8 @@
 # pyright: standard
 """Metrics for generated motions, as torchmetrics classes.
 
-Every `update` takes some of these inputs by name. There are B generated and R real motions.
+Each metric's `update` takes some of these inputs as keyword arguments. There are B generated and R
+real motions.
 
 | name | shape | content |
 |---|---|---|
@@ -30,10 +31,10 @@ A key is the `flame_mdm.seeds.key` of an id. If there are several samples per id
 depends on the sample index. Metrics that compare motions one by one (MID, position and displacement
 errors) require real motions in the order of the generated motions.
 
-`compute()` returns a number, or a dict of numbers by name. If there are no samples, it returns
-None. It raises `UserError` if a number would be meaningless, for example because there are too few
-samples. For the same features, values are bit-identical for any batch size, order and number of
-processes. Random draws depend only on `seed`.
+`compute()` returns a number, or a dict that maps names to numbers. If there are no samples, it
+returns None. It raises `UserError` if a number would be meaningless, for example because there are
+too few samples. For the same features, values are bit-identical for any batch size, order and
+number of processes. Random draws depend only on `seed`.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, SampleMetric]:
-    """Creates metrics, by name, from mappings with a `_target_`.
+    """Creates metrics, keyed by name, from mappings with a `_target_`.
 
     Each metric receives the `options` that it accepts.
     """

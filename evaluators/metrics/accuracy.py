@@ -25,5 +25,5 @@ class ActionAccuracy(SampleMetric):
     states = ("logits", "labels")
 
     def value(self, logits: Tensor, labels: Tensor) -> float:
-        """Returns the accuracy of logits (N, A) for labels (N,) int64."""
+        """Computes the accuracy from logits (N, A) and int64 labels (N,)."""
         return (logits.argmax(1) == labels).double().mean().item()

@@ -21,7 +21,7 @@ def equally_weighted(values: Tensor) -> Tensor:
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct: Tensor) -> Tensor:
-    """Returns the rank (N,) of the correct candidate of each query, 0 = first.
+    """Returns the rank of each query's correct candidate, as (N,), 0 = first.
 
     The rank is the number of candidates that are closer than the correct candidate, or equally
     close but earlier in the pool. `pools` (N, P) contains, for each query (N, E), the indices of
@@ -63,16 +63,16 @@ class RPrecision(SampleMetric):
         self.pool, self.seed = pool, seed
 
     def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
-        """Returns `top1`, `top2` and `top3` for features (N, E) and caption keys (N,)."""
+        """Computes `top1`, `top2` and `top3` from features (N, E) and caption keys (N,)."""
         ranks = self.ranks(generated, text, text_keys)
         return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in TOP}
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
-        """Returns the rank (N,) of the correct candidate for each query, 0 = first."""
+        """Returns the rank of each query's correct candidate, as (N,), 0 = first."""
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:
-        """Returns, by rank k, each query's probability of a hit in a random pool.
+        """Returns each query's probability of a hit in a random pool, keyed by the rank k.
 
         A hit means that the correct candidate of the query is among the k nearest candidates.
 
@@ -117,7 +117,7 @@ class TextsForMotion(RPrecision):
     """
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
-        """Returns the rank (N,) of each motion's own text in its pool, 0 = first."""
+        """Ranks each motion's own text in its pool and returns the ranks (N,), 0 = first."""
         # The other texts of a motion are drawn from all captions except its own: drawn indices at
         # or above its own caption are increased by one. Then its own caption, which is last, is
         # swapped with a random text.
@@ -137,7 +137,7 @@ class TextsForMotion(RPrecision):
         )
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns, by k, the probability that each motion's text is among the k nearest in a random pool."""
+        """Returns, for each k, the probability that a motion's text is among the k nearest in a random pool."""
         keys = rows["text_keys"].numpy()
         _, first, correct = np.unique(keys, return_index=True, return_inverse=True)
         return self.in_random_pools(
@@ -148,9 +148,9 @@ class TextsForMotion(RPrecision):
 class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32 motions?
 
-    This is the definition in the code of Guo et al. 2022, which the tables of MDM and MFM use. Test
-    pairs in random order are split into pools of 32, which may contain equal captions. In each
-    pool, the motions are ranked by their Euclidean distance from each text.
+    This is the definition in the code of Guo et al. 2022, which was used for the tables of MDM and
+    MFM. Test pairs in random order are split into pools of 32, which may contain equal captions. In
+    each pool, the motions are ranked by their Euclidean distance from each text.
 
     The authors' code drops an incomplete last pool. In this implementation, the last 32 motions are
     ranked for the texts of an incomplete last pool, so that every text counts once. The authors'
@@ -162,8 +162,8 @@ class MotionsForText(RPrecision):
         seed: seed of the pools.
         normalize: whether to first scale features to norm 1, so that motions are ranked by cosine.
             An extractor that was trained with cosines, such as motion-CLIP, does not constrain the
-            lengths of features, so without normalization, the motions with the shortest features
-            would be nearest to every text.
+            norms of features. Without normalization, the motions whose features have the smallest
+            norms would therefore be nearest to every text.
 
     Example:
         >>> metric, features, keys = MotionsForText(pool=3), torch.eye(3), torch.arange(3)
@@ -177,7 +177,7 @@ class MotionsForText(RPrecision):
         self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
-        """Returns the rank (N,) of each text's own motion in its pool, 0 = first.
+        """Ranks each text's own motion in its pool and returns the ranks (N,), 0 = first.
 
         The texts are in random order.
         """
@@ -188,7 +188,7 @@ class MotionsForText(RPrecision):
         return retrieval_ranks(text[order], generated, pools, position)
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns, by k, the probability that each text's motion is among the k nearest in a random pool."""
+        """Returns, for each k, the probability that a text's motion is among the k nearest in a random pool."""
         generated, text = rows["generated"], rows["text"]
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -232,7 +232,7 @@ class MultimodalDistance(SampleMetric):
         self.normalize = normalize
 
     def value(self, generated: Tensor, text: Tensor) -> float:
-        """Returns the mean distance between features (N, E) of motions and texts."""
+        """Returns the mean distance between motion features (N, E) and text features (N, E)."""
         return self._distances(generated, text).mean().item()
 
     def _distances(self, generated: Tensor, text: Tensor) -> Tensor:
@@ -262,7 +262,7 @@ class MotionCLIPScore(SampleMetric):
     states = ("generated", "text")
 
     def value(self, generated: Tensor, text: Tensor) -> float:
-        """Returns the mean cosine between features (N, E) of motions and texts."""
+        """Returns the mean cosine between motion features (N, E) and text features (N, E)."""
         return F.cosine_similarity(generated, text).mean().item()
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
@@ -328,7 +328,7 @@ class MutualInformationDivergence(SampleMetric):
         self.eps = eps
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
-        """Returns the MID of features (N, E). Raises `UserError` if there are too few samples."""
+        """Computes MID from features (N, E). Raises `UserError` if there are too few samples."""
         self.need(
             len(text),
             real.shape[1] + text.shape[1] + 1,

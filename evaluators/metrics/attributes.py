@@ -190,7 +190,7 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Detects walking and running: the body moves more than 33 cm, and both ankles rise 4 cm."""
+    """Detects walking and running: the body moves more than 33 cm, and both ankles rise by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
@@ -232,7 +232,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Detects throws, salutes, raised arms, waves, claps and punches, or else standing."""
+    """Detects throws, salutes, raised arms, waves, punches and claps or, if there are none, standing."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -300,7 +300,7 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
         requested: the attributes of the request.
 
     Returns:
-        Whether each attribute is correct, by name. `action_and_side` states whether both are
+        Whether each attribute is correct, keyed by name. `action_and_side` states whether both are
         correct or, if no side was requested, whether the action is correct. `all` states whether
         every requested attribute is correct.
     """
@@ -316,7 +316,7 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 
 
 class AttributeAccuracy(Timed, MotionMean):
-    """Fraction of motions that show the requested value, by attribute.
+    """Fraction of motions that show the requested value of each attribute.
 
     This metric was introduced in this project. It has one value in [0, 1] for each of the
     `ATTRIBUTES`, for `action_and_side` and for `all`. Higher is better. The attributes are read
@@ -343,9 +343,9 @@ class AttributeAccuracy(Timed, MotionMean):
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns, by attribute, whether motions show the requested value, and whether they count.
+        """Returns, for each attribute, whether each motion shows the requested value and whether it counts.
 
-        A motion counts if a value was requested.
+        A motion counts if a value of the attribute was requested.
         """
         pairs = zip(rows["seen"], rows["requested"], strict=True)
         shown = [right_attributes(json.loads(str(seen)), requested) for seen, requested in pairs]
@@ -381,8 +381,7 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
 
     For walk-turn-left and walk-turn-right, the side is read from the turn of the body, and for
     walk-left and walk-right, from the direction of travel. For all other contents, it is the side
-    of the hand that rises higher above its shoulder. The side that is part of the content's name is
-    not used.
+    of the hand that rises higher above its shoulder. The side in the content's name is not used.
 
     Args:
         joints: (F, 22, 3) positions of SMPL's joints in meters, y up.

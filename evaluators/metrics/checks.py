@@ -1,8 +1,8 @@
-"""Checks for individual actions: whether a motion shows one, and its side, count or direction.
+"""Checks for individual actions: whether a motion shows the action, and its side, count or direction.
 
 `evaluators.metrics.attributes` recognizes 22 actions. Rules cannot tell the other actions apart: a
-hand at the head for half a second may mean a drink, a phone call or a scratch. Therefore, a check
-only verifies that a motion shows the requested action. Thresholds are stated next to the rules.
+hand at the head for half a second may mean drinking, phoning or scratching. Therefore, a check only
+verifies that a motion shows the requested action. Thresholds are stated next to the rules.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ SIDES = ("left", "right")
 
 
 def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns forward and left directions (F, 2) on the ground, and the left turn (degrees)."""
+    """Returns the forward and left directions on the ground, each (F, 2), and the left turn in degrees."""
     across = (
         smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]]
     )[:, [0, 2]]
@@ -28,7 +28,7 @@ def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def tilt_of(smooth: np.ndarray) -> np.ndarray:
-    """Returns the angle (F,), in degrees, between the trunk and the vertical."""
+    """Returns the angle between the trunk and the vertical in each frame, in degrees."""
     trunk = smooth[:, NECK] - smooth[:, PELVIS]
     return np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1]))
 
@@ -54,7 +54,7 @@ class View:
         forward: direction (F, 2) that the body faces, on the ground.
         left: direction (F, 2) to the left of the body, on the ground.
         turned: turn to the left over the clip, in degrees.
-        floor: height of the lowest toes in meters.
+        floor: height of the floor in meters, taken from the lowest toe positions.
     """
 
     smooth: np.ndarray
@@ -229,7 +229,7 @@ def _strafe(view: View) -> Shown:
 
 
 def _limp(view: View) -> Shown:
-    """Determines the leg on which a walking person sinks while the other foot is in the air.
+    """Determines on which leg a walking person sinks while the other foot is in the air.
 
     The correlation between the height of the pelvis and the difference between the feet's heights
     must exceed 0.35. For an even gait, this correlation is about 0.

@@ -81,7 +81,7 @@ class ClaimAccuracy(Timed, MotionMean):
 
     @staticmethod
     def _shares(judged: Sequence[Verdict]) -> dict[str, Tensor]:
-        """Returns 1 or 0 for each claim that counts toward a value, by the name of the value."""
+        """Maps each value's name to 1 or 0 for every claim that counts toward the value."""
         decided = [verdict for verdict in judged if verdict.answer != "cannot tell"]
         true = {
             name: [verdict.answer == "yes" for verdict in decided if name in (verdict.group, "all")]
@@ -112,7 +112,7 @@ class ClaimAccuracy(Timed, MotionMean):
         return {"positions": positions, "frames": frames}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the numbers of true and decided claims (N, 2) per motion, by the name of the value."""
+        """Maps each value's name to the numbers of true and decided claims per motion, as (N, 2)."""
         pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for packed, frames, caption in zip(
             rows["positions"], rows["frames"], rows["captions"], strict=True

@@ -54,14 +54,14 @@ class FrechetMotionDistance(TwoSets):
     higher_is_better = False
 
     def value(self, generated: Tensor, real: Tensor) -> float:
-        """Returns the distance between features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
+        """Computes the distance between features (N, E) and (M, E). Raises `UserError` if N or M is below 2."""
         self.need(len(generated), 2, "generated motions")
         self.need(len(real), 2, "real motions")
         # Rounding errors may make the value slightly negative.
         return max(frechet_distance(generated, real).item(), 0.0)
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the distance between sets in which motions are repeated as often as drawn."""
+        """Computes the distance between sets in which each motion is repeated as often as it was drawn."""
         generated, real = rows["generated"], rows["real"]
         values = []
         for times in map(torch.from_numpy, weights):
@@ -95,7 +95,7 @@ class KernelMotionDistance(TwoSets):
 
     Args:
         subsets: number of random subsets.
-        subset_size: number of samples that a subset takes from each set. Each set must contain at
+        subset_size: number of samples drawn from each set for a subset. Each set must contain at
             least this number of samples.
         replace: whether to draw with replacement, as the code of MoDi and MDM does if there are
             more real motions than `subset_size`. Samples that are drawn twice increase the value.
@@ -125,7 +125,7 @@ class KernelMotionDistance(TwoSets):
         )
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `std` for features (N, E) and (M, E).
+        """Computes `mean` and `std` from two sets of features, (N, E) and (M, E).
 
         Raises `UserError` if a set has fewer than `subset_size` samples.
         """
@@ -144,7 +144,7 @@ class KernelMotionDistance(TwoSets):
 
 
 def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
-    """Returns the fraction of `points` (M, E) in the manifold of `samples` (N, E).
+    """Returns the fraction of `points` (M, E) that lie in the manifold of `samples` (N, E).
 
     A point is in the manifold if its distance from some sample is at most the distance between that
     sample and its third-nearest neighbor (Kynkäänniemi et al. 2019, eq. 1 and 2). A sample is not a
@@ -186,7 +186,7 @@ class PrecisionRecall(TwoSets):
     names = ("precision", "recall")
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `precision` and `recall` for features (N, E) and (M, E).
+        """Computes `precision` and `recall` from two sets of features, (N, E) and (M, E).
 
         Raises `UserError` if a set has fewer than four motions.
         """

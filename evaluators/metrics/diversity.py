@@ -22,7 +22,7 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
-    """Draws random pairs of `count` motions. Returns the indices (pairs,) of both sides.
+    """Draws random pairs from `count` motions. Returns the indices of both sides, each (pairs,).
 
     Each side is drawn with or without replacement.
     """
@@ -60,7 +60,7 @@ class Diversity(SampleMetric):
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def value(self, features: Tensor) -> float:
-        """Returns the diversity of features (N, E).
+        """Computes diversity from features (N, E).
 
         Raises `UserError` if there are too few motions for the pairs.
         """
@@ -108,7 +108,7 @@ class TextMultimodality(SampleMetric):
         self.samples, self.pairs, self.seed = samples, pairs, seed
 
     def value(self, features: Tensor, groups: Tensor) -> float:
-        """Returns the multimodality of features (N, E).
+        """Computes multimodality from features (N, E).
 
         `groups` (N,) contains the keys of the texts. Raises `UserError` unless each text has
         `samples` motions.
@@ -144,7 +144,7 @@ class PairedMultimodality(SampleMetric):
         self.samples = samples
 
     def value(self, features: Tensor, groups: Tensor) -> float:
-        """Returns the multimodality of features (N, E).
+        """Computes multimodality from features (N, E).
 
         `groups` (N,) contains the keys of the texts. Raises `UserError` unless each text has 2 *
         `samples` motions.
@@ -181,7 +181,7 @@ class ActionMultimodality(SampleMetric):
         self.pairs, self.seed = pairs, seed
 
     def value(self, features: Tensor, labels: Tensor) -> float:
-        """Returns the multimodality of features (N, E) with labels (N,).
+        """Computes multimodality from features (N, E) and labels (N,).
 
         Raises `UserError` if a class has only one motion.
         """

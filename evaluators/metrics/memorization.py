@@ -18,7 +18,7 @@ CLOSE = 0.01
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
-    """Returns poses (F, 3J) that do not depend on position and heading, from joint positions (F, J, 3).
+    """Converts joint positions (F, J, 3) to poses (F, 3J) that do not depend on position and heading.
 
     In every frame, joints are relative to the ground point below the pelvis, and the body is turned
     so that it faces +z.
@@ -39,7 +39,7 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 
 @dataclass
 class TrainingMotions:
-    """The training motions, in which `nearest` searches for the nearest neighbors of motions."""
+    """The training motions, among which `nearest` searches for the nearest neighbors of other motions."""
 
     #: (N, 3J) poses of all frames of all motions, concatenated; see `poses`.
     poses: Tensor
@@ -102,7 +102,7 @@ class NearestTraining(SampleMetric):
     """Distance to the nearest training motion, and the share of copies.
 
     This metric was introduced in this project. A motion counts as a copy if its joints are closer
-    to a training motion than the joints of 99 % of the held-out real motions (all but the share
+    to a training motion than those of 99 % of the held-out real motions (all but the share
     `CLOSE`). By this definition, about 1 % of real motions are copies, whereas all motions are
     copies if a model repeats the training set.
 

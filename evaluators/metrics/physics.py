@@ -45,7 +45,7 @@ class FootSkating(Timed, JointMean):
         self.toes = list(toes)
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns (F - 1,) bool: whether a foot skates in each frame transition of a motion (F, J, 3)."""
+        """Returns whether a foot skates in each frame transition of a motion (F, J, 3), as (F - 1,) bool."""
         toes = motion[:, self.toes].double()
         fast = toes[..., [0, 2]].diff(dim=0).norm(dim=-1) * self.fps > LIMITS["skating"][0]
         low = toes[..., 1] < LOW
@@ -71,7 +71,7 @@ class Penetration(JointMean):
     side = -1
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns the distance (F,) of the lowest joint of a motion (F, J, 3) from the floor, in meters."""
+        """Returns the lowest joint's distance from the floor in each frame of a motion (F, J, 3), in meters."""
         distance = self.side * motion.double()[..., 1].amin(1)
         return torch.where(distance > TOLERANCE, distance, 0.0)
 
@@ -112,12 +112,12 @@ class Jitter(Timed, JointMean):
     unit = "m/s^3"
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns the mean jerk (F - 3,) of the joints of a motion (F, J, 3), in m/s^3."""
+        """Returns the jerk of a motion (F, J, 3), averaged over its joints, as (F - 3,) in m/s^3."""
         return motion.double().diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 
 class StaticShare(Timed, JointMean):
-    """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
+    """Fraction of motions that hardly move (less than 3 cm/s, averaged over joints and frames).
 
     Real data sets also contain static motions of standing people, so compare the value for
     generated motions with the value for real motions. Lower is better.

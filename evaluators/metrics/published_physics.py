@@ -47,7 +47,7 @@ class PublishedPhysics(Timed, JointMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns the means by name. Raises `UserError` if they are undefined at the frame rate."""
+        """Returns the means, keyed by name. Raises `UserError` if they are undefined at the frame rate."""
         if not self.defined:
             raise self.error(
                 f"only defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
@@ -60,7 +60,7 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns, by name, the sum and number (N, 2) of each motion's values, or {} if they are undefined."""
+        """Returns the sum and number of each motion's values as (N, 2), keyed by name, or {} if undefined."""
         return super().readings(motions) if self.defined else {}
 
 
@@ -110,7 +110,7 @@ class MBenchQuality(PublishedPhysics):
         super().__init__(fps, toes)
 
     def measure(self, motion: Tensor) -> Values:
-        """Computes the values of a motion (F, J, 3) by name."""
+        """Computes the values of a motion (F, J, 3), keyed by name."""
         motion = motion.double()
         local, feet = motion - motion[:, :1], motion[:, self.feet]
         height, contact = feet[..., 1], mbench_contact(feet)
@@ -138,7 +138,7 @@ def mbench_contact(feet: Tensor) -> Tensor:
 
 
 def _speed(points: Tensor) -> Tensor:
-    """Returns the distances (F, ...), in meters, that points (F, ..., 3) move to the next frame.
+    """Returns how far points (F, ..., 3) move until the next frame, in meters, as (F, ...).
 
     The last distance is repeated. For a single frame, the result is empty.
     """
@@ -176,7 +176,7 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
 
 
 def _runs(aloft: Tensor) -> list[tuple[int, int]]:
-    """Returns the start and (exclusive) end of each run of at least four True values in `aloft`."""
+    """Returns the start and (exclusive) end of each series of at least four consecutive True values."""
     runs = torch.nn.functional.pad(aloft.int(), (1, 1)).diff().nonzero().view(-1, 2).tolist()
     return [(begin, end) for begin, end in runs if end - begin >= 4]
 
@@ -187,13 +187,13 @@ class KimodoQuality(PublishedPhysics):
     - `skate_from_height`: mean speed of toes that are lower than 5 cm.
     - `skate_ratio`: fraction of the toes' frame-to-frame movements that are faster than 0.2 m/s,
       among movements that begin and end lower than 5 cm.
-    - `low`: mean fraction of the toes' movements that begin lower than 5 cm. If it is 0, the first
-      two values are also 0.
+    - `low`: mean fraction of the toes' movements that begin lower than 5 cm. If this fraction is 0,
+      the first two values are also 0.
     - `skate_from_contacts`, `skate_max`: mean and maximum speeds of heels and toes in contact.
     - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15 m/s
       and lower than 10 cm). Higher is better.
 
-    Speeds are computed in three dimensions. A motion with a single frame has no speed.
+    Speeds are computed in three dimensions. For motions with a single frame, speeds are undefined.
 
     Args:
         fps: frames per second of the motions.
@@ -278,12 +278,12 @@ class KimodoConstraints(MotionMean):
 
     Distances are in meters and are averaged over motions.
 
-    - `root2d_err`: horizontal distance between the roots, in frames that keep the root.
+    - `root2d_err`: horizontal distance between the roots, in frames in which the root is kept.
     - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
-    - `root2d_acc`: of the frames that keep the root, the fraction in which this distance is at most
-      10 cm.
-    - `fullbody_keyframe`: distance between all joints, in frames that keep all joints.
-    - `end_effector`: distance between the kept joints, in the other frames.
+    - `root2d_acc`: fraction of the frames with a kept root in which the two roots are at most 10 cm
+      apart.
+    - `fullbody_keyframe`: distance between all joints, in frames in which all joints are kept.
+    - `end_effector`: distance between the kept joints, in all other frames.
 
     In Kimodo's code, the user draws the root trajectory; in this implementation, the root
     trajectory of the real motion is used.
@@ -358,8 +358,8 @@ class PhysicalFootContact(PublishedPhysics):
     The score is the mean over frames of a product of three factors: the horizontal movements of
     both feet, in meters per frame, and the acceleration of the root divided by its largest value.
     Downward accelerations count as 0. The movement of a foot is the smaller of the movements of its
-    ankle and its toe. Motions without acceleration have no value, whereas EDGE's code includes
-    their NaN in the mean. Lower is better.
+    ankle and its toe. Motions without acceleration are left out of the mean, whereas EDGE's code
+    includes them as NaN. Lower is better.
 
     Args:
         fps: frames per second of the motions. For rates other than 30, `compute` raises
@@ -403,14 +403,14 @@ class TransitionJerk(SampleMetric):
     over joints, of the third difference of the position, in meters per frame^3. A window is
     centered at the first frame after each change between kept and generated frames, provided that
     the motion contains the whole window. The jerk is averaged over windows, frame by frame. `peak`
-    is the maximum of this mean curve. `area` is the sum of its absolute differences from
-    `JERK_OF_REAL_MOTIONS` and grows with the size of the window; it is undefined at frame rates
-    without an entry there. `windows` is the number of windows.
+    is the maximum of this mean curve. `area` is the sum of its absolute differences from the jerk
+    of real motions, and grows with the size of the window; it is undefined at frame rates that are
+    not in `JERK_OF_REAL_MOTIONS`. `windows` is the number of windows.
 
     Args:
         fps: frames per second of the motions.
-        window: number of frames of a window. Published values use 60 frames at 20 frames per
-            second, and 30 frames at 30 frames per second.
+        window: number of frames per window. Published values use 60 frames at 20 frames per second,
+            and 30 frames at 30 frames per second.
 
     Example:
         >>> metric, joints = TransitionJerk(fps=20, window=8), torch.zeros(1, 12, 22, 3)
@@ -467,7 +467,7 @@ class TransitionJerk(SampleMetric):
 
 
 def transition_jerk(window: Tensor) -> Tensor:
-    """Returns the jerk (F - 3,) of positions (F, J, 3), frame by frame, in meters per frame^3."""
+    """Computes the jerk in each frame from positions (F, J, 3), as (F - 3,) in meters per frame^3."""
     return window.double().diff(n=3, dim=0).abs().sum(-1).amax(-1)
 
 

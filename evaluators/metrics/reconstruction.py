@@ -121,7 +121,7 @@ class PositionErrors(MotionMean):
         self.add(keys, errors, groups=keys if groups is None or self.samples == 1 else groups)
 
     def value(self, sums: Tensor, counts: Tensor, groups: Tensor) -> dict[str, float | None]:
-        """Returns the errors by name. Raises `UserError` unless each text has `samples` motions."""
+        """Returns the errors, keyed by name. Raises `UserError` unless each text has `samples` motions."""
         texts = (
             self.by_group(groups, self.samples)
             if self.samples > 1
@@ -135,11 +135,11 @@ class PositionErrors(MotionMean):
         return dict(zip(self.names, values, strict=True))
 
     def positions(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns the positions of a motion (F, J, 3) to compare, by the names in `PARTS`."""
+        """Returns the positions to compare for a motion (F, J, 3), keyed by the names in `PARTS`."""
         raise NotImplementedError
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the errors of a clip by name.
+        """Returns the errors of a clip, keyed by name.
 
         An "ape" error has one value per frame (F,). If all clips have equal weight, it is the mean
         over frames.
@@ -185,7 +185,7 @@ class TemosPositionErrors(PositionErrors):
         return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the APE of each frame (F,) and the AVE of the clip, by name."""
+        """Returns the APE of each frame, as (F,), and the AVE of the clip, keyed by name."""
         distances = {part: (a[part] - b[part]).norm(dim=-1) for part in PARTS}
         position = {f"ape_{part}": x if x.ndim == 1 else x.mean(1) for part, x in distances.items()}
         return position | {
@@ -194,7 +194,7 @@ class TemosPositionErrors(PositionErrors):
 
 
 class FlamePositionErrors(PositionErrors):
-    """APE (in meters) and AVE (in square meters) as in FLAME's code. FLAME's tables do not use them.
+    """APE (in meters) and AVE (in square meters) as in FLAME's code. They are not used in FLAME's tables.
 
     The positions to compare are `flame_parts`. The error of the trajectory is the sum of the
     distances along its two axes. The local error is the error of the bones. Variances of global
@@ -225,7 +225,7 @@ class FlamePositionErrors(PositionErrors):
         return flame_parts(joints, joints[:, 0], self.parents)
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the APE (in meters) and AVE (in square meters) of a clip, by name."""
+        """Returns the APE (in meters) and AVE (in square meters) of a clip, keyed by name."""
         root, path, local, joints = (a[part] - b[part] for part in PARTS)
         distances = [
             root.norm(dim=-1),
@@ -338,7 +338,7 @@ class DisplacementErrors(EditErrors):
 
 
 class KeptDrift(EditErrors):
-    """Distance in meters by which the kept part of an edit has moved in world coordinates.
+    """Distance, in meters, by which joints that an edit kept have moved in world coordinates.
 
     This metric was introduced in this project. `mean` is the distance averaged over the kept joints
     and frames of a motion, and then over motions. `largest` is the maximum over all of them. If

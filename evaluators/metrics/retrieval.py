@@ -187,7 +187,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
-        """Returns the values by name.
+        """Returns the values, keyed by name.
 
         Args:
             motion: (N, E) features of the motions.
@@ -243,7 +243,7 @@ class TMRRetrieval(CaptionMetric):
     - `threshold`: retrieval among all motions, where motions with the same caption also count as
       correct.
     - `dissimilar`: retrieval among 100 motions (at most half of all motions) with different
-      captions. Without an encoder, there is no value.
+      captions. Without an encoder, these values are not computed.
     - `batches`: retrieval in batches of 32. An incomplete last batch is left out, and the medians
       of the batches are averaged.
 
@@ -253,8 +253,8 @@ class TMRRetrieval(CaptionMetric):
 
     TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
     HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the
-    dissimilar subset starts with the first motion by key. Until the subset is complete, the motion
-    whose caption is least similar to the captions chosen so far is added.
+    dissimilar subset starts with the first motion by key. Then, the motion whose caption is least
+    similar to the captions chosen so far is added repeatedly until the subset is complete.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
@@ -296,7 +296,7 @@ class TMRRetrieval(CaptionMetric):
     def value(
         self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor
     ) -> dict[str, float | None]:
-        """Returns the values by name.
+        """Returns the values, keyed by name.
 
         Args:
             motion: (N, E) features of the motions.

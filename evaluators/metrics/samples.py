@@ -1,5 +1,5 @@
 # pyright: standard
-"""Base classes for metrics, which compute their values from all samples, sorted by key."""
+"""Base classes for metrics that are computed from all samples, sorted by key."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Declared:
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
-        units: by name, the units of values whose unit differs from `unit`.
-        directions: by name, whether higher is better, for values to which `higher_is_better` does
-            not apply; None = neither direction is better.
+        units: units of the values whose unit differs from `unit`, keyed by name.
+        directions: whether higher is better, keyed by name, for values to which `higher_is_better`
+            does not apply; None = neither direction is better.
         summary: name of the value that summarizes the other values, or None if there is no such
             value.
         audited: names of the values that audits show; None = all values.
@@ -60,14 +60,14 @@ class Declared:
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns, by name, what the metric measures on motions, independently of their conditions.
+        """Returns what the metric measures on motions independently of their conditions, keyed by name.
 
         Each reading is an array with N rows. Metrics computed from features need no readings.
         """
         return {}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the value and the weight (N, 2) of each sample, by the name of the value.
+        """Returns the value and the weight of each sample as (N, 2), keyed by the name of the value.
 
         The metric is the weighted mean. If it uses random pools, the values are averaged over all
         possible draws. Returns {} if the metric has no values for individual samples. `rows`
@@ -77,7 +77,7 @@ class Declared:
         return {}
 
     def weighted(self, rows: Rows, weights: np.ndarray) -> dict[str, np.ndarray]:
-        """Computes the values (R,) of R resamples of N samples, by name.
+        """Computes the values for R resamples of N samples, each as (R,), keyed by name.
 
         `weights` (R, N) states how often each sample was drawn. See `per_sample` for
         `rows`. Returns {} if the metric cannot be resampled.
@@ -91,7 +91,7 @@ class Declared:
 
 
 class SampleMetric(Declared, Metric):
-    """Base class for metrics that compute their value from one row per sample, sorted by key.
+    """Base class for metrics that are computed from one row per sample, with rows sorted by key.
 
     Therefore, the value does not depend on the batches, their order or the number of ranks, and a
     rank may have no samples. Subclasses implement the formula in `value`. If a metric draws at
@@ -234,8 +234,8 @@ class SampleMetric(Declared, Metric):
     def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
         """Splits padded joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3).
 
-        Sums over a motion are the same in every batch. Raises `UserError` if a motion contains
-        NaN or infinity.
+        Without padding, sums over a motion are the same in every batch. Raises `UserError` if a
+        motion contains NaN or infinity.
         """
         frames = joints.detach()[mask]
         motions = list(frames.split(mask.sum(1).tolist()))
@@ -303,7 +303,7 @@ class MotionMean(SampleMetric):
         return self.means(*rows)
 
     def means(self, sums: Tensor, counts: Tensor) -> Any:
-        """Returns the mean of all values, by name if the metric has `names`.
+        """Returns the mean of all values or, if the metric has `names`, a mapping from names to means.
 
         The mean is None if there are no values.
         """
@@ -312,7 +312,7 @@ class MotionMean(SampleMetric):
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns, by name, the sum and number (N, 2) of each motion's values."""
+        """Returns the sum and number of each motion's values as (N, 2), keyed by name."""
         names = self.parts or self.names or [""]
         return {name: torch.as_tensor(rows[name]) for name in names if name in rows}
 
@@ -336,14 +336,14 @@ class JointMean(MotionMean):
         self.add(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
 
     def measure(self, motion: Tensor) -> Any:
-        """Computes the values of a motion (F, J, 3), by name if the metric has `names`.
+        """Computes the values of a motion (F, J, 3), keyed by name if the metric has `names`.
 
         Values that are NaN or missing are undefined.
         """
         raise NotImplementedError
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns, by name, the sum and number (N, 2) of each motion's values."""
+        """Returns the sum and number of each motion's values as (N, 2), keyed by name."""
         self.reset()
         for i, joints in enumerate(motions["joints"]):
             mask = torch.ones(1, len(joints), dtype=torch.bool)

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluator audit: perturbs real motions at several grades, and measures the results."""
+"""Evaluator audit: perturbs real motions at several grades and measures the results."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ class _Measure:
     def facts_of(self, name: str) -> dict[str, Any]:
         """Returns the properties that a card lists for a value; see `AuditedMetric`.
 
-        The direction is not included.
+        The direction of the value is not included.
         """
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]
@@ -262,7 +262,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that evaluates requested attributes exactly, or None."""
+        """Name of the value that evaluates requested attributes exactly, or None if there is none."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }

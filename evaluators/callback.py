@@ -26,10 +26,10 @@ class Evaluate(Callback):
     val/<protocol>/<metric> (<unit>), next to the value for real motions (.../real). With several
     replications, .../ci is the half width of the 95 % interval.
 
-    The evaluation is part of validation: it runs at the first one, and then whenever another
-    multiple of `every_n_steps` has been reached. If the recipe averages weights, the averaged
-    weights are evaluated. The motions are divided among all ranks. Raises `UserError` before
-    training begins if the extractor does not exist.
+    The evaluation runs during the first validation, and then during the first validation after each
+    multiple of `every_n_steps`. If the recipe averages weights, the averaged weights are evaluated.
+    The motions are divided among all ranks. Raises `UserError` before training begins if the
+    extractor does not exist.
 
     Args:
         protocol: a name in experiments/evaluation, or the path of a file.
@@ -75,7 +75,7 @@ class Evaluate(Callback):
         self.next = trainer.global_step
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Evaluates the averaged weights if another multiple of `every_n_steps` has been reached."""
+        """Evaluates the averaged weights if an evaluation is due; see `every_n_steps`."""
         if trainer.global_step < self.next or not hasattr(self, "evaluation"):
             return
         assert isinstance(pl_module, GeneratorTask)
@@ -107,7 +107,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Adds a value for checkpoint selection, and its curves for dashboards."""
+        """Stores a value for checkpoint selection and its curves for dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name

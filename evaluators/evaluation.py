@@ -178,7 +178,7 @@ class Evaluation:
     def _measure_real(
         self, source: Source | None, ground_truth: bool
     ) -> tuple[list[tuple[Rows, Rows]], Outcome]:
-        """Measures real motions, and returns them for comparisons with the source's motions.
+        """Measures real motions and returns them for comparisons with the source's motions.
 
         Each replication has two references: the real motions of the evaluated clips, and a set of
         real motions for metrics that compare sets.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""The keys of an evaluation.
+"""The keys of `flame-mdm evaluate`, which describe an evaluation.
 
 This module does not import torch, so that invalid keys are reported immediately.
 """

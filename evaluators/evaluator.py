@@ -316,7 +316,7 @@ class Evaluator:
 
 
 def keys_of(names: Sequence[str]) -> Tensor:
-    """Returns the keys (N,) int64 of N unique names; see `flame_mdm.seeds.key`."""
+    """Returns the keys of N unique names, as int64 (N,); see `flame_mdm.seeds.key`."""
     return torch.tensor([key(name) for name in names], dtype=torch.long)
 
 

@@ -203,7 +203,7 @@ class Perturbation:
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
-        """Returns the indices (N,) of motions in the order in which they are perturbed.
+        """Returns the order in which motions are perturbed, as indices (N,).
 
         The order is the same at all grades.
         """
@@ -287,7 +287,7 @@ class ReplacedShare(ChangedSet):
 
 @dataclass(frozen=True)
 class DroppedRepetition(ReplacedShare):
-    """Cuts one repetition out of a share of the motions, except those without repetitions."""
+    """Cuts one repetition out of a share of the motions. Motions without repetitions stay unchanged."""
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
         """Returns the perturbation if any motion has repetitions."""

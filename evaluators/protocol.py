@@ -91,9 +91,9 @@ class Multimodality(ClosedSchema):
 class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
-    The caption and crop of a clip, and the noise of the generated motion, are functions of (seed,
+    The caption and crop of a clip and the noise of the generated motion depend only on (seed,
     replication, id). Generated motions are as long as the real clips. Real motions are measured in
-    the same way, and compared with a second draw of real motions.
+    the same way and compared with a second draw of real motions.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -274,7 +274,7 @@ class Protocol(ClosedSchema):
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
         """Returns the motions for one replication of multimodality.
 
-        Each of the first prompts has several motions.
+        Several motions are generated for each of the first prompts.
         """
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]

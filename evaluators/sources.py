@@ -34,7 +34,7 @@ NOISE = 0.5  # standard deviation of the noise in noisy baselines, in normalized
 
 @dataclass
 class Samples:
-    """Motions to measure, each (F, D) float32 in the data's units."""
+    """Motions to measure, each float32 (F, D) in the data's units."""
 
     #: The rows of the protocol for which the motions were generated, in the same order.
     rows: list[DrawnClip]
@@ -346,7 +346,7 @@ class Baseline:
         return motions
 
     def _static(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
-        """Holds the first frame.
+        """Holds the first frame of each motion.
 
         If the features contain velocities, the joint positions are held and encoded again.
         """

@@ -108,7 +108,7 @@ class OwnExtractor(Extractor, Generic[TrainedTask]):
         )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes "features" (B, E) from motions (B, F, D), in the data's units, and mask (B, F)."""
+        """Computes "features" (B, E) from motions (B, F, D) in the data's units, with mask (B, F)."""
         return {"features": self.task(features, mask)}
 
 
@@ -176,7 +176,7 @@ class OwnClassifierExtractor(OwnExtractor[ClassifierTask]):
     trained, recipes = ClassifierTask, "classifier"
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes "features" (B, E) and "logits" (B, actions) from joints (B, F, J, 3) and mask (B, F)."""
+        """Computes "features" (B, E) and "logits" (B, actions) from joints (B, F, J, 3) and their mask (B, F)."""
         return {
             "features": self.task(joints, mask),
             "logits": self.task.network.logits(joints, mask),
@@ -227,7 +227,7 @@ class ReleasedExtractor(Extractor, Generic[Network]):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes "features" (B, E) from motions (B, F, D), in the data's units, and mask (B, F)."""
+        """Computes "features" (B, E) from motions (B, F, D) in the data's units, with mask (B, F)."""
         return {"features": self.network(features, mask)}
 
 

@@ -13,9 +13,9 @@ class ActionGRU(nn.Module):
     """Action classifier with two GRU layers over joint positions.
 
     The class is predicted from the state at the last real frame. The features and accuracies in all
-    published HumanAct12 tables are computed with the released weights. The authors draw the initial
-    state from a normal distribution on every call, whereas here the initial `state` (layers, B,
-    hidden) is zero by default.
+    published HumanAct12 tables were computed with the released weights. The authors draw the
+    initial state from a normal distribution on every call, whereas here the initial `state`
+    (layers, B, hidden) is zero by default.
     """
 
     features = 30
@@ -34,7 +34,7 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Computes features (B, 30), in (-1, 1), from joint positions (B, F, J, 3) and mask (B, F).
+        """Computes features (B, 30), in (-1, 1), from joint positions (B, F, J, 3) and their mask (B, F).
 
         The positions are in meters, y up.
         """

@@ -76,7 +76,7 @@ class ClassifierTask(ExtractorTask[ActionGRU | JointSTGCN]):
         return self.network.logits(joints.masked_fill(past_end, 0), batch.mask), batch.action
 
     def on_validation_epoch_start(self) -> None:
-        """Copies the running statistics of rank 0, which are saved in checkpoints, to all ranks."""
+        """Copies rank 0's running statistics, which are saved in checkpoints, to all ranks."""
         if world_size() > 1:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, 0)

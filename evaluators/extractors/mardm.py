@@ -73,7 +73,7 @@ class MARDMClip(nn.Module):
         self.logit_scale = nn.Parameter(torch.zeros(()))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes vectors (B, 512) from motions (B, F, D >= 67), in the data's units, and mask (B, F)."""
+        """Computes vectors (B, 512) from motions (B, F, D >= 67) in the data's units, with mask (B, F)."""
         x = (x[..., : len(self.mean)] - self.mean) / self.std * mask[..., None]
         return F.normalize(self.motion_encoder(x, mask), dim=-1)
 

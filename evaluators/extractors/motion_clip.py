@@ -38,7 +38,7 @@ POOL = 32  # number of pairs in a pool, as in R-precision
 
 
 class MotionCLIP(nn.Module):
-    """A transformer over [CLS, length, frame 1, ...], and a linear layer for the pooled text.
+    """A transformer over [CLS, length, frame 1, ...] and a linear layer for the pooled text.
 
     The features are not scaled to norm 1, because Fréchet distance and MID use unscaled features.
     The temperature is learned, with an initial value of 0.07.
@@ -82,7 +82,7 @@ class MotionCLIP(nn.Module):
         self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes features (B, E) from normalized motions (B, F, D) and mask (B, F).
+        """Computes features (B, E) from normalized motions (B, F, D) and their mask (B, F).
 
         F must not exceed `max_frames`.
         """
@@ -223,7 +223,7 @@ class MotionCLIPTask(ExtractorTask[MotionCLIP]):
         return task.eval()
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes features (B, E) from motions (B, F, D), in the data's units, and mask (B, F)."""
+        """Computes features (B, E) from motions (B, F, D) in the data's units, with mask (B, F)."""
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:

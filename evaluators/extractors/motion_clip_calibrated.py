@@ -40,11 +40,11 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
     - Texts: motions of clips with the same captions or attributes are not negatives of each other's
       captions. Near-miss captions (see `near_misses`) are additional negatives.
-    - Motions: half of them are accompanied by a noisy copy. The strength of the noise is drawn from
-      [0, 1], with small values more likely. The distance between the features of a motion and its
-      copy, both scaled to norm 1, is trained to equal this strength. Half of the copies have white
-      noise on the joints and are encoded again, like motions from files. The other half have noise
-      on normalized features, like generated motions.
+    - Motions: half of them come with a noisy copy. The strength of the noise is drawn from [0, 1],
+      with small values more likely. The distance between the features of a motion and its copy,
+      both scaled to norm 1, is trained to equal this strength. Half of the copies have white noise
+      on the joints and are encoded again, like motions from files. The other half have noise on
+      normalized features, like generated motions.
 
     All features are scaled to the same norm. Otherwise, their norms, which do not affect cosines,
     would distort Euclidean distances.
@@ -154,7 +154,7 @@ def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: 
     """Returns noisy copies (B, F, D) of normalized motions.
 
     In the first half of the batch, noise is added to the joints; in the second half, to the
-    features. `strength` (B,) is the strength of the noise, which is drawn from torch's CPU
+    features. `strength` (B,) is the strength of the noise. The noise is drawn from torch's CPU
     generator.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()

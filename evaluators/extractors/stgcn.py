@@ -71,7 +71,7 @@ class STGCN(nn.Module):
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes features (B, E) from motions (B, F, V, C) and mask (B, F)."""
+        """Computes features (B, E) from motions (B, F, V, C) and their mask (B, F)."""
         x = self.data_bn(x.flatten(2).transpose(1, 2)).unflatten(1, x.shape[2:]).permute(0, 2, 3, 1)
         for block, importance in zip(self.st_gcn_networks, self.edge_importance, strict=True):
             x = block(x, self.A * importance, mask)
@@ -109,7 +109,7 @@ class _Block(nn.Module):
 
 
 class UESTC(STGCN):
-    """The classifier for UESTC's 40 actions that was used for the tables of ACTOR, MDM and MFM.
+    """The UESTC classifier used for the tables of ACTOR, MDM and MFM, with 40 actions.
 
     It reads joint rotations.
     """
@@ -153,5 +153,5 @@ class JointSTGCN(STGCN):
     """
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes features (B, 256) from joint positions (B, F, J, 3), in meters, and mask (B, F)."""
+        """Computes features (B, 256) from joint positions (B, F, J, 3) in meters, with mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)

@@ -68,8 +68,7 @@ class WordVectors:
     def read(cls, folder: Path) -> Self:
         """Reads our_vab_data.npy and our_vab_idx.pkl.
 
-        Raises `FileNotFoundError` if a file is missing, and `UserError` if its content is not
-        valid.
+        Raises `FileNotFoundError` if a file is missing, and `UserError` if its content is invalid.
         """
         rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = _read_numbers(folder / "our_vab_data.npy").astype(np.float32)
@@ -134,7 +133,7 @@ class LearnedWords(nn.Module):
 class T2MEvaluator(nn.Module):
     """Embeds motions and captions in a joint space, for the metrics of HumanML3D and KIT.
 
-    The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units, and
+    The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units and
     are normalized with the `mean` and `std` (D,) of the released weights. After normalization,
     motions are padded with zeros to `max_frames`, as in the authors' code for real motions, so the
     convolutions read 3 frames past the end. The network reads the first `used_features` features
@@ -167,7 +166,7 @@ class T2MEvaluator(nn.Module):
         self.motion_encoder = _MotionEncoder(movement_latent, motion_hidden, embedding)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes embeddings (B, E) from motions (B, F, D) and mask (B, F).
+        """Computes embeddings (B, E) from motions (B, F, D) and their mask (B, F).
 
         The motions must have 4 to `max_frames` frames.
         """

@@ -63,10 +63,10 @@ def matching_loss(
     """Computes the contrastive loss of Guo et al. 2022 over B pairs. Returns a scalar.
 
     The formula is eq. 4 of Hadsell et al. 2006, without its factor 1/2. Each text is compared with
-    its own motion and with a wrong motion: the motion of the nearest previous pair that the text
-    does not describe. The wrong motion adds no loss if its distance is larger than `margin`. The
-    authors shift the motions by a random number of rows instead, which also pushes matching pairs
-    apart.
+    its own motion and with a wrong motion: the motion of the closest preceding pair whose motion
+    the text does not describe. The wrong motion adds no loss if its distance is larger than
+    `margin`. The authors shift the motions by a random number of rows instead, which also pushes
+    matching pairs apart.
 
     Args:
         motion: (B, E) features of the motions.

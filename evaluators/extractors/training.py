@@ -82,7 +82,7 @@ class ExtractorTask(Task, Generic[Network]):
         self.val_metrics.update(self.metrics())
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes features (B, E) from motions (B, F, ...), in the data's units, and mask (B, F)."""
+        """Computes features (B, E) from motions (B, F, ...) in the data's units, with mask (B, F)."""
         return self.network(x, mask)
 
     def seed_step(self, batch_idx: int) -> None:

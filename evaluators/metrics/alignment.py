@@ -16,7 +16,7 @@ TOP = (1, 2, 3)
 
 
 def equally_weighted(values: Tensor) -> Tensor:
-    """Returns values (N,) and weights of 1 as two columns, (N, 2)."""
+    """Stacks values (N,) and weights of 1 as two columns (N, 2)."""
     return torch.stack([values, torch.ones(len(values), dtype=values.dtype)], 1)
 
 

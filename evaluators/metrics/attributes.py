@@ -215,8 +215,8 @@ def _locomotion(
 def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, str | int]:
     """Detects kicks.
 
-    In a kick, a foot is more than 35 cm in front of the pelvis and more than 25 cm above its height
-    when standing.
+    In a kick, a foot is more than 35 cm in front of the pelvis and more than 25 cm higher than when
+    standing.
     """
     out = smooth[:, ANKLES] - smooth[:, [PELVIS]]
     ahead = (out[..., [0, 2]] * forward[:, None]).sum(-1)

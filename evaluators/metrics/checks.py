@@ -1,4 +1,4 @@
-"""Checks for individual actions: whether a motion shows the action, and its side, count or direction.
+"""Checks for individual actions: whether a motion shows the action, and with which side, count or direction.
 
 `evaluators.metrics.attributes` recognizes 22 actions. Rules cannot tell the other actions apart: a
 hand at the head for half a second may mean drinking, phoning or scratching. Therefore, a check only
@@ -158,7 +158,7 @@ def _slash(view: View) -> Shown:
 
 
 def _hop(view: View) -> Shown:
-    """Detects hops on one foot, and counts how often this foot leaves the floor.
+    """Detects hops on one foot and counts how often this foot leaves the floor.
 
     The other foot must be 12 cm higher for 0.4 seconds.
     """

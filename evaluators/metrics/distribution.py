@@ -34,7 +34,7 @@ def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 class FrechetMotionDistance(TwoSets):
-    """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
+    """Fréchet distance of motion features: "FID" (Heusel et al. 2017) or "FD" (FLAME); see `frechet_distance`.
 
     Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
     means in float32 and uses scipy's `sqrtm` for the product; if `sqrtm` fails, 1e-6 is added to

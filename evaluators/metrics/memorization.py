@@ -59,7 +59,7 @@ class TrainingMotions:
 
         Returns:
             (B, 2), or (B, 1) without features. The first column is the root mean square distance,
-            in meters, between the joints of the motion and of the best window of the same length,
+            in meters, between the motion's joints and those of the best window of the same length,
             computed from every fourth frame. It is infinite if no training motion is long enough.
             The second column is the distance between the features.
         """

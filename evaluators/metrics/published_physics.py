@@ -334,7 +334,7 @@ class KimodoConstraints(MotionMean):
         self.add(keys, errors)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns the means over motions, and the percentile `root2d_err_p95`, by name."""
+        """Returns the means over motions and the percentile `root2d_err_p95`, keyed by name."""
         roots = sums[counts[:, 0] > 0, 0]
         return self.means(sums, counts) | {
             "root2d_err_p95": roots.quantile(0.95).item() if len(roots) else None
@@ -399,13 +399,14 @@ class PhysicalFootContact(PublishedPhysics):
 class TransitionJerk(SampleMetric):
     """Peak jerk and area under the jerk, at transitions between kept and generated frames.
 
-    The computation follows FlowMDM's code (e81c67f). The jerk of a frame is the largest L1 norm,
-    over joints, of the third difference of the position, in meters per frame^3. A window is
-    centered at the first frame after each change between kept and generated frames, provided that
-    the motion contains the whole window. The jerk is averaged over windows, frame by frame. `peak`
-    is the maximum of this mean curve. `area` is the sum of its absolute differences from the jerk
-    of real motions, and grows with the size of the window; it is undefined at frame rates that are
-    not in `JERK_OF_REAL_MOTIONS`. `windows` is the number of windows.
+    The computation follows FlowMDM's code (e81c67f). The jerk of a frame is the L1 norm of the
+    third difference of a joint's position, in meters per frame^3, for the joint with the largest
+    norm. A window is centered at the first frame after each change between kept and generated
+    frames, provided that the motion contains the whole window. The jerk is averaged over windows,
+    frame by frame. `peak` is the maximum of this mean curve. `area` is the sum of the curve's
+    absolute differences from the jerk of real motions, and grows with the size of the window; it is
+    undefined at frame rates that are not in `JERK_OF_REAL_MOTIONS`. `windows` is the number of
+    windows.
 
     Args:
         fps: frames per second of the motions.

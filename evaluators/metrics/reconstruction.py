@@ -288,7 +288,7 @@ class DisplacementErrors(EditErrors):
     """ADE and FDE: mean joint distance, in meters, in all predicted frames and in the last one.
 
     As is usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints
-    and frames of a clip, and then over clips. The part that an edit kept is ignored. MFM (Table 3)
+    and frames of a clip, and then over clips. Parts that an edit kept are ignored. MFM (Table 3)
     states no formula, code or unit for its numbers, which are too large to be in meters and
     therefore not comparable.
 

@@ -36,9 +36,9 @@ def _encoder(config: str) -> ConditionEncoder:
 
 @functools.cache
 def embedding(config: str, caption: str) -> Tensor:
-    """Returns the vector (C,) of a caption, scaled to norm 1.
+    """Encodes a caption as a vector (C,) of norm 1.
 
-    `config` is an encoder's mapping as JSON. The caption is encoded alone, not in a batch.
+    `config` is the mapping of an encoder in JSON. The caption is encoded alone, not in a batch.
     """
     empty = torch.zeros(1, 1, 1)
     with torch.no_grad():
@@ -82,7 +82,7 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 
 
 def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
-    """Returns the rank (N,) of the best correct candidate, 0 = first.
+    """Returns the rank of each query's best correct candidate, as (N,), 0 = first.
 
     Candidates with the same value in `similarity` (N, M) share their mean rank.
     """

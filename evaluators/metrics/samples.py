@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class that declares properties of a metric, and its values for samples and resamples.
+    """Base class that declares properties of a metric and its values for samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.

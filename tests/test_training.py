@@ -179,7 +179,7 @@ def test_training_starts_from_the_weights_of_another_model(tiny, trained, tmp_pa
         ("absent/run.ckpt", "initial_weights=absent/run.ckpt: no such checkpoint"),
         (
             "motion_clip_synthetic",
-            "initial_weights=motion_clip_synthetic: no weight matches a weight",
+            "initial_weights=motion_clip_synthetic: none of its weights match this recipe",
         ),
     ],
 )

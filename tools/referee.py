@@ -18,9 +18,9 @@ duration, or the other end of the motion, count as false. A wrong caption counts
 referee.
 
 Captions hardly ever state durations. If the captions of a recording only state that the body walks,
-runs or stands still, the recording is therefore cut to two, three and four seconds, so that "for
-three seconds" is true for the cut. A walking body is assumed to be upright at the start and at the
-end. Claims about durations, starts and ends are not used for calibration.
+runs or stands still, clips of two, three and four seconds are therefore cut from the recording, so
+that "for three seconds" is true for one of them. A walking body is assumed to be upright at the
+start and at the end. Claims about durations, starts and ends are not used for calibration.
 """
 
 import re

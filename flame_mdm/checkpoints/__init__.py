@@ -1,1 +1,1 @@
-"""Checkpoints and model files: reading, writing, loading, import of released weights, and upload."""
+"""Checkpoints and model files: reading, writing, loading, importing and uploading."""

@@ -1,17 +1,17 @@
 """Adapters: small changes to a model's weights, learned from a few clips.
 
-A weight W (out, in) of attention or feed-forward layers becomes W + strength * up down, with `up`
-(out, rank) and `down` (rank, in) (Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, a
-vector is added to the row of each new word. During training, `torch.nn.utils.parametrize`
-computes the weights. This also works for code that reads a weight without calling its layer, such
-as cross-attention.
+A weight W of shape (out, in) in an attention or feed-forward layer becomes W + strength * up down,
+where `up` has shape (out, rank) and `down` has shape (rank, in) (Hu et al. 2021, arXiv:2106.09685).
+In a learned text encoder, a vector is added to the row of each new word. During training,
+`torch.nn.utils.parametrize` computes the changed weights, so that even code that reads a weight
+without calling its layer, such as cross-attention, uses them.
 
-All layers are trained, but a style keeps only the changes in the second half of the layers. The
-first half would learn that the clips show few actions, and the model would no longer follow the
-requested action.
+All layers are trained, but a style keeps only the changes in the second half of the layers. Changes
+in the first half would bias the model toward the few actions in the clips, and it would no longer
+follow the requested action.
 
-An adapter file (.safetensors) contains the parts of the change to a weight NAME as NAME.up,
-NAME.down and NAME.vectors. Its metadata contains `About` as JSON.
+An adapter file (.safetensors) stores the change to the weight NAME as NAME.up and NAME.down, or as
+NAME.vectors. Its metadata contains `About` as JSON.
 """
 
 from __future__ import annotations
@@ -96,14 +96,14 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns, for each word, one of its two table rows, preferably one that no vocabulary word uses."""
+    """Returns one of the two table rows of each word, preferably one that no vocabulary word uses."""
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]
 
 
 def attach(model: MotionGenerator, about: About) -> None:
-    """Freezes a model and attaches changes, which are initially 0.
+    """Freezes a model and attaches changes, initially 0, to its weights.
 
     Raises `UserError` if the model's denoiser has no transformer.
     """
@@ -125,7 +125,7 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
-    """Copies the weights of a base model into a model, which may have attached changes.
+    """Copies the weights of a base model into a model, with or without attached changes.
 
     `base` is a path or name, as in `find`.
     """
@@ -141,7 +141,7 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
 
 
 def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[int, int]:
-    """Copies trained weights of another model if their names and shapes match.
+    """Copies the trained weights of another model whose names and shapes match.
 
     The statistics of the features are not copied, since they belong to the data.
 
@@ -150,7 +150,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
         source: a path or name, as in `find`.
 
     Returns:
-        The number of copied tensors, and the number of trained tensors in the model.
+        The number of tensors copied, and the number of trained tensors in the model.
 
     Raises:
         UserError: If no tensor matches.
@@ -164,7 +164,7 @@ def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[i
     ]
     if not fitting:
         raise UserError(
-            f"initial_weights={source}: no weight matches a weight of this recipe in name and shape. Use a model "
+            f"initial_weights={source}: none of its weights match this recipe in name and shape. Use a model "
             "with the same network and width"
         )
     with torch.no_grad():

@@ -35,13 +35,14 @@ OTHERS = "not overwritten because push did not write it. Choose another folder w
 
 
 def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes the model of a checkpoint as a single .safetensors file and returns its path.
+    """Writes the model in a checkpoint as a single .safetensors file and returns its path.
 
     Args:
         source: the model, as in `flame_mdm.load`.
         out: path of the file.
         half: whether to store weight matrices in half precision. Vectors, such as the statistics of
-            the features, keep single precision. Loaded models always compute in single precision.
+            the features, remain in single precision. Loaded models always compute in single
+            precision.
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises the same errors as `flame_mdm.load`.

@@ -184,7 +184,7 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
 
 
 class _CallLimit(TorchFunctionMode):
-    """Allows at most `limit` calls to torch functions, so that a recipe with a million layers fails early."""
+    """Limits the number of torch calls, so that a recipe with a million layers fails early."""
 
     def __init__(self, limit: int):
         super().__init__()

@@ -141,7 +141,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
     ]
     if wrong:
         raise UserError(
-            f"{wrong[0]}: outside the limits for exported models, which docs/export.md lists"
+            f"{wrong[0]}: outside the limits for exported models (see docs/export.md)"
         )
     return content | {"sha256": {}}
 
@@ -163,7 +163,7 @@ class Probe:
     """Records how a sampler combines noise and clean estimates.
 
     The probe takes the place of the denoiser, the noise and the `Guide`. `variance` is the constant
-    that it returns in the channels of a learned variance.
+    that the probe returns in the channels of a learned variance.
     """
 
     # All exported samplers are linear: each noisy motion is a weighted sum of noise draws and clean
@@ -178,11 +178,11 @@ class Probe:
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1) of one noise draw or one clean estimate."""
+        """Returns the unit vector (1, 1, 2 * calls + 1) of a noise draw or a clean estimate."""
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
-        """Counts the draws, and returns a unit vector instead of noise."""
+        """Counts the draw, and returns its unit vector instead of noise."""
         self.draws = draw + 1
         return self.unit(draw)
 
@@ -192,7 +192,7 @@ class Probe:
         return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Records the coefficients p and q of a call, from two tiny inputs."""
+        """Records the coefficients p and q of a call, computed from two tiny inputs."""
         if len(self.records) == self.calls:
             raise UserError("it chooses its own step sizes")
         # The clean estimate is p x + q y. An output y = 0 reveals p; an input x = 0 reveals q.
@@ -204,7 +204,7 @@ class Probe:
         return x_t
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns the unit vector of a clean estimate instead of the estimate."""
+        """Returns the unit vector of the clean estimate instead of the estimate itself."""
         return self.unit(self.calls + len(self.records))
 
 
@@ -263,8 +263,8 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
 class Graph(NamedTuple):
     """A module to export.
 
-    `examples` contains example inputs by name, and `dimensions` names their axes of variable
-    length.
+    `examples` maps the names of the inputs to example inputs, and `dimensions` names their axes of
+    variable length.
     """
 
     name: str
@@ -342,7 +342,7 @@ class Call(nn.Module):
 
 
 class ContinuingCall(Call):
-    """A call to a denoiser that continues frames, which are an additional input."""
+    """A call to a denoiser that continues previous frames, which are an additional input."""
 
     def forward(
         self,
@@ -423,7 +423,10 @@ def graphs(model: MotionGenerator) -> list[Graph]:
 
 
 def traced(graph: Graph) -> torch.export.ExportedProgram:
-    """Traces a graph's module for inputs of any size along the named axes, and returns its operations."""
+    """Traces a graph's module and returns its operations.
+
+    The named axes of the inputs may have any size.
+    """
     dimensions = [graph.dimensions.get(name) for name in graph.examples]
     return torch.export.export(
         graph.module.eval(),
@@ -436,7 +439,7 @@ def traced(graph: Graph) -> torch.export.ExportedProgram:
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
     """Writes a graph.
 
-    Raises `UserError` if its outputs differ from PyTorch's for a batch of one or two motions.
+    Raises `UserError` if its outputs for one or two motions differ from PyTorch's.
     """
     import onnxruntime
 

@@ -1,4 +1,4 @@
-"""Import of the checkpoints released by the authors of MDM, MFM and FLAME.
+"""Imports the checkpoints released by the authors of MDM, MFM and FLAME.
 
 The import fails unless each learned weight is used exactly once. Frozen text encoders and sinusoids
 are skipped.
@@ -45,7 +45,7 @@ POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
 
 
 class Released(NamedTuple):
-    """A released network, and its weights under the project's names."""
+    """A released network, with its weights renamed to this project's names."""
 
     network: type[Denoiser]
     features: tuple[int, int, int]  # in_features, out_features, cond_features
@@ -71,8 +71,8 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
     Args:
         state: weights from `released_state`, whose shapes determine the sizes of the network.
         args: options of the authors' code.
-        time_token: whether the decoder's input token contains only the time, as in the code since
-            February 2025. The released model with an input token is older.
+        time_token: whether the decoder's input token contains only the time, as in the authors'
+            code since February 2025. The released model with an input token is older than that.
     """
     network, stack, layer = NETWORKS[args.arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")
@@ -121,7 +121,7 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
 
 
 def _target_options(ours: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Infers the options of the target encoder from its weights, which have the project's names."""
+    """Infers the options of the target encoder from its renamed weights."""
     layers = sum(key.startswith("target.network.") and key.endswith(".weight") for key in ours) - 1
     if layers >= 0:
         return {"target_encoder": "single", "target_layers": layers}

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Options of released models.
+"""Reads the options of released models.
 
 Each option is either read, ignored because it has no effect on the model, or rejected.
 """
@@ -26,7 +26,7 @@ LowerCase = BeforeValidator(lambda x: x.lower() if isinstance(x, str) else x)
 
 
 class Solver(Schema):
-    """Options of MFM's solver, called `ode_kwargs` there."""
+    """Options of MFM's solver, called `ode_kwargs` in its code."""
 
     method: str = "euler"
     step_size: Annotated[YamlNumber, Field(ge=1 / MAX_STEPS, le=1)] = 0.01
@@ -133,7 +133,7 @@ def _check_known(options: Mapping[Any, Any], read: Any, table: Config, prefix: s
 
 
 def _equal(value: Any, neutral: Any) -> bool:
-    """Returns whether two values are equal. A number may be text, such as 1e-5 in YAML 1.1."""
+    """Returns whether two values are equal. A number may be a string, such as 1e-5 in YAML 1.1."""
     try:
         return value == neutral or (isinstance(neutral, float) and float(value) == neutral)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Weights in files that the authors of a paper released: reading, renaming and loading them."""
+"""Reads, renames and loads weights released by the authors of papers."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -24,8 +24,7 @@ def read_released(
 ) -> Mapping[str, Any]:
     """Reads a released file.
 
-    With `run_code`, the file may also contain pickled objects of other classes; reading them runs
-    any code in them. Raises `UserError` if the file is damaged or, without `run_code`, if it
+    With `run_code`, the file may also contain pickled objects of classes other than torch's. Reading such objects runs any code in them. Raises `UserError` if the file is damaged or, without `run_code`, if it
     contains such objects. The error message about these objects ends with `advice`.
     """
     try:

@@ -4,8 +4,8 @@
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
-For the same caption, length and seed, the motion is the same as from `flame_mdm.generate`, which
-also understands sentences that differ from the captions of the training data. A model that
+For the same caption, length and seed, the motion is identical to that from `flame_mdm.generate`,
+which also understands sentences that differ from the captions of the training data. A model that
 continues frames starts from a standing person.
 """
 
@@ -169,7 +169,7 @@ def _has_type(value: Any, kind: str) -> bool:
 
 
 def check(content: Any) -> None:
-    """Raises `ValueError` if `model.json` is damaged, changed, or not within the limits of `SCHEMA`."""
+    """Raises `ValueError` if `model.json` is damaged, has been changed, or violates `SCHEMA`."""
     if not isinstance(content, dict):
         raise ValueError("model.json is damaged")
     if content.get("format") != FORMAT:
@@ -299,7 +299,7 @@ class Sampler:
         infinity.
 
         `text` is the sentence that selects the noise, if it differs from the caption `prompt`:
-        `flame_mdm.generate` draws noise for the sentence as typed.
+        `flame_mdm.generate` draws noise for the sentence exactly as the user typed it.
         """
         content = self.content
         fps = content["fps"]
@@ -334,7 +334,7 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Returns normalized features (F, D) of frames sampled together. `number` seeds the noise."""
+        """Samples frames together and returns their normalized features (F, D). `number` seeds the noise."""
         content = self.content
         x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
@@ -474,7 +474,7 @@ def joined(before: np.ndarray, x: np.ndarray, fade: Mapping[str, int] | None) ->
 
 
 def normal(number: int, frames: int, features: int) -> np.ndarray:
-    """Returns standard normal noise (F, D) float32 for a key; see `flame_mdm.seeds.normal`."""
+    """Returns float32 standard normal noise (F, D) for a key; see `flame_mdm.seeds.normal`."""
     pairs = (features + 1) // 2
     first = mixed(mixed(np.array([number & MASK], np.uint64)))
     positions = np.arange(frames * pairs, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)

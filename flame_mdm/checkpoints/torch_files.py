@@ -29,7 +29,7 @@ def read_torch(path: Path) -> Any:
 
 
 def check_torch(path: Path) -> None:
-    """Checks the sizes and checksums in an archive from `torch.save`, which `torch.load` ignores."""
+    """Checks the sizes and checksums in an archive from `torch.save`; `torch.load` ignores them."""
     size = regular_file(path)
     if not _is_archive(path):
         return
@@ -54,12 +54,13 @@ def check_torch(path: Path) -> None:
 
 
 def check_keys(path: Path) -> None:
-    """Raises `UserError` if many keys in a file may share one hash.
+    """Raises `UserError` if many keys in a file could have the same hash.
 
     With `torch.load(weights_only=True)`, loading a dictionary with such keys takes quadratic time:
-    hours for a file of one megabyte. Strings have random hashes, and small integers have different
-    hashes. If the pickle names an object that PyTorch refuses, the check stops there without an
-    error, because PyTorch stops at the same place and names the object.
+    hours for a file of one megabyte. Strings are safe because their hashes are randomized, and
+    small integers because their hashes are distinct. If the pickle names an object that PyTorch
+    refuses, the check stops there without an error, because PyTorch stops at the same place and
+    names the object.
     """
     regular_file(path)
     damage = naming(path, Exception, prefix="damaged, or not a file of plain values and tensors: ")
@@ -91,7 +92,7 @@ class _Named:
 
 
 class _Refused(Exception):
-    """The pickle names an object that PyTorch refuses."""
+    """Raised when the pickle names an object that PyTorch refuses."""
 
 
 CONTAINERS = ("collections.OrderedDict", "collections.Counter", "builtins.set")
@@ -211,7 +212,7 @@ class _KeyCheck(pickle._Unpickler):
 
 
 def _check_container(name: str, arguments: Sequence[Any]) -> None:
-    """Checks the keys with which a container is created.
+    """Checks the keys in the arguments from which a container is created.
 
     Examples are OrderedDict([(key, value), ...]) and set([key, ...]).
     """

@@ -53,9 +53,9 @@ class Denoiser(nn.Module, ABC):
 
         Args:
             x_t: (B, F, D) noisy motion.
-            t: (B,) float in [0, 1000), the time as a row index of the sinusoidal table.
+            t: (B,) float in [0, 1000), the time, given as a row index into the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
-            cond: the condition. Samples whose condition was dropped already have the null
+            cond: the condition. For samples whose condition was dropped, it is already the null
                 condition.
 
         Raises:

@@ -11,7 +11,7 @@ from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
 class MDMGRU(Denoiser):
     """GRU over the frames of a motion.
 
-    The sum of the time and condition embeddings is concatenated to each frame. The network runs
+    Each frame is concatenated with the sum of the time and condition embeddings. The network runs
     forward in time, so padding at the end does not affect real frames.
 
     Args:

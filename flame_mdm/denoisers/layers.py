@@ -13,8 +13,9 @@ from flame_mdm.errors import UserError
 def sinusoid(position: Tensor, features: int) -> Tensor:
     """Returns sinusoidal embeddings (N, features) for positions (N,) (Vaswani et al. 2017, section 3.5).
 
-    Even channels are sines, and odd channels are cosines. They are always computed in float32,
-    regardless of the network's precision, as they were when the released weights were trained.
+    Even channels are sines, and odd channels are cosines. The embeddings are always computed in
+    float32, regardless of the network's precision, as they were when the released weights were
+    trained.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
@@ -22,12 +23,12 @@ def sinusoid(position: Tensor, features: int) -> Tensor:
 
 
 def with_prefix(mask: Tensor, prefix: int) -> Tensor:
-    """Extends a mask (B, N) to (B, prefix + N), where all entries of the prefix are real."""
+    """Prepends `prefix` real entries to a mask (B, N)."""
     return torch.cat([mask.new_ones(mask.shape[0], prefix), mask], 1)
 
 
 class Attention(nn.Module):
-    """Multi-head attention from x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
+    """Multi-head attention from x to x itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
     As in the released weights, query, key and value share one matrix (3C, C), so that
     self-attention needs only one projection.
@@ -74,7 +75,7 @@ class Attention(nn.Module):
 
 
 class TransformerLayer(nn.Module):
-    """Self-attention, optional cross-attention, and a feed-forward network.
+    """Transformer layer: self-attention, optional cross-attention, and a feed-forward network.
 
     Each of these sublayers is followed by a residual sum and a layer norm.
     """

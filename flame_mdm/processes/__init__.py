@@ -45,7 +45,7 @@ class Process(nn.Module, ABC):
     #: Modes of `Edit` that sampling supports. The first one is the mode that the authors use.
     edit_modes: Sequence[str] = ()
 
-    #: Samplers by name.
+    #: Samplers, keyed by name.
     samplers: Mapping[str, Sampler] = {}
 
     #: Whether losses are averaged over the padded length, with zero noise in the padding.
@@ -118,12 +118,12 @@ class Process(nn.Module, ABC):
             cond: conditions of the batch.
             t: (B,) times. Default: drawn from torch's default generator.
             noise: (B, F, D). Default: drawn from torch's default generator.
-            auxiliary: additional losses of the clean estimate, such as
+            auxiliary: additional losses on the clean estimate, such as
                 `flame_mdm.losses.MotionLosses`.
 
         Returns:
-            Per-sample losses (B,) by name: the losses returned by `terms` and `auxiliary`, and
-            their sum, "loss".
+            Per-sample losses (B,), keyed by name: the losses returned by `terms` and `auxiliary`,
+            and their sum, "loss".
         """
         if t is None:
             t = self.training_times(torch.rand(len(x), device=x.device))

@@ -1,9 +1,9 @@
 """Consistency distillation: a student learns to replace many steps of its teacher with one call.
 
-Let f(x_t, t) be a network's clean estimate at time t. Along a path of the teacher, f should be the
-same at all times (Song et al. 2023, "Consistency Models"). Because the teacher's steps are guided,
-the student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai et al. 2024,
-"MotionLCM").
+Let f(x_t, t) be a network's clean estimate at time t. Along each sampling path of the teacher, f
+should be the same at all times (Song et al. 2023, "Consistency Models"). Because the teacher's
+steps are guided, the student needs no guidance (Luo et al. 2023, "Latent Consistency Models"; Dai
+et al. 2024, "MotionLCM").
 """
 
 import torch
@@ -35,11 +35,11 @@ def consistency_terms(
     target is the teacher's own clean estimate.
 
     Args:
-        process: process that the student and the teacher share. The prediction must be the clean
+        process: the process of both the student and the teacher. The prediction must be the clean
             motion or the velocity.
         student: the network to train.
         follower: the network that computes the target (the estimate after the step), without
-            gradient. It is the student itself, or a copy with the average of its weights.
+            gradients. It is the student itself, or a copy with averaged weights.
         teacher: the guided teacher.
         x: (B, F, D) normalized clean motion.
         mask: (B, F) bool, True = real frame.
@@ -50,7 +50,8 @@ def consistency_terms(
         auxiliary: geometric losses between the estimate and the target.
 
     Returns:
-        Per-sample losses (B,) by name: "consistency", the auxiliary losses, and their sum, "loss".
+        Per-sample losses (B,), keyed by name: "consistency", the auxiliary losses, and their sum,
+        "loss".
     """
     # The step follows the teacher's path to the next time. It is computed from the teacher's clean
     # estimate and the noise that this estimate implies.

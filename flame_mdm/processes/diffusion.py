@@ -20,7 +20,7 @@ from flame_mdm.sampler_options import SamplerOptions
 
 
 class GaussianDiffusion(Process):
-    """Gaussian diffusion over T steps, the process of MDM and FLAME (Ho et al. 2020).
+    """Gaussian diffusion over T steps (Ho et al. 2020), as in MDM and FLAME.
 
     The time t is the step, a float from 0 to T - 1, and is passed to the denoiser unchanged. The
     noisy motion is x_t = sqrt(ab) x + sqrt(1 - ab) noise, where the schedule determines ab ("alpha
@@ -36,8 +36,8 @@ class GaussianDiffusion(Process):
             additional channels (Nichol and Dhariwal 2021, eq. 15).
         vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), which is used only if
             the variance is learned. L_vlb is a sum over T steps, so it is computed as T times the
-            term of one step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to 1 in
-            FLAME's code.
+            term of a single step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to
+            1 in FLAME's code.
         average_padding: whether to average losses over the padded length, with zero noise in the
             padding, as in FLAME's code. Short motions then have less weight. The denoiser must
             return 0 in the padding.
@@ -46,15 +46,16 @@ class GaussianDiffusion(Process):
             and 7).
         skip: whether to add a skip connection around the network, which requires the prediction
             "epsilon". The predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras
-            et al. 2022, eq. 7, for data of variance 1). The output is then a velocity, but it is
-            trained with the error of the noise. The network need not pass its input through, and
-            the clean estimate is computed without division by the signal.
+            et al. 2022, eq. 7, for data of variance 1). The output is then a velocity, but the loss
+            is the error of the noise. The network does not need to pass its input through, and the
+            clean estimate is computed without division by the signal.
         min_snr: maximum weight of a step. The squared error is weighted as if the clean motion were
             predicted with weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None =
             every step has weight 1, regardless of the prediction.
-        noise_scale: factor by which the noise-to-signal ratio of each step is multiplied. With 263
-            features that depend on each other, the text is informative only at high noise. A factor
-            above 1 assigns more steps to high noise (Hoogeboom et al. 2023, section 2.2).
+        noise_scale: factor by which the noise-to-signal ratio of each step is multiplied. For
+            motions with 263 interdependent features, the text is informative only at high noise
+            levels. A factor above 1 assigns more steps to these levels (Hoogeboom et al. 2023,
+            section 2.2).
 
     Raises:
         UserError: If T or `noise_scale` is out of range, if `skip` is combined with a prediction
@@ -178,7 +179,7 @@ class GaussianDiffusion(Process):
         return terms
 
     def _snr_weight(self, t: Tensor) -> Tensor | float:
-        """Returns the weight (B,) of the squared error of the prediction at steps t (B,)."""
+        """Returns the weights (B,) of the squared prediction errors at steps t (B,)."""
         if self.min_snr is None:
             return 1.0
         snr = (
@@ -195,8 +196,8 @@ class GaussianDiffusion(Process):
         """Returns the terms (B, F, D) of the variational bound at steps t (B,), in nats.
 
         Source: Ho et al. 2020, eq. 5. Only the variance receives a gradient (Nichol and Dhariwal
-        2021, section 3.1). As in FLAME's code, the term of step 0 is the divergence with the
-        clipped posterior variance.
+        2021, section 3.1). As in FLAME's code, the term of step 0 is the KL divergence computed
+        with the clipped posterior variance.
         """
         real = self.schedule.posterior_mean(x, x_t, t)
         mean = self.schedule.posterior_mean(self.to_x0(output, x_t, t).detach(), x_t, t)

@@ -23,12 +23,12 @@ class FlowMatching(Process):
         sigma_min: standard deviation of the noise that remains at t = 1 (Lipman et al. 2023, eq.
             20-23).
         prediction: what the denoiser predicts: the velocity of the path ("velocity", as in MFM), or
-            the clean motion ("x0"), from which the velocity is computed. A network that is narrower
-            than the motion cannot represent the noise in the velocity.
+            the clean motion ("x0"), from which the velocity is computed. A network whose layers are
+            narrower than the motion features cannot represent the noise in the velocity.
         time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal",
-            the logistic function of a normal variable, which favors the middle (Esser et al. 2024,
-            eq. 19).
-        quantize_time: whether to pass floor(1000 t) to the denoiser, as a row index of the time
+            the logistic function of a normal variable, which favors times in the middle (Esser et
+            al. 2024, eq. 19).
+        quantize_time: whether to pass floor(1000 t) to the denoiser, as a row index into the time
             table, as in MFM's code.
         odeint_grid: whether to use float32 multiples of 1 / N as times, like torchdiffeq's Euler
             steps in MFM's code. For some N, `quantize_time` then rounds some times to a table row
@@ -100,9 +100,9 @@ class FlowMatching(Process):
         return (1 - (1 - self.sigma_min) * t[:, None, None]) * output + (1 - self.sigma_min) * x_t
 
     def table_time(self, t: Tensor) -> Tensor:
-        """Converts flow times to the times in [0, 1000] that the denoiser receives.
+        """Converts flow times in [0, 1] to the denoiser's times in [0, 1000].
 
-        A time exceeds 1000 only if a solver evaluates t > 1.
+        The result exceeds 1000 only if a solver evaluates a time t > 1.
         """
         # Times are always computed in float32, because models were trained with this rounding.
         return (t.to(torch.float32) * 1000).floor() if self.quantize_time else t * 1000

@@ -37,14 +37,14 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
     scale - 1. In this form, which MDM and FLAME (eq. 5) use, a scale of 1 means no guidance.
 
     Args:
-        denoise: the denoiser. Its condition must contain a null condition.
+        denoise: the denoiser. The condition passed to it must contain a null condition.
         scale: guidance scale, either one number or one per sample (B,). If it is the number 1,
             `denoise` itself is returned.
         features: D, the number of features. Further channels contain a learned variance, which is
             not guided but taken from the conditional prediction.
 
     Returns:
-        A function with the same arguments and the same kind of result as `denoise`.
+        A function with the same signature as `denoise`.
 
     Example:
         >>> null = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
@@ -79,12 +79,12 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
 @dataclass
 class Positions:
-    """M world coordinates of joints that a motion should reach.
+    """M world coordinates that the joints of a motion should reach.
 
     Attributes:
         frames: (M,) int64, indices of the frames.
         joints: (M,) int64, indices of the joints.
-        axes: (M,) int64, 0 = x, 1 = y, 2 = z.
+        axes: (M,) int64, the axes; 0 = x, 1 = y, 2 = z.
         values: (M,) the coordinates in meters.
     """
 

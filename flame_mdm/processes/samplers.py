@@ -213,9 +213,9 @@ def blended(
     """Samples with an edit whose mode is "x_t".
 
     At each step, the kept part is replaced by the known motion with the current amount of noise.
-    With `edit.blend` "after", the known motion with the initial noise also replaces the kept part
-    before the first step. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each step
-    again and repeats the step.
+    With `edit.blend` "after", the kept part is also replaced before the first step, by the known
+    motion with the initial noise. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each
+    step again and repeats the step.
 
     Args:
         sampler: a diffusion sampler.
@@ -349,8 +349,8 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
     """Integrates with adaptive steps of order 5 (Dormand and Prince 1980).
 
     As in MFM, rtol = atol = 1e-5. Because the error is measured over the entire batch, a motion
-    depends on the other motions in its batch, but only within the tolerance. If the last step goes
-    beyond the last time, the solver interpolates back.
+    depends on the other motions in its batch, but only within the tolerance. If the last step
+    overshoots the final time, the solver interpolates back to it.
 
     Args:
         x: (B, F, D) motion at time t.

@@ -10,7 +10,7 @@ from flame_mdm.sampler_options import MAX_STEPS
 
 
 def cosine_betas(num_train_timesteps: int) -> Tensor:
-    """Returns the noise variances (T,) float64 of the cosine schedule, clipped at 0.999.
+    """Returns the float64 noise variances (T,) of the cosine schedule, clipped at 0.999.
 
     Source: Nichol and Dhariwal 2021, eq. 17.
 
@@ -33,7 +33,7 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 
 
 def linear_betas(num_train_timesteps: int) -> Tensor:
-    """Returns the noise variances (T,) float64 of the linear schedule (Ho et al. 2020, section 4).
+    """Returns the float64 noise variances (T,) of the linear schedule (Ho et al. 2020, section 4).
 
     For T = 1000, the variances increase from 1e-4 to 0.02. For other T, they are multiplied by
     1000 / T, so that the final noise is the same, as in guided-diffusion. All variances are clipped
@@ -70,7 +70,7 @@ def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
 
 
 class Schedule:
-    """Coefficients of a Gaussian diffusion, by step i from 0 (least noise) to N - 1.
+    """Coefficients of a Gaussian diffusion, indexed by step i: 0 (least noise) to N - 1.
 
     The tables are float64 on the CPU and are rounded only once, when they are used. They are not
     buffers, because casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et
@@ -119,7 +119,7 @@ class Schedule:
         return self.numbers[name][i]
 
     def at(self, name: str, i: Tensor, x: Tensor) -> Tensor:
-        """Returns the values (B, 1, 1) of a coefficient at steps i (B,), on the device of x.
+        """Returns a coefficient's values (B, 1, 1) at steps i (B,), on the device of x.
 
         The values have the precision of x, but at least float32.
         """
@@ -129,7 +129,7 @@ class Schedule:
         return self._moved[key][i.long()][:, None, None]
 
     def factor(self, name: str, i: int | Tensor, x: Tensor) -> float | Tensor:
-        """Returns `number` if i is one step for the entire batch, or `at` if i contains B steps."""
+        """Returns `number(name, i)` if i is a single step, or `at(name, i, x)` if i contains B steps."""
         return self.number(name, i) if isinstance(i, int) else self.at(name, i, x)
 
     def respace(self, steps: list[int]) -> "Schedule":
@@ -184,7 +184,7 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
 def timesteps(
     num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace"
 ) -> list[int]:
-    """Selects the diffusion steps that sampling visits.
+    """Selects the diffusion steps to use in sampling.
 
     Args:
         num_train_timesteps: T.
@@ -192,7 +192,7 @@ def timesteps(
         spacing: "linspace" includes both ends and rounds half to even; the code of MDM and FLAME
             calls it "N", following Nichol and Dhariwal 2021. "stride" counts from 0 with the
             smallest integer stride that gives N steps, so the noisiest step may be well below
-            T - 1; their code calls it "ddimN", following Song et al. 2021.
+            T - 1; MDM and FLAME call it "ddimN", following Song et al. 2021.
 
     Returns:
         N increasing steps in the range 0 ... T - 1.

@@ -37,8 +37,8 @@ def blended(denoise: Denoise, windows: Windows) -> Denoise:
         windows: the windows; see `cover`.
 
     Returns:
-        A function (x_t (B, F, D), t (B,), mask (B, F), cond of W windows) -> blended output
-        (B, F, out_features).
+        A function that maps x_t (B, F, D), t (B,), mask (B, F) and the conditions of W windows to
+        the blended output (B, F, out_features).
     """
 
     def blend(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
@@ -62,14 +62,14 @@ def spans(
     not fit into one window is covered by several windows.
 
     Args:
-        lengths: number of frames of each part.
-        longest: maximum number of frames of a window.
+        lengths: number of frames in each part.
+        longest: maximum number of frames in a window.
         overlap: number of frames that neighboring windows share, an even number.
         loop: whether the last part is followed by the first one. Windows may then begin before
             frame 0.
 
     Returns:
-        The index of the part, the first frame and the number of frames of each window.
+        For each window, the index of its part, its first frame and its number of frames.
 
     Example:
         >>> spans([10, 10], longest=16, overlap=4)
@@ -99,13 +99,13 @@ def cover(
     """Returns the frames and weights of windows, without conditions.
 
     The weight of a window rises over the overlap at its start and falls over the overlap at its
-    end. Past its end, a window contains the subsequent frames of the motion, where the last frame is
-    followed by the first one.
+    end. Past its end, a window is padded with the subsequent frames of the motion, where the last
+    frame is followed by the first one.
 
     Args:
         windows: W windows, each given by the index of its motion, its first frame and its number of
             frames.
-        totals: number of frames of each motion.
+        totals: number of frames in each motion.
         overlap: number of frames over which a weight rises or falls.
         width: L, the padded length of the windows.
         device: device of the result.

@@ -140,9 +140,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
         if name not in ("sha256", "digest")
     ]
     if wrong:
-        raise UserError(
-            f"{wrong[0]}: outside the limits for exported models (see docs/export.md)"
-        )
+        raise UserError(f"{wrong[0]}: outside the limits for exported models (see docs/export.md)")
     return content | {"sha256": {}}
 
 

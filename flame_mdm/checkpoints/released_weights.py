@@ -24,8 +24,10 @@ def read_released(
 ) -> Mapping[str, Any]:
     """Reads a released file.
 
-    With `run_code`, the file may also contain pickled objects of classes other than torch's. Reading such objects runs any code in them. Raises `UserError` if the file is damaged or, without `run_code`, if it
-    contains such objects. The error message about these objects ends with `advice`.
+    With `run_code`, the file may also contain pickled objects of classes other than torch's.
+    Reading such objects runs any code in them. Raises `UserError` if the file is damaged or,
+    without `run_code`, if it contains such objects. The error message about these objects ends with
+    `advice`.
     """
     try:
         check_torch(path)

@@ -32,7 +32,10 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Seen:
-    """Response of a metric to a perturbation. A grade of None means that no grade meets the condition."""
+    """Response of a metric to a perturbation.
+
+    `grade` and `outside` are None if there is no such grade.
+    """
 
     # Weakest grade such that, at this and all stronger grades, the paired difference from real
     # motions is not 0
@@ -112,7 +115,7 @@ class CitedCard:
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
         """Returns a sort key, which is larger for cards that fit the evaluated data better.
 
-        The criteria, in order, are: the same length limits, the test split, the same data, and the
+        The criteria are, in this order, equal length limits, the test split, the same data, and the
         number of motions.
         """
         same_frames = self.data.frames == data.frames
@@ -128,7 +131,7 @@ class CitedCard:
 
 
 def card_of(data: Data, sha256: str | None) -> CitedCard | None:
-    """Returns the strongest card of an extractor that fits the evaluated data, or None.
+    """Returns the extractor's card that best fits the evaluated data, or None.
 
     Without an extractor, the card covers the metrics computed from joint positions. Cards are in
     the folder FLAME_MDM_AUDITS (default: runs/audit) and in the repository, where audited.json
@@ -200,7 +203,7 @@ def _section(card: AuditCard) -> dict[str, object]:
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
-    """Returns one row per perturbation, with one cell per metric and card, and with curves by metric."""
+    """Returns one row per perturbation, with a cell per metric and card, and each metric's curves."""
     by_name = [
         {perturbation.name: perturbation for perturbation in card.perturbations} for card in cards
     ]
@@ -251,7 +254,7 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def findings(card: AuditCard) -> list[str]:
-    """Returns sentences about perturbations that metrics miss, or rate better than real motions."""
+    """Returns sentences about perturbations that metrics do not detect, or that improve metrics."""
     table = {
         (perturbation.name, metric): seen(card, perturbation, metric)
         for perturbation in card.perturbations
@@ -327,7 +330,7 @@ def _cell(
 
 
 def _not_computed(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> str:
-    """Returns a phrase that lists the grades at which a metric has no value."""
+    """Returns a phrase that lists the grades for which a metric was not computed."""
     grades = [grade.grade for grade in perturbation.grades if None in grade.values[metric][2:]]
     if None in card.real[metric] or len(grades) == len(perturbation.grades):
         return "not computed"

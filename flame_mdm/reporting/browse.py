@@ -54,7 +54,7 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
-    """Returns the first `SECONDS` seconds of a clip as a motion that is placed on the floor."""
+    """Returns the first `SECONDS` seconds of a clip as a motion placed on the floor."""
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
@@ -94,13 +94,13 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    To make captions unique if possible, a clip with several captions is written with the first one
-    that no earlier clip has.
+    A clip with several captions is written with the first one that no earlier clip uses, so that
+    captions are unique where possible.
 
     Args:
         folder: the folder to write.
         store: the prepared data set.
-        representation: the representation of its features.
+        representation: the representation of the data set's features.
         clips: the clips to write.
         longest: maximum number of frames. Longer clips are cut, as in evaluations.
 

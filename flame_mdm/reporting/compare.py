@@ -88,7 +88,7 @@ def _direct_motions(folder: Path) -> list[Path]:
 
 
 def read_motions(folder: Path) -> dict[Prompt, Motion]:
-    """Reads the motion files in a folder, by prompt."""
+    """Reads the motion files in a folder and returns the motions, keyed by prompt."""
     from flame_mdm.formats.readers import read
 
     numbered: dict[Prompt, Motion] = {}
@@ -105,7 +105,7 @@ def in_all(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
 
 
 def only_runs(compared: Sequence[ComparedRun]) -> dict[str, Run]:
-    """Returns the runs by label, leaving out the folders of motions."""
+    """Returns the runs, keyed by label, without the folders of motions."""
     return {entry.label: entry.run for entry in compared if entry.run is not None}
 
 
@@ -119,8 +119,8 @@ def comparison(
 
     Args:
         compared: runs and folders of motions.
-        shown: the motions of each run and folder, by prompt. The page plays the motions for the
-            prompts that all of them have.
+        shown: the motions of each run and folder, keyed by prompt. The page plays the motions for
+            the prompts that all of them share.
         mesh: the body to draw.
         evidence: function that returns the marks for the timeline of a motion.
     """
@@ -190,7 +190,7 @@ def _player(
     body: Mesh | None,
     evidence: Callable[[Motion], Sequence[Mark]],
 ) -> str:
-    """Returns a player with the motions for the prompts that all runs have, in the order of the first run."""
+    """Returns a player with the motions for the prompts that all runs share, in the first run's order."""
     from flame_mdm.visualize import player_page
 
     scene = [
@@ -234,7 +234,7 @@ def differences(first: Result, second: Result) -> list[list[str]] | str:
 
 
 def _difference(name: str, first: Value | None, second: Value | None) -> list[str]:
-    """Returns cells for the difference second - first, or [] if there are no pairs of values."""
+    """Returns table cells for the difference second - first, or [] if there are no pairs of values."""
     if first is None or second is None or first.n != second.n:
         return []
     count = min(len(first.per_replication), len(second.per_replication))
@@ -266,7 +266,10 @@ def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
-    """Groups results by protocol, data and extractor. Returns run labels and results by title."""
+    """Groups results by protocol, data and extractor.
+
+    Returns the run labels and results, keyed by title.
+    """
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, run in runs.items():
         for result in run.results.values():

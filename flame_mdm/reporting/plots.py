@@ -87,7 +87,7 @@ def chart(
 ) -> Markup:
     """Draws curves over training steps and lists their last finite values.
 
-    `bands` contains the half widths of intervals, by the name of the curve.
+    `bands` maps the names of curves to the half widths of their intervals.
     """
     spread = {
         name: {x: abs(width) for x, width in _finite(curve)}
@@ -183,7 +183,7 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    """Returns the points of a curve by step, without NaN and without values that would overflow."""
+    """Returns the points of a curve, sorted by step, without NaN and values that would overflow."""
     return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]
 
 

@@ -99,7 +99,7 @@ def _chart(run: Run, name: str, families: list[str]) -> Markup:
 
 
 def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
-    """Groups curves into headings and, under each heading, into charts.
+    """Groups curves by heading and, under each heading, by chart.
 
     Curves whose names differ only in their family (`train/loss`, `val/loss`) share a chart.
     """

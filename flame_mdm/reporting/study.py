@@ -63,7 +63,7 @@ class Pair(Schema):
 
     @property
     def share(self) -> tuple[float, float, float]:
-        """Share of the votes for run `a`, with the bounds of its 95 % interval."""
+        """Run `a`'s share of the votes, with the bounds of its 95 % interval."""
         return wilson(self.wins_a, self.votes)
 
 
@@ -87,7 +87,7 @@ def rating_page(
 
     Args:
         compared: two or more runs or folders of motions.
-        shown: the motions of each run, by prompt.
+        shown: the motions of each run, keyed by prompt.
         seed: seed for the order of the pairs, and for the side on which each motion is shown.
         body: the body to draw.
 
@@ -112,7 +112,7 @@ def _pairs(
     draw: random.Random,
     body: Mesh | None,
 ) -> list[dict[str, Any]]:
-    """Returns the questions about two runs: a pair of motions for every prompt that both have."""
+    """Returns the questions about two runs: a pair of motions for every prompt that they share."""
     from flame_mdm.visualize import player_page
 
     (run_a, motions_a), (run_b, motions_b) = first, other

@@ -94,7 +94,7 @@ def adapt(
         base: the model to adapt: a run directory, a .ckpt or .safetensors file, the name of a
             model in this package, or "user/name[@revision]" on the Hugging Face hub.
         source: folder of motions with captions.
-        name: name of the style, one word of letters and digits.
+        name: name of the style, a single word of letters and digits.
         out: run directory. Default: runs/adapt/NAME.
         action: whether the clips show an action that the model does not know, instead of a style.
         full: whether to train all weights. The result is then a model file instead of an adapter.
@@ -234,7 +234,7 @@ def _recipe(
 
 
 def _prior(model: MotionGenerator, root: Path, out: Path, captions: Sequence[str]) -> Path:
-    """Returns the folder of a store with the base model's training data, or with a substitute.
+    """Returns the folder of a store that contains the base model's training data or a substitute.
 
     If `root` does not contain the store of the training data, motions are sampled from the base
     model and stored in a folder in `out`.

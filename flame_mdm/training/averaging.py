@@ -22,7 +22,7 @@ class MovingAverage(WeightAveraging):
         decay: factor from 0 to 1 in average = decay * average + (1 - decay) * weights.
         update_every_n_steps: number of steps between updates of the average.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
-            them. The first update always copies them.
+            them. The first update always copies.
         from_initial_weights: whether the average starts from the weights before the first step, as
             in MDM's code. The first update then averages instead of copying.
     """
@@ -56,7 +56,7 @@ class MovingAverage(WeightAveraging):
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of the model and the average once, because this takes time."""
+        """Collects the parameters of the model and of the average once, because collecting takes time."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
@@ -68,7 +68,7 @@ class MovingAverage(WeightAveraging):
         )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Copies the initial weights before the first step, after pretraining or a teacher has set them."""
+        """Copies the initial weights, which pretraining or a teacher may have set, before the first step."""
         if self.from_initial_weights and not self.begun:
             self._copy_weights()
             self.begun = True

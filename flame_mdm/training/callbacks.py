@@ -53,7 +53,7 @@ Values = Mapping[str, float]  # values by metric, or by metric/part
 
 
 class Interrupted(Exception):
-    """Raised after a signal stopped training at the end of a step and a checkpoint was written."""
+    """Raised when a signal has stopped training at the end of a step, after writing a checkpoint."""
 
     def __init__(self, signum: int, step: int):
         super().__init__(f"{signal.Signals(signum).name} at step {step}")
@@ -119,7 +119,7 @@ class Checkpoints(Checkpoint):
 
 
 class Measurements(Callback):
-    """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps` steps.
+    """Logs the gradient norm, learning rate and speed every `trainer.log_every_n_steps` steps.
 
     The values that the task reports are logged at the same steps, and no other step is slowed down.
     The norm of all gradients is measured before clipping. Seconds per step exclude validation.
@@ -324,7 +324,8 @@ def are_same(motions: Sequence[Motion]) -> bool:
     """Returns whether motions differ by less than `SAME`, as if the network ignored its input.
 
     If the learning rate is too high, the network may learn to return the same pose for all prompts
-    and noise. Its loss is finite and even decreases slightly, so curves do not show the failure.
+    and noise. Its loss is finite and even decreases slightly, so the curves do not reveal the
+    failure.
     """
     if len(motions) < 2:
         return False
@@ -343,10 +344,10 @@ class SampleMotions(Callback):
             and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None =
             `UNCONDITIONED` motions without prompts. If a model is conditioned on actions and no
-            prompt is an action, its first actions are used instead.
+            prompt is an action, the model's first actions are used instead.
         seconds: length of the motions in seconds.
-        metrics: torchmetrics metrics by name. Their `update` takes some of these arguments: joints
-            (B, F, J, 3), mask (B, F), keys, requested.
+        metrics: torchmetrics metrics, keyed by name. Their `update` methods take some of these
+            arguments: joints (B, F, J, 3), mask (B, F), keys, requested.
     """
 
     def __init__(
@@ -466,7 +467,7 @@ class SampleMotions(Callback):
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
         """Computes all metrics for up to `REAL` training clips.
 
-        Only clips labeled with the attributes that all prompts request are used.
+        Only clips that are labeled with all attributes common to the prompts are used.
         """
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]
@@ -485,7 +486,7 @@ class SampleMotions(Callback):
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
-        """Computes all metrics for motions (F, J, 3) in meters. Metrics without a value are left out."""
+        """Returns all metrics for motions (F, J, 3) in meters, except those that cannot be computed."""
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()

@@ -1,4 +1,4 @@
-"""Atomic checkpoints, and resuming from them.
+"""Writes checkpoints atomically, and resumes from them.
 
 A run directory may come from an untrusted source. Therefore, reading a checkpoint never runs code
 and takes no more memory than the size of the file, and only files in the checkpoint folder are
@@ -161,7 +161,7 @@ def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Itera
 
 
 def _is_alike(value: Any, usual: Any) -> bool:
-    """Returns whether a saved option of an optimizer has the same type as the usual value."""
+    """Returns whether a saved option of an optimizer has the same type as its usual value."""
     if isinstance(usual, bool) or usual is None:
         return value is None or isinstance(value, bool)
     if isinstance(usual, int | float):
@@ -175,9 +175,9 @@ def _is_alike(value: Any, usual: Any) -> bool:
 
 
 def _is_state(value: Any, weight: Tensor) -> bool:
-    """Returns whether a saved value can be the state of a weight.
+    """Returns whether a saved value can belong to the optimizer state of a weight.
 
-    A state is a number, or a tensor that is no larger than the weight.
+    Such a value is a number, or a tensor that is no larger than the weight.
     """
     if isinstance(value, Tensor):
         return value.numel() <= max(1, weight.numel()) and not value.dtype.is_complex
@@ -205,7 +205,7 @@ def _check_version(version: Any, path: Path) -> None:
 
 
 def _tensors(content: Any, name: str) -> Iterator[tuple[str, Tensor]]:
-    """Yields all tensors in nested mappings and lists, with the keys that lead to them."""
+    """Yields all tensors in nested mappings and lists, each with the keys that lead to it."""
     if isinstance(content, Tensor):
         yield name, content
     elif isinstance(content, dict | list | tuple):

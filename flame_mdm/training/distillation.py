@@ -1,5 +1,5 @@
 # pyright: standard
-"""Distillation: trains models that take one to four steps, from a teacher that takes more."""
+"""Distillation: trains models that sample in one to four steps, using a teacher that takes more."""
 
 import copy
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Training of a recipe: assembles data, task, callbacks and trainer, and handles errors."""
+"""Trains a recipe: assembles data, task, callbacks and trainer, and handles errors."""
 
 import logging
 import os

@@ -35,8 +35,8 @@ class TrainingMemory:
         parameters: number of weights of the denoiser.
         state: weights, gradients, both states of Adam and, if the recipe averages weights, the
             average. Their size does not depend on the batch size.
-        activations: tensors that the backward pass needs, for the batch with the longest motions.
-            In bfloat16, they take about half of this memory.
+        activations: tensors that the backward pass needs, for a batch of the longest motions.
+            In bfloat16, they take about half as much memory.
         recomputed: the same as `activations`, but with `task.checkpoint_activations=true`.
     """
 
@@ -123,7 +123,7 @@ def _fused_attention(query: Tensor, key: Tensor, value: Tensor, **_: Any) -> Ten
 
 
 class _FusedAttention(torch.autograd.Function):
-    """Saves what a fused attention kernel saves: inputs and result, but no attention weights."""
+    """Saves the inputs and the result, but no attention weights, like a fused attention kernel."""
 
     @staticmethod
     def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Skips work that Lightning does in every step although this framework does not need it.
 
-A step of a small network takes about 2 ms, a third of which is Lightning's bookkeeping. During this
-time, a GPU waits for the host.
+A training step of a small network takes about 2 ms. A third of this time is Lightning's
+bookkeeping, during which a GPU waits for the host.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -24,7 +24,8 @@ STEP_HOOKS = (
 class NoProfiler(PassThroughProfiler):
     """Profiler that measures nothing.
 
-    Lightning's equivalent enters a generator for each of about 100 measured parts of a step.
+    Lightning's equivalent enters a generator for each of the roughly 100 parts of a step that it
+    measures.
     """
 
     nothing: AbstractContextManager[Any] = nullcontext()
@@ -37,7 +38,7 @@ class NoProfiler(PassThroughProfiler):
 def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
     """Sets hooks that do nothing to None, so that Lightning does not call them in every step.
 
-    There are six hooks per step, most of which callbacks do not override. Calling a hook takes
+    There are six hooks per step, and callbacks do not override most of them. Calling a hook takes
     longer than many of torch's operations.
     """
     owners: list[tuple[object, type]] = [(task, LightningModule)]

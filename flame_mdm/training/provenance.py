@@ -55,7 +55,8 @@ class WriteProvenance(Callback):
                 kind for name, kind in kinds.items() if getattr(before, name) != facts[name]
             ]:
                 say(
-                    f"resuming with different {' and '.join(different)}: results may differ from an uninterrupted run"
+                    f"resuming with different {' and '.join(different)}: results may differ from those of "
+                    "an uninterrupted run"
                 )
         write_json(folder / PROVENANCE, facts)
         for logger in trainer.loggers:
@@ -99,7 +100,7 @@ def device_name(trainer: Trainer) -> str:
 def environment() -> dict[str, Any]:
     """Returns the command, code version, machine and package versions.
 
-    Every run and every result records them.
+    They are recorded with every run and every result.
     """
     return {
         "command": sys.argv,

@@ -33,7 +33,7 @@ FREE = (
 def train(config: Config) -> None:
     """Trains the composed experiment, or resumes the run in its directory.
 
-    An interruption raises `SystemExit`.
+    Raises `SystemExit` if training is interrupted.
     """
     folder = Path(config["run"]["dir"])
     if (folder / "config.yaml").exists():

@@ -258,7 +258,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 def _numbers(result: Result) -> str:
     """Returns a sentence with the numbers of motions and replications behind most values.
 
-    The number of real motions is added if it is different.
+    The number of real motions is added if it differs.
     """
     values = [value for value in (result.values or {}).values() if value and value.replications]
     if not values:
@@ -344,7 +344,7 @@ def _line(
 
 
 def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
-    """Returns the numbers of replications and motions of most metrics, and then the exceptions."""
+    """Describes the numbers of replications and motions for most metrics, and then the exceptions."""
     counts = {}
     for result, name in zip(results, values, strict=True):
         entry = (result.values or {}).get(name) if result else None
@@ -390,7 +390,7 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 
 
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
-    """Formats the numbers of each column with the same number of decimals.
+    """Formats all numbers in a column with the same number of decimals.
 
     The largest number gets about three digits. Settings with at most one decimal are shown
     unchanged, and numbers that would be rounded to zero are shown with two significant digits.
@@ -419,7 +419,7 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
 
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
-    """Marks the best and second-best values among rows of the same kind with the same footnotes."""
+    """Marks the best and second-best values among rows that have the same kind and footnotes."""
     for kind, real in (("measured", "real"), ("reported", "reported real")):
         for marks in {line.marks for line in lines}:
             same = [x for x in lines if x.marks == marks]

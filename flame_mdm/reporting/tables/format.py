@@ -286,7 +286,7 @@ def draw(part: Part, figure: Figure) -> Markup | None:
 
 
 def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:
-    """Returns the points of a column by row, and the column's values for real motions."""
+    """Returns a column's points as one series per row, and the column's values for real motions."""
     index = list(part.columns).index(column)
     curves: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     levels = []

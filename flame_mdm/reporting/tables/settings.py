@@ -16,7 +16,7 @@ HYPERPARAMETERS = LABELS["hyperparameters"]
 
 @cache
 def hyperparameters(name: str) -> dict[str, Any]:
-    """Returns the `HYPERPARAMETERS` of a recipe by key.
+    """Returns the `HYPERPARAMETERS` of a recipe, keyed by name.
 
     Unset keys get the default values of their class.
     """

@@ -129,7 +129,7 @@ def as_list(value: Any) -> list[Any]:
 
 
 class Figure(ClosedSchema):
-    """A plot of a part's columns over an option of its rows: curves or, with `points`, dots."""
+    """A plot of a part's columns against an option of its rows: curves or, with `points`, dots."""
 
     part: str
     x: str
@@ -172,7 +172,7 @@ class Lengths(Schema):
 
 
 def spec_names() -> list[str]:
-    """Returns the sorted names of this project's tables. Numbers in names are sorted as numbers."""
+    """Returns the sorted names of this project's tables. Numbers in names are sorted numerically."""
     names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
     return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 
@@ -211,7 +211,7 @@ def load_mapping(path: Path) -> Config:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An evaluation for a table: the label of its row, and its keys for `flame-mdm evaluate`."""
+    """An evaluation for a table: its row label, and its keys for `flame-mdm evaluate`."""
 
     label: str
     keys: Mapping[str, Any]
@@ -233,7 +233,7 @@ class Evaluation:
 
     @property
     def absent(self) -> dict[str, str]:
-        """The missing files, by the reason that the table shows, such as "no checkpoint"."""
+        """The missing files, keyed by the reason that the table shows, such as "no checkpoint"."""
         files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
         paths = {reason: str(self.keys.get(key) or "none") for reason, key in files.items()}
         return {

@@ -3,8 +3,8 @@
 A weight W of shape (out, in) in an attention or feed-forward layer becomes W + strength * up down,
 where `up` has shape (out, rank) and `down` has shape (rank, in) (Hu et al. 2021, arXiv:2106.09685).
 In a learned text encoder, a vector is added to the row of each new word. During training,
-`torch.nn.utils.parametrize` computes the changed weights, so that even code that reads a weight
-without calling its layer, such as cross-attention, uses them.
+`torch.nn.utils.parametrize` computes the changed weights. They therefore also affect code that
+reads a weight without calling its layer, such as cross-attention.
 
 All layers are trained, but a style keeps only the changes in the second half of the layers. Changes
 in the first half would bias the model toward the few actions in the clips, and it would no longer
@@ -141,7 +141,7 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
 
 
 def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[int, int]:
-    """Copies the trained weights of another model whose names and shapes match.
+    """Copies those trained weights of another model that match in name and shape.
 
     The statistics of the features are not copied, since they belong to the data.
 

@@ -20,7 +20,7 @@ SHIPPED = {
 
 
 def find(source: str | Path, which: Which = "last") -> Path:
-    """Returns the file of a model. Raises `FileNotFoundError` or `UserError` if there is no such file.
+    """Returns the path of a model file. Raises `FileNotFoundError` or `UserError` if there is no such file.
 
     `source` is a file; a run directory, in which `which` names the checkpoint; a folder with one
     .safetensors file; the name of a model in this package; or "user/name[@revision]" on the

@@ -1,8 +1,8 @@
 """File formats of models: training checkpoints (.ckpt) and model files (.safetensors).
 
 A model file contains the (averaged) weights, including the statistics of the features, but no code.
-Its metadata has two keys. `flame_mdm` is JSON with the recipe, the metadata of the data set and the
-origin of the weights. `sha256` is the hash of this JSON text and the weights.
+Its metadata has two keys. `flame_mdm` contains the recipe, the metadata of the data set and the
+origin of the weights as JSON. `sha256` is the hash of this JSON text and the weights.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the SHA-256 of a file's weights, the same for a checkpoint and its model file."""
+    """Returns the SHA-256 of a file's weights, which is the same for a checkpoint and its model file."""
     return state_sha256(read_checkpoint(path)["state_dict"])
 
 

@@ -147,7 +147,8 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 def root_units(representation: HumanML) -> list[list[float]]:
     """Returns the mean and standard deviation of each of the first three features.
 
-    These are the turn of the root in radians, and its movements to the left and forward in meters.
+    These features are the turn of the root in radians, and its movements to the left and forward in
+    meters.
     """
     scale = representation.mean.new_ones(3)
     scale[0] = representation.turn_unit

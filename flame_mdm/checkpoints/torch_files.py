@@ -101,7 +101,7 @@ PLAIN = (*CONTAINERS, "_codecs.encode", "builtins.bytearray", "builtins.complex"
 
 
 class _KeyCheck(pickle._Unpickler):
-    """Reads a pickle like PyTorch's restricted reader, without keeping the content of containers."""
+    """Reads a pickle as PyTorch's restricted reader does, without keeping the content of containers."""
 
     stack: list[Any]
     append: Callable[[Any], None]
@@ -111,7 +111,7 @@ class _KeyCheck(pickle._Unpickler):
         super().__init__(file, encoding="bytes")
 
     def passes(self) -> bool:
-        """Returns whether the pickle was read to its end, that is, without a refused object."""
+        """Returns whether the pickle was read to its end, that is, contains no refused object."""
         try:
             self.load()
         except _Refused:

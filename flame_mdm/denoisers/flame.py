@@ -33,8 +33,8 @@ class FLAME(Denoiser):
             transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
         condition_frames: whether to also add TS and CLS to every frame. A small network then learns
             to follow the text in fewer training steps.
-        length_unit: number of frames; ML embeds the length rounded down to a multiple of it,
-            because the lengths of training windows are such multiples.
+        length_unit: unit of the embedded length, in frames. ML embeds the length rounded down to a
+            multiple of this unit, because the lengths of training windows are such multiples.
 
     Example:
         >>> denoiser = FLAME(

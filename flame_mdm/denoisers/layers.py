@@ -28,7 +28,7 @@ def with_prefix(mask: Tensor, prefix: int) -> Tensor:
 
 
 class Attention(nn.Module):
-    """Multi-head attention from x to x itself or to a memory (Vaswani et al. 2017, section 3.2.2).
+    """Multi-head attention from x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
     As in the released weights, query, key and value share one matrix (3C, C), so that
     self-attention needs only one projection.
@@ -163,9 +163,9 @@ class Transformer(nn.Module):
 class TimeAndCondition(nn.Module):
     """Embedding of time and condition, the token z_tk of MDM (Tevet et al. 2023, section 3).
 
-    The embedding is the sinusoid of the time after two linear layers, plus the projected condition.
-    The null condition is a zero vector *before* the projection, so that only the bias of the
-    projection remains.
+    The embedding is the time's sinusoid, passed through two linear layers, plus the projected
+    condition. The null condition is a zero vector *before* the projection, so that only the bias of
+    the projection remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):

@@ -127,7 +127,7 @@ class MDMDecoder(Denoiser):
             "concat" places it before them as a separate token.
         mask_padding: whether to mask the padding in attention. In the released models without
             `mask_frames`, frames attend to the padding.
-        context_frames: number of clean frames before the motion, in `Condition.prefix`.
+        context_frames: number of clean frames that precede the motion; see `Condition.prefix`.
         target_encoder: network that embeds `Condition.target`. Its output is added to the time
             embedding. "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".

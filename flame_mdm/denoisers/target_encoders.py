@@ -1,4 +1,4 @@
-"""Encoders of target conditions: where joints should be at the end of a motion.
+"""Encoders of target conditions, which state where joints should be at the end of a motion.
 
 Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) contains one slot per joint. Each slot
 contains x, y, z, and a flag, which is 1 if the joint is requested and 0 if it is free.
@@ -20,8 +20,8 @@ SLOTS = 8
 class TargetEncoder(nn.Module, ABC):
     """Embeds the target of a condition as vectors (B, features). Without a target, the embedding is 0.
 
-    A target that requests no joint is not the same as no target, because its embedding contains the
-    biases of the network.
+    A target that requests no joints is not equivalent to no target, because its embedding contains
+    the biases of the network.
 
     Example:
         >>> encoder = SingleTarget(features=16, layers=1)
@@ -77,8 +77,8 @@ class SplitTarget(TargetEncoder):
 class MultiTarget(TargetEncoder):
     """Embeds each slot with a separate network, and returns a weighted sum over requested slots.
 
-    The weights are learned. As in the authors' code, they are divided by their sum over all slots,
-    which may be near 0. `layers` has no effect.
+    The learned weights are divided by their sum over all slots, which may be near 0, as in the
+    authors' code. `layers` has no effect.
     """
 
     def __init__(self, features: int, layers: int):

@@ -19,7 +19,7 @@ from flame_mdm.errors import UserError
 
 
 class MDMUNet(Denoiser):
-    """U-Net over time, for motions of any length. The features of a frame are channels.
+    """U-Net over time, for motions of any length. The features of a frame are its channels.
 
     Padding does not affect real frames. Padded frames are set to 0 before every convolution, as if
     the motion ended there, and are excluded from the normalization statistics. A frame of a coarser

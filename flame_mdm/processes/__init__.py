@@ -205,7 +205,7 @@ class Process(nn.Module, ABC):
     def check_edit(self, edit: Edit, mask: Tensor, options: SamplerOptions) -> None:
         """Raises `UserError` if this process or the sampler does not support an edit.
 
-        The same error is raised if the shape of the edit differs from the shape of the motions.
+        The same error is raised if the edit and the motions have different shapes.
         """
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)

@@ -22,9 +22,9 @@ class FlowMatching(Process):
     Args:
         sigma_min: standard deviation of the noise that remains at t = 1 (Lipman et al. 2023, eq.
             20-23).
-        prediction: what the denoiser predicts: the velocity of the path ("velocity", as in MFM), or
-            the clean motion ("x0"), from which the velocity is computed. A network whose layers are
-            narrower than the motion features cannot represent the noise in the velocity.
+        prediction: what the denoiser predicts, either the velocity of the path ("velocity", as in
+            MFM) or the clean motion ("x0"), from which the velocity is computed. A network whose
+            layers are narrower than the motion features cannot represent the noise in the velocity.
         time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal",
             the logistic function of a normal variable, which favors times in the middle (Esser et
             al. 2024, eq. 19).
@@ -91,9 +91,9 @@ class FlowMatching(Process):
         return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """See `Process.to_x0`. The result is exact.
+        """See `Process.to_x0`. Unlike in MFM's code, the result is exact.
 
-        MFM's code instead computes x_t + (1 - t) u, which retains sigma_min times the noise.
+        MFM's code computes x_t + (1 - t) u, which retains sigma_min times the noise.
         """
         if self.prediction == "x0":
             return output

@@ -108,7 +108,7 @@ def steer(
 
     Each step follows the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior
     sampling"), so the entire body moves with the joints in a way that is plausible to the
-    denoiser. The step has Polyak's length, but at most `STEERING_LIMIT`.
+    denoiser. The step length follows Polyak's rule and is limited by `STEERING_LIMIT`.
 
     Args:
         clean: function that returns the clean estimate (B, F, D) of a noisy motion.

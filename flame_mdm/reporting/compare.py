@@ -80,7 +80,7 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
 
 
 def _direct_motions(folder: Path) -> list[Path]:
-    """Returns the sorted motion files directly in a folder, except hidden files."""
+    """Returns the motion files directly inside a folder, sorted and without hidden files."""
     files = (
         path for path in folder.iterdir() if path.suffix.lower() in ENDINGS and path.name[0] != "."
     )
@@ -212,7 +212,7 @@ EXPLAINED = (
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
-    """Returns rows for `HEAD` with the differences in all metrics, or the reason for their absence.
+    """Returns rows for `HEAD` with the differences in all metrics, or the reason why there are none.
 
     Both results must come from the same evaluation: the same protocol, data and extractor.
     """

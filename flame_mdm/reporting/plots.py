@@ -43,7 +43,7 @@ class Series:
 
 @dataclass
 class Histogram:
-    """Histogram of motion lengths. The first bar is for 0 to `step` frames."""
+    """Histogram of motion lengths. The first bar covers 0 to `step` frames."""
 
     step: int
     counts: Sequence[int]
@@ -53,7 +53,7 @@ class Histogram:
 class Panel:
     """A pair of axes with labels.
 
-    The x-axis may be logarithmic or begin at 0. `levels` are the values of horizontal lines.
+    The x-axis may be logarithmic or begin at 0. `levels` are the y-values of horizontal lines.
     """
 
     content: Sequence[Series] | Histogram

@@ -96,7 +96,7 @@ def adapt(
         source: folder of motions with captions.
         name: name of the style, a single word of letters and digits.
         out: run directory. Default: runs/adapt/NAME.
-        action: whether the clips show an action that the model does not know, instead of a style.
+        action: whether the clips show an action that is new to the model, rather than a style.
         full: whether to train all weights. The result is then a model file instead of an adapter.
         force: whether to accept clips that drift upward or float.
         rank: rank of the low-rank updates of the weights, at least 1. Increase it for motions that

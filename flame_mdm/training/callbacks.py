@@ -122,7 +122,8 @@ class Measurements(Callback):
     """Logs the gradient norm, learning rate and speed every `trainer.log_every_n_steps` steps.
 
     The values that the task reports are logged at the same steps, and no other step is slowed down.
-    The norm of all gradients is measured before clipping. Seconds per step exclude validation.
+    The norm of all gradients is measured before clipping. The seconds per step do not include
+    validation.
 
     Adds `facts.training` to checkpoints: `hours` (duration of training so far, including
     validation), `processes` (their number), `device`, `speed`, `precision`, and `memory_gib` (the

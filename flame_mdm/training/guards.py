@@ -73,7 +73,7 @@ class BadLoss(Callback):
         batch: MotionBatch,
         batch_idx: int,
     ) -> None:
-        """Stores the loss of the batch on its device. Checks all losses at the log interval."""
+        """Stores the loss of the batch on its device. Checks all losses once per log interval."""
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]

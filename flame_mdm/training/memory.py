@@ -1,4 +1,4 @@
-"""Memory that training requires, computed from a recipe without allocating the network."""
+"""Computes the memory that training a recipe requires, without allocating the network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

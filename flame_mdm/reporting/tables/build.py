@@ -256,7 +256,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Returns a sentence with the numbers of motions and replications behind most values.
+    """Returns a sentence with the numbers of motions and replications on which most values are based.
 
     The number of real motions is added if it differs.
     """

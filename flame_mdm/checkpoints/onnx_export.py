@@ -60,8 +60,8 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
         adapted: adapters to merge into the weights, and their strengths, as in `flame_mdm.load`.
 
     Raises:
-        UserError: As in `flame_mdm.load`, and if a part cannot be exported, or if the outputs of a
-            graph differ from PyTorch's.
+        UserError: For the same reasons as in `flame_mdm.load`, if a part cannot be exported, or if
+            the outputs of a graph differ from PyTorch's.
     """
     try:
         import onnxruntime  # noqa: F401

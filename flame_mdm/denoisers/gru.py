@@ -25,7 +25,7 @@ class MDMGRU(Denoiser):
             embedding.
         recur_over_batch: whether to recur from sample to sample instead of from frame to frame, as
             MDM's released code does because its axes are swapped. This option is only for
-            reproduction: results then depend on the order of the samples in the batch.
+            reproduction, because results then depend on the order of the samples in the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

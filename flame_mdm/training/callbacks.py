@@ -126,8 +126,8 @@ class Measurements(Callback):
     validation.
 
     Adds `facts.training` to checkpoints: `hours` (duration of training so far, including
-    validation), `processes` (their number), `device`, `speed`, `precision`, and `memory_gib` (the
-    peak memory of tensors on CUDA, and of the first process on other devices).
+    validation), `processes` (number of processes), `device`, `speed`, `precision`, and `memory_gib`
+    (peak memory: of tensors on CUDA, of the first process on other devices).
     """
 
     def __init__(self) -> None:
@@ -341,14 +341,14 @@ class SampleMotions(Callback):
     Args:
         folder: folder of the samples. The samples of each step are in a subfolder such as
             `step_0001000`.
-        every_n_steps: minimum number of steps between samples, which are generated at validation
-            and after training.
+        every_n_steps: minimum number of steps between samples. Samples are generated when the model
+            is validated, and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None =
             `UNCONDITIONED` motions without prompts. If a model is conditioned on actions and no
             prompt is an action, the model's first actions are used instead.
         seconds: length of the motions in seconds.
-        metrics: torchmetrics metrics, keyed by name. Their `update` methods take some of these
-            arguments: joints (B, F, J, 3), mask (B, F), keys, requested.
+        metrics: torchmetrics metrics, keyed by name. Their `update` methods take some of the
+            arguments joints (B, F, J, 3), mask (B, F), keys and requested.
     """
 
     def __init__(
@@ -468,7 +468,7 @@ class SampleMotions(Callback):
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
         """Computes all metrics for up to `REAL` training clips.
 
-        Only clips that are labeled with all attributes common to the prompts are used.
+        Uses only clips that are labeled with every attribute that all prompts request.
         """
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]

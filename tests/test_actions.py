@@ -192,7 +192,7 @@ def test_another_humanact12_file_is_named(tmp_path: Path, subtests):
             path = write_humanact12(tmp_path / f"raw{k}", 1 + ("equal" in message), **changed)
             with pytest.raises(ValueError, match=message):
                 write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
-    with pytest.raises(ValueError, match="it contains list"):
+    with pytest.raises(ValueError, match="but contains list"):
         HumanAct12(str(written(tmp_path / "humanact12poses.pkl", [1]))).count()
     with pytest.raises(
         FileNotFoundError, match=r"no humanact12poses\.pkl; the data set is published with ACTOR"

@@ -479,7 +479,7 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path, subtests):
     absent, texts = "openai/clip-not-here", batch_of(CAPTIONS)
     cases = [
         (lambda: LearnedTokens(16, heads=2)(batch_of()), "no captions"),
-        (lambda: ActionLabels(4, 2)(batch_of()), "Choose data with labels"),
+        (lambda: ActionLabels(4, 2)(batch_of()), "Choose a data set with labels"),
         (lambda: encoder("some/model")(batch_of()), "some/model: this batch has no captions"),
         (lambda: ActionLabels(4, 0), "action labels"),
         (lambda: encoder(models["bert"])(texts), rf"features=4 .* Set condition\.features={WIDTH}"),

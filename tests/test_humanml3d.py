@@ -269,7 +269,7 @@ def motion(folder, name="000001"):
             lambda f: np.save(motion(f), np.zeros((3, 4, 5))),
             r"000001\.npy: expected .*, but found shape \(3, 4, 5\)",
         ),
-        (lambda f: np.save(f / "Std.npy", np.zeros(263)), "is not a positive standard deviation"),
+        (lambda f: np.save(f / "Std.npy", np.zeros(263)), "a positive standard deviation"),
         (
             lambda f: (f / "test.txt").write_text("000000\n"),
             r"test\.txt: 000000 is also in train\.txt",

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from support.stores import OwnClips, clip
 
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.data.bandai import Bandai
 from flame_mdm.data.cmu import CMU
 from flame_mdm.data.folder import MOST_COPIES, Folder
@@ -194,3 +196,24 @@ def test_actions_of_a_mixture_are_matched_by_name(people: Path):
     assert source.actions == ("walk", "jump", "crawl")
     assert [labels[f"{name}{k}"] for name in ("one", "two") for k in range(2)] == [0, 1, 2, 0]
     assert labels["one without"] is None
+
+
+def test_training_on_an_unprepared_folder_knows_the_actions_of_its_clips(
+    people: Path, tiny: list[str], tmp_path: Path
+):
+    line = [
+        *(word for word in tiny if not word.startswith("data.")),
+        "data=folder",
+        "data.name=people",
+        f"data.source.path={people}",
+        f"data_root={tmp_path / 'data'}",
+        "data.batch_size=2",
+        "data.crop.min_frames=8",
+        "callbacks.samples=null",
+        "callbacks.best=null",
+        "trainer.limit_val_batches=0",
+        "trainer.max_steps=1",
+    ]
+    assert main(["train", "quickstart", *line]) == 0
+    checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert set(checkpoint["facts"]["actions"]) == {"walk", "dance"}

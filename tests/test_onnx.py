@@ -127,7 +127,7 @@ def test_a_plan_leads_to_the_motion_of_the_sampler(subtests) -> None:
     for process, sampler, says in (
         (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
         (FlowMatching(), "rk4", "combines more than two"),
-        (FlowMatching(), "dopri5", "dopri5 cannot edit"),
+        (FlowMatching(), "dopri5", "dopri5 does not support edits"),
         (FlowMatching(), "ddim", "unknown sampler"),
     ):
         with subtests.test(sampler=sampler, says=says), pytest.raises(UserError, match=says):

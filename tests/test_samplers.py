@@ -614,7 +614,7 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
         ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a flow takes equal steps"),
         (
             {"sampler": "euler", "spacing": "stride"},
-            "spacing=stride: the sampler euler has no such",
+            "spacing=stride: the sampler euler does not support this option",
         ),
         ({"sampler": "euler", "edit": {"mode": "x_t"}}, "trajectory, x0"),
         (

@@ -142,7 +142,7 @@ def test_parts_have_their_durations_or_as_many_frames_as_fit_into_a_window(
 @pytest.mark.parametrize(
     ("model", "seconds", "usual", "message"),
     [
-        (sized(20, 60), [None], 1.4, "0.05 seconds .1 frames. are too short"),
+        (sized(20, 60), [None], 1.4, "0.05 seconds .1 frames. is too short"),
         (sized(20, 60), [None], 61.0, "trained on motions of up to 3 seconds"),
         (sized(20, 60), [2.0, 0.45], None, "a part of 0.45 seconds is too short. .* at least 0.5"),
         (sized(20, 60), [300, 300.1], None, "600.1 seconds is too long. Use at most 600 seconds"),
@@ -255,7 +255,7 @@ def test_bad_requests_give_one_clear_line(model, subtests):
             {"after": "walk.npz", "targets": "path.json"},
             r"^after=walk\.npz: .* cannot be combined with targets\.",
         ),
-        ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Use a \.npz"),
+        ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Use a file of type \.npz"),
         ("walks", {"seed": 0.5}, "seed=0.5: expected a whole number"),
         ("walks", {"actions": "walk"}, "texts and actions cannot be combined"),
         ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),

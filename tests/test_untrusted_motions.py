@@ -261,11 +261,11 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
         for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):
             yield member(TAKE, 0, kind, target) + bytes(1024), "a link"
     yield member(TAKE, 0, tarfile.FIFOTYPE) + bytes(1024), "special file"
-    yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header has"
-    yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header has"
+    yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header is"
+    yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header is"
     for kind, values, says in (
         (tarfile.XGLTYPE, 200, "not a BVH file"),
-        (tarfile.XHDTYPE, 10_000, "a header has"),
+        (tarfile.XHDTYPE, 10_000, "a header is"),
     ):
         records = b"".join(
             b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values)

@@ -12,7 +12,7 @@ from support.motions import degrees, frames_array, posed, sway
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import body as body_module
-from flame_mdm.formats.body import fit_body
+from flame_mdm.formats.body import fit_body, proportions
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.people import HEADS, load_body
 from flame_mdm.formats.posture import _toes
@@ -61,6 +61,7 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor(s
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     solved = Motion(motion.joints, 20)
     assert fit_body(solved).skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
+    np.testing.assert_array_equal(drawn.joints[0], 0)
     # A rigid bone maps both its ends to joints
     moves = (drawn.turns[0, :22] @ drawn.joints[..., None])[..., 0]
     for parent, joint in SMPL22.edges:
@@ -71,6 +72,50 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor(s
                 + drawn.turns[0, parent] @ drawn.joints[joint]
             )
             assert np.linalg.norm(end - drawn.starts[0, joint]) < 1e-4, SMPL22.joints[joint]
+
+
+@pytest.mark.parametrize(
+    ("bones", "part", "sizes"),
+    [
+        (["neck"], "spine3", (1, 1.2, 1)),  # the neck ends the chest, not a collarbone
+        (["spine1"], "pelvis", (1, 1.2, 1)),  # the spine ends the pelvis, not a hip
+        (["left_collar", "right_collar"], "spine3", (None, 1, 1)),
+        (["left_hip", "right_hip"], "pelvis", (1.2, 1, 1)),
+        (["head"], "neck", (1, 1.2, 1)),
+    ],
+)
+def test_parts_of_the_trunk_are_as_tall_as_their_bone_and_as_wide_as_the_hips_and_shoulders(
+    bones: list[str], part: str, sizes: tuple[float | None, ...]
+):
+    offsets = mannequin().rest.copy()
+    usual, wide = proportions(mannequin(), offsets)
+    np.testing.assert_allclose(usual, np.tile(np.eye(3), (22, 1, 1)), atol=1e-6)
+    assert wide == pytest.approx(1)
+    offsets[[JOINT[bone] for bone in bones]] *= 1.2
+    fit, wide = proportions(mannequin(), offsets)
+    assert wide == pytest.approx(1)  # limbs alone determine the width
+    along = mannequin().rest[JOINT[bones[0]]]
+    for axis, size in enumerate(sizes):
+        if size is not None and part != "neck":
+            assert fit[JOINT[part]][axis, axis] == pytest.approx(size), axis
+    if part == "neck":
+        np.testing.assert_allclose(fit[JOINT[part]] @ along, 1.2 * along, atol=1e-6)
+
+
+def test_a_limb_is_stretched_along_its_bone_and_as_thick_as_all_limbs():
+    offsets = mannequin().rest.copy()
+    knee = JOINT["left_knee"]
+    limbs = [JOINT[f"{s}_{n}"] for s in ("left", "right") for n in ("knee", "ankle", "elbow", "wrist")]
+    lengths = np.linalg.norm(offsets[limbs], axis=1)
+    offsets[knee] *= 1.5
+    fit, wide = proportions(mannequin(), offsets)
+    extra = 0.5 * np.linalg.norm(mannequin().rest[knee])
+    assert wide == pytest.approx(1 + extra / lengths.sum())
+    along = mannequin().rest[knee]
+    across = np.cross(along, [0, 0, 1])
+    thigh = fit[JOINT["left_hip"]]
+    np.testing.assert_allclose(thigh @ along, 1.5 * along, atol=1e-9)
+    np.testing.assert_allclose(thigh @ across, wide * across, atol=1e-9)
 
 
 def test_a_twisted_wrist_turns_the_forearm_by_degrees_toes_bend_and_the_head_is_level():

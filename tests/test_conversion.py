@@ -17,7 +17,7 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.rifke import Rifke
 from flame_mdm.representations.rot6d import Rot6D
-from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.reading import read_motion, with_features
 
@@ -79,6 +79,16 @@ def test_rotations_are_resampled_on_the_sphere():
     bones = np.linalg.norm(encoded[:, 18] - encoded[:, 16], axis=1)
     np.testing.assert_allclose(bones, bones[0], atol=1e-5)
     np.testing.assert_allclose(encoded[::2, :22], turning.joints, atol=1e-4)
+
+
+def test_hands_of_24_joints_are_left_out_of_rotations_and_errors():
+    body = Motion(synthetic("kick").joints, 20)
+    ends = body.joints[:, 20:] + np.array([[0.08, 0, 0], [-0.08, 0, 0]])
+    hands = Motion(np.concatenate([body.joints, ends], 1), 20, SKELETONS["smpl24"])
+    expected, raw = raw_motion(body, SMPL(20.0)), raw_motion(hands, SMPL(20.0))
+    assert torch.equal(raw.values, expected.values)
+    assert (raw.note, raw.error) == (expected.note, expected.error)
+    assert 0 < raw.error < 0.04
 
 
 def test_joints_of_kit_are_those_of_smpl_mirrored():

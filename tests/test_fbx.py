@@ -346,6 +346,8 @@ REFUSED = {
         b"; FBX 7.7.0 project file\nFBXHeaderExtension:  {\n",
         "this is an ASCII FBX file. Export it as binary FBX",
     ),
+    "ascii without a header": (b"\n ; Kaydara FBX\nObjects:  {\n", "this is an ASCII FBX file"),
+    "ascii without a comment": (b"FBXHeaderExtension:  {\n", "this is an ASCII FBX file"),
     "old": (header(6100), r"FBX version 6\.1, but only version 7"),
     "header alone": (header(), "damaged"),
     "endless name": (header() + struct.pack("<IIIB", 60, 0, 0, 255) + b"A" * 20, "ends outside"),

@@ -293,6 +293,14 @@ def test_rotations_are_fitted_to_files_of_joints_and_the_error_is_stated(arrays:
     assert "2 motions: rotations were fitted to joints, with a mean error of at most" in findings
 
 
+def test_a_clip_has_the_license_of_its_row_or_else_of_the_folder(arrays: Path):
+    write_table(arrays, [{"id": "one", "license": "CC0"}, {"id": "deep/two", "license": ""}])
+    clips = {clip.id: clip.license for clip in read_all(arrays, license="MIT")}
+    assert {"one": "CC0", "deep_two": "MIT"}.items() <= clips.items()
+    assert Folder(path=str(arrays), license="MIT").licenses() == {"CC0", "MIT"}
+    assert {clip.license for clip in read_all(arrays)} == {"CC0", ""}
+
+
 def test_motions_are_excluded_by_name(arrays: Path):
     (arrays / "one.npy").write_bytes(b"")
     source = Folder(str(arrays), exclude=["one"])

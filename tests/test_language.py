@@ -240,6 +240,46 @@ def test_numbers_are_no_typos_and_no_forms_of_other_words():
     assert understand("kicks four times").mentions[0].attributes["count"] == 4
 
 
+@pytest.mark.parametrize(
+    ("text", "attributes"),
+    [
+        ("a person turns left", {"direction": "left"}),
+        ("a person turns to the left", {"direction": "left"}),
+        ("a person turns their left leg", {}),  # the leg is left, not the turn
+        ("a person walks, left foot first", {}),
+        ("a person steps left", {"direction": "left"}),
+        ("a person hops to the right on the left leg", {"side": "left", "direction": "right"}),
+        ("a person looks over the left shoulder", {"direction": "left"}),
+        ("a person walks back", {"direction": "backward"}),
+        ("a person walks in a circle to the left", {"direction": "counterclockwise"}),
+        ("a person walks to the right in a circle", {"direction": "clockwise"}),
+        ("a person walks clockwise in a circle", {"direction": "clockwise"}),
+        ("a person walks up", {}),  # only stairs and the like have a vertical direction
+        ("a person climbs up", {"direction": "up"}),
+    ],
+)
+def test_left_and_right_are_directions_unless_they_name_a_part_of_the_body(
+    text: str, attributes: dict
+):
+    (mention,) = understand(text).mentions
+    assert dict(mention.attributes) == attributes
+
+
+@pytest.mark.parametrize(
+    ("text", "action", "typed", "word"),
+    [
+        ("doge to the left", "dodge", "doge", "dodge"),
+        ("a person skps", "skip", "skps", "skips"),
+    ],
+)
+def test_a_word_that_is_one_letter_from_an_action_is_read_as_this_action(
+    text: str, action: str, typed: str, word: str
+):
+    understood = understand(text)
+    assert [mention.action for mention in understood.mentions] == [action]
+    assert dict(understood.corrected) == {typed: word}
+
+
 def test_a_word_is_not_corrected_if_it_is_english(subtests):
     for text in ("a person walks to the shelf", "a person is talking", "stairs", "reaction"):
         with subtests.test(text=text):

@@ -29,6 +29,7 @@ from flame_mdm.reporting.tables.format import (
     Table,
     _series,
     comma_separated,
+    draw,
     ranks,
     rendered,
 )
@@ -210,6 +211,22 @@ def test_cells_ranks_and_real_motions(folder):
         "2.5",
         "50",
     )
+
+
+def test_a_row_with_results_of_several_evaluations_names_those_that_exist(folder):
+    path = put(request_of(folder, "MFM"), folder, measured(0.41, 0.7, 9.4, seed=3))
+    read = builder.read_result(path)
+    row = {"label": "MFM", "num_inference_steps": 7, "guidance_scale": "none"}
+    values = ["fid", "diversity", "nfe", "num_inference_steps"]
+    line = builder._line(row, [None, read, read, None], values, ["a", "b", "b", "c"])
+    assert [cell and cell.value for cell in line.cells] == [None, 9.4, 50, 7]
+    assert (line.facts["result"], line.facts["seed"], line.state) == ("b", "3", "")
+    assert line.options["num_inference_steps"] == 7  # the row's, not the 50 of the checkpoint
+    assert line.options["guidance_scale"] == 2.5
+    assert line.options["nfe"] == 50
+    nothing = builder._line(row, [None] * 4, values, ["a", "b", "b", "c"])
+    assert [cell and cell.value for cell in nothing.cells] == [None, None, None, 7]
+    assert (nothing.facts, nothing.options) == ({}, {"num_inference_steps": 7})
 
 
 def test_a_baseline_is_shown_but_not_ranked(folder):
@@ -911,6 +928,9 @@ def test_figures_draw_points_in_order_without_incomplete_rows():
     assert levels == [0.5]
     lower = Part("P", {"FID": "lower"}, lines)
     assert _series(lower, Figure(part="P", x="eta", y=["FID"]), "FID")[1] == []
+    drawing = str(draw(part, Figure(part="P", x="eta", y=["FID"])))
+    assert drawing.count('class="level"') == 1
+    assert 'class="level"' not in str(draw(lower, Figure(part="P", x="eta", y=["FID"])))
     dots, _ = _series(part, Figure(part="P", x="eta", y=["FID"], points=True), "FID")
     assert [s.kind for s in dots] == ["dots", "dots"]
 

@@ -105,7 +105,9 @@ def test_parts_of_the_trunk_are_as_tall_as_their_bone_and_as_wide_as_the_hips_an
 def test_a_limb_is_stretched_along_its_bone_and_as_thick_as_all_limbs():
     offsets = mannequin().rest.copy()
     knee = JOINT["left_knee"]
-    limbs = [JOINT[f"{s}_{n}"] for s in ("left", "right") for n in ("knee", "ankle", "elbow", "wrist")]
+    limbs = [
+        JOINT[f"{s}_{n}"] for s in ("left", "right") for n in ("knee", "ankle", "elbow", "wrist")
+    ]
     lengths = np.linalg.norm(offsets[limbs], axis=1)
     offsets[knee] *= 1.5
     fit, wide = proportions(mannequin(), offsets)
@@ -162,6 +164,31 @@ def test_the_nearest_triangle_is_drawn_and_pictures_show_the_body_in_its_clothes
     skin = (image[..., 0] > image[..., 2] + 30).nonzero()[0]
     assert min(len(blue), len(skin)) > 100
     assert skin.min() < blue.min()  # the face is above the shirt
+
+
+def test_pixels_show_the_nearest_triangle_at_their_centers_with_mixed_colors():
+    random = np.random.default_rng(0)
+    at, depth = random.uniform(-4, 20, (15, 2)), random.uniform(1, 3, 15)
+    colors, triangles = random.uniform(0, 255, (15, 3)), np.arange(15).reshape(5, 3)
+    image = np.full((16, 14, 3), 255, np.uint8)
+    expected = image.copy()
+    for row, column in np.ndindex(16, 14):
+        nearest = np.inf
+        for corners in triangles:
+            # shares of the corners: their sum is 1, and they mix the corners to the pixel's center
+            system = np.vstack([at[corners].T, np.ones(3)])
+            shares = np.linalg.solve(system, [column + 0.5, row + 0.5, 1])
+            # y is down, so a triangle that is counterclockwise on the screen has a negative area
+            if (
+                np.linalg.det(system) < 0
+                and shares.min() >= 0
+                and shares @ depth[corners] < nearest
+            ):
+                nearest = shares @ depth[corners]
+                expected[row, column] = shares @ colors[corners]
+    render._rasterize(image, at, depth, colors, triangles)
+    assert 20 < (expected != 255).any(2).sum() < 200
+    assert np.abs(image.astype(int) - expected).max() <= 1
 
 
 def test_a_motion_that_no_body_fits_says_why(subtests):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.motions import posed
 from support.npm import node
 from support.refusals import error_of
 from support.usd import opened
@@ -17,9 +18,10 @@ import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Attributes, example
 from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
-from flame_mdm.formats.gaits import Clip, find_cycle, gait, turn
+from flame_mdm.formats.gaits import Clip, find_cycle, gait, moving, passing, progress, turn
 from flame_mdm.formats.grounding import (
     GroundedMotion,
+    anchored,
     grounded,
     jolt,
     pivot,
@@ -134,6 +136,86 @@ def test_a_turn_has_exactly_the_angle_and_begins_and_ends_standing():
     assert slide(clip) < CENTIMETER
     assert turn(motion, -wanted, motion.local[0]) is None
     assert turn(motion, 3 * degrees, motion.local[0]) is None
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_the_end_of_a_clip_takes_a_pose_and_fades_into_the_motion(at_end: bool):
+    pose = posed().joints[0].astype(float)
+    # Bones keep their lengths, so that a motion of the whole body shows the weights.
+    motion = GroundedMotion(
+        np.tile(pose, (9, 1, 1)), np.zeros((9, 2)), np.zeros(9), np.ones((9, 2), bool), 10.0
+    )
+    raised = pose + np.array([0, 0.1, 0])
+    changed = anchored(motion, raised, 0.4, at_end=at_end).local - pose
+    frames = np.arange(9)[:: -1 if at_end else 1]
+    share = np.clip(1 - frames / 4, 0, 1)
+    expected = 0.1 * (3 * share**2 - 2 * share**3)
+    np.testing.assert_allclose(changed[:, 0, 1], expected, atol=1e-12)
+    np.testing.assert_allclose(changed[..., [0, 2]], 0, atol=1e-12)
+    # The change ends within a clip that is shorter than the time.
+    short = anchored(motion, raised, 60.0, at_end=at_end).local - pose
+    assert short[0 if at_end else -1, 0, 1] == 0
+    assert short[4, 0, 1] == pytest.approx(0.05)
+
+
+def test_progress_is_the_speed_along_a_direction_relative_to_the_heading():
+    frames = np.arange(11)
+    # A root that faces +x (90 degrees to the left) walks sideways, toward +z: to its right
+    motion = GroundedMotion(
+        np.zeros((11, 22, 3)),
+        np.stack([0 * frames, 0.1 * frames], 1),
+        np.full(11, np.pi / 2),
+        np.ones((11, 2), bool),
+        20.0,
+    )
+    for degrees, speeds in {0: (0, -2), 90: (-2, 0), -90: (2, 0), 180: (0, 2)}.items():
+        along, aside = progress(motion, degrees)
+        np.testing.assert_allclose(along, speeds[0], atol=1e-9)
+        np.testing.assert_allclose(aside, speeds[1], atol=1e-9)
+
+
+def test_toes_pass_the_root_at_the_time_between_two_frames():
+    local, frames = np.zeros((11, 22, 3)), np.arange(11)
+    local[:, JOINT["left_foot"], 2] = 0.35 - 0.1 * frames  # at 0 after 3.5 frames
+    local[:, JOINT["right_foot"], 2] = 0.62 - 0.1 * frames
+    contacts = np.ones((11, 2), bool)
+    contacts[6:8, 1] = False  # in the air while it passes
+    path = np.stack([0 * frames, 0.1 * frames], 1)
+    motion = GroundedMotion(local, path, np.zeros(11), contacts, 10.0)
+    assert passing(motion) == [pytest.approx(0.35), None]
+    still = GroundedMotion(local, 0.05 * path, np.zeros(11), contacts, 10.0)
+    assert passing(still) == [None, None]
+
+
+def test_movement_is_cut_with_a_margin():
+    joints = np.zeros((60, 22, 3))
+    joints[:, JOINT["left_wrist"], 1] = 0.2 * np.clip(np.arange(60) - 20, 0, 10)  # at 4 m/s
+    motion = GroundedMotion(joints, np.zeros((60, 2)), np.zeros(60), np.ones((60, 2), bool), 20.0)
+    begin, end = moving(motion)  # frames 20 to 30 and, at each end, 0.15 s and the smoothing
+    assert 13 <= begin <= 17
+    assert (begin + end) / 2 == 25
+    still = GroundedMotion(
+        0 * joints, np.zeros((60, 2)), np.zeros(60), np.ones((60, 2), bool), 20.0
+    )
+    assert moving(still) == (0, 59)
+
+
+def test_repetitions_of_a_loop_continue_in_the_direction_in_which_it_ends():
+    # a quarter of a circle to the left with radius 2, in four steps
+    angles = np.linspace(0, np.pi / 2, 5)
+    path = 2 * np.stack([1 - np.cos(angles), np.sin(angles)], 1)
+    local = np.zeros((5, 22, 3))
+    local[:4, 0, 1] = np.arange(4)
+    contacts = np.arange(10).reshape(5, 2) % 3 == 0
+    circle = repeated(GroundedMotion(local, path, angles, contacts, 10.0), 4)
+    whole = np.linspace(0, 2 * np.pi, 17)
+    np.testing.assert_allclose(circle.heading, whole)
+    np.testing.assert_allclose(
+        circle.path, 2 * np.stack([1 - np.cos(whole), np.sin(whole)], 1), atol=1e-12
+    )
+    assert circle.local[:, 0, 1].tolist() == [*[0, 1, 2, 3] * 4, 0]
+    np.testing.assert_array_equal(circle.contacts[4:8], contacts[:4])
+    np.testing.assert_array_equal(circle.contacts[-1], contacts[-1])
 
 
 def test_planted_feet_stay_where_a_fixed_pose_has_them(walk: GroundedMotion, subtests):

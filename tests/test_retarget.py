@@ -1,5 +1,6 @@
 """Motions on the skeletons of other programs, and on a user's own characters."""
 
+import io
 import itertools
 import json
 import subprocess
@@ -9,18 +10,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.fixtures import blender
 from support.glb import Glb, changed, odd_character, skinned, write_names
 from support.motions import largest_step, posed, synthetic
 
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh, characters
+from flame_mdm.formats import bvh, character_meshes, characters, fbx_scene, glb, glb_animation
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import preset, presets, retarget
 from flame_mdm.formats.rig import LIMBS, SIDES
+from flame_mdm.formats.rigged import RiggedClip
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
 
@@ -400,6 +403,105 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
             assert not (tmp_path / "out.glb").exists()
     with pytest.raises(UserError, match=r"out\.bvh: a \.glb character can only"):
         kick.save(tmp_path / "out.bvh", character=tmp_path / "mixamo.glb")
+
+
+def skin_of(clip: RiggedClip, frame: int) -> np.ndarray:
+    """Vertices (V, 3) of all skins of a clip in a frame, whose joints may have scales."""
+    worlds: list[np.ndarray] = []
+    for joint, parent in enumerate(clip.parents):
+        local = np.eye(4)
+        local[:3, :3] = clip.scales[joint] * clip.turns[frame, joint]
+        local[:3, 3] = clip.moves[joint][frame] if joint in clip.moves else clip.offsets[joint]
+        worlds.append(worlds[parent] @ local if parent >= 0 else local)
+    surfaces = []
+    for skin in clip.skins:
+        moves = np.stack(worlds)[list(skin.ordered)] @ skin.binds
+        points = np.pad(skin.points, ((0, 0), (0, 1)), constant_values=1)
+        moved = np.einsum("vkij,vj->vki", moves[skin.bones], points)[..., :3]
+        surfaces.append((skin.weights[..., None] * moved).sum(1))
+    return np.concatenate(surfaces)
+
+
+@pytest.mark.parametrize("name", ["hero", "odd"])
+def test_a_character_as_fbx_moves_its_joints_and_skin_as_in_its_glb_file(
+    name: str, kick: Motion, tmp_path: Path
+):
+    kick.save(tmp_path / "hero.glb", rig="mixamo")
+    odd_character(tmp_path / "odd.glb", kick)
+    write_names(tmp_path / "odd.yaml")
+    motion, path = Motion(synthetic("wave").joints[:30], 20), tmp_path / f"{name}.glb"
+    motion.save(tmp_path / "wave.glb", character=path)
+    summary = motion.save(tmp_path / "wave.fbx", character=path)
+    theirs, ours = glb_animation.read(tmp_path / "wave.glb"), fbx_scene.read(tmp_path / "wave.fbx")
+    joints = [joint for joint in theirs.names if joint in ours.names]
+    assert len(joints) >= 22
+    rows = ([file.names.index(joint) for joint in joints] for file in (theirs, ours))
+    expected, positions = (
+        file.positions[:, row] for file, row in zip((theirs, ours), rows, strict=True)
+    )
+    np.testing.assert_allclose(positions, expected, atol=1e-5)
+    clip = character_meshes.character_clip(characters.read_skinned(path), motion, "wave")
+    for frame in (0, 29):
+        surface = skin_of(clip, frame)
+        np.testing.assert_allclose(surface, skinned(tmp_path / "wave.glb", frame), atol=1e-5)
+    assert f"{len(clip.joints)} joints, 1 meshes" in summary
+
+
+def test_meshes_of_a_character_keep_their_parts_materials_and_images(kick: Motion, tmp_path: Path):
+    path, image = tmp_path / "hero.glb", io.BytesIO()
+    kick.save(path)
+    Image.new("RGB", (2, 2), (9, 8, 7)).save(image, "PNG")
+    file = Glb(path)
+    document = file.document
+    data = glb.Binary(file.binary, document["bufferViews"], document["accessors"])
+    view = len(data.views)
+    document["bufferViews"] = [
+        *data.views,
+        {"buffer": 0, "byteOffset": len(data.data), "byteLength": len(image.getvalue())},
+    ]
+    document["images"] = [{"bufferView": view, "mimeType": "image/png"}, {"uri": "elsewhere.png"}]
+    document["textures"] = [{"source": 1}, {"source": 0}]
+    surface = {"baseColorFactor": [0.5, 0.25, 2.0, 1], "baseColorTexture": {"index": 1}}
+    document["materials"] = [{"name": "cloth", "pbrMetallicRoughness": surface}, {}]
+    (mesh,) = document["meshes"]
+    (whole,) = mesh["primitives"]
+    bare = {"POSITION": whole["attributes"]["POSITION"]}
+    mesh |= {"name": "body"}
+    mesh["primitives"] = [
+        whole | {"material": 0},
+        {"attributes": bare, "indices": whole["indices"]},
+    ]
+    data.data += image.getvalue()
+    binary = bytes(data.data) + b"\0" * (-len(data.data) % 4)
+    document["buffers"][0]["byteLength"] = len(binary)
+    file.binary = binary
+    file.save(path)
+    first, second = character_meshes.meshes(glb.read(path))
+    assert (first.name, second.name) == ("body 1", "body 2")
+    (cloth,), (plain,) = first.palette, second.palette
+    assert (cloth.name, cloth.image) == ("cloth", image.getvalue())
+    np.testing.assert_allclose(cloth.color, [0.5 ** (1 / 2.2), 0.25 ** (1 / 2.2), 1])
+    assert (plain.name, plain.image) == ("material", b"")
+    # The second part is bound to no joint, so it follows its node.
+    assert second.bones.tolist() == [[0]] * len(second.points)
+    np.testing.assert_array_equal(second.binds, np.eye(4)[None])
+    # It has no normals, so they are computed; the first part has those of the same surface.
+    np.testing.assert_allclose(np.linalg.norm(second.normals, axis=1), 1)
+    assert (first.normals * second.normals).sum(1).mean() > 0.98
+
+
+def test_normals_that_a_file_lacks_are_means_of_its_triangles_weighted_by_area():
+    points = np.array([[1.0, 0, 0], [0, 2, 0], [0, 0, 1], [0, 0, 0]])
+    triangles = np.array([[0, 1, 2], [3, 1, 0], [3, 2, 1], [3, 0, 2]])
+    normals = character_meshes._normals(None, {}, points, triangles)  # type: ignore[arg-type]
+    # twice the areas: (2, 1, 2) of the slope, and 2, 2 and 1 of the sides in the three planes
+    sums = [[2, 0, 0], [0, 1, 0], [0, 0, 2], [-2, -1, -2]]
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals, sums / lengths, atol=1e-12)
+
+
+def test_joints_with_the_same_name_are_numbered():
+    assert character_meshes._distinct(["a", "b", "a", "a"]) == ("a", "b", "a 2", "a 3")
 
 
 def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

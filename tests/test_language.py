@@ -1,7 +1,9 @@
 """What sentences are understood to ask for, and what a model makes of them."""
 
 import json
+import re
 from collections import defaultdict
+from html import unescape
 from itertools import chain
 
 import numpy as np
@@ -14,12 +16,14 @@ from flame_mdm.conditions.language.parsing import understand
 from flame_mdm.conditions.language.reading import NotUnderstood, Reader
 from flame_mdm.conditions.language.spelling import corrections
 from flame_mdm.conditions.language.tables import actions
+from flame_mdm.conditions.language.tokens import corrected_to_action, tokenize
 from flame_mdm.conditions.language.understanding import Mention, Understanding
 from flame_mdm.conditions.language.vectors import FILE, word_table
 from flame_mdm.conditions.language.wording import caption, predicate
 from flame_mdm.conditions.vocabulary import known_form
 from flame_mdm.data.synthetic import draw_captions, prompts
 from flame_mdm.data.synthetic_actions import ACTIONS
+from flame_mdm.demo.chips import _with_action, chips
 from flame_mdm.errors import UserError
 
 ATTRIBUTES = ("side", "count", "direction", "speed")
@@ -270,6 +274,9 @@ def test_left_and_right_are_directions_unless_they_name_a_part_of_the_body(
     [
         ("doge to the left", "dodge", "doge", "dodge"),
         ("a person skps", "skip", "skps", "skips"),
+        # These are words of the table of vectors, but rare and far from any action.
+        ("a person clans quietly", "clap", "clans", "claps"),
+        ("they quietly threads to the left", "walk", "threads", "treads"),
     ],
 )
 def test_a_word_that_is_one_letter_from_an_action_is_read_as_this_action(
@@ -278,6 +285,15 @@ def test_a_word_that_is_one_letter_from_an_action_is_read_as_this_action(
     understood = understand(text)
     assert [mention.action for mention in understood.mentions] == [action]
     assert dict(understood.corrected) == {typed: word}
+
+
+def test_a_word_for_an_action_replaces_one_token_and_keeps_the_others():
+    tokens = tokenize("they quietly threads to the left")
+    corrected = corrected_to_action(tokens, [1, 2])
+    assert [token.word for token in corrected] == ["they", "quietly", "treads", "to", "the", "left"]
+    assert [token.typed for token in corrected] == [token.typed for token in tokens]
+    assert (corrected[2].start, corrected[2].end) == (tokens[2].start, tokens[2].end) == (13, 20)
+    assert corrected_to_action(tokens, [0, 1]) == tokens
 
 
 def test_a_word_is_not_corrected_if_it_is_english(subtests):
@@ -299,6 +315,82 @@ def test_abilities_are_read_from_the_facts_of_a_model():
     assert "backflip" not in abilities.actions
     assert abilities.choices("kick") == {"count": [1, 2], "side": ["left", "right"]}
     assert not abilities.is_simultaneous
+
+
+PARTS = [
+    ("kicks twice with the left leg", 1.5),
+    ("a person walks <b>", None),
+    ("jumps nervously and sits down", None),
+]
+
+
+def selects() -> dict[str, list[tuple[str, bool, str]]]:
+    """The options of the chips for `PARTS`: text of the form, whether it is selected, and label."""
+    reader = Reader(FACTS)
+    page = chips(reader.abilities, PARTS, [reader.read(words) for words, _ in PARTS])
+    assert "<span>jumps</span> then <span>sits down</span> <del>" in page  # two actions in a part
+    assert "<b>" not in page
+    assert page.count(" then ") == 3
+    found = {}
+    for part, content in enumerate(page.split(" then ")[:2]):
+        for name, options in re.findall(r'<select aria-label="(\w+)".*?>(.*?)</select>', content):
+            found[f"{name} {part}"] = [
+                (unescape(text), bool(selected), unescape(label))
+                for text, selected, label in re.findall(
+                    r'<option value="(.*?)"( selected)?>(.*?)</option>', options
+                )
+            ]
+    return found
+
+
+def test_chips_show_the_action_and_attributes_that_a_text_states():
+    chosen = {
+        name: [label for _, selected, label in options if selected]
+        for name, options in selects().items()
+    }
+    assert chosen == {
+        **{"Action 0": ["kicks"], "Count 0": ["twice"], "Side 0": ["left"]},
+        **{"Action 1": ["walks"], "Direction 1": ["any direction"], "Speed 1": ["any speed"]},
+    }
+
+
+def test_another_action_keeps_the_shown_attributes_that_it_can_have():
+    (mention,) = understand("turns a quarter to the left").mentions
+    assert dict(mention.attributes) == {"direction": "left", "amount": "quarter"}
+    assert _with_action(mention, "spin").attributes == {"direction": "left"}  # no chip for amounts
+    assert _with_action(mention, "kick").attributes == {}
+
+
+def test_an_option_of_a_chip_changes_one_action_or_attribute_and_keeps_all_other_parts():
+    before = [understand(words).mentions[0] for words, _ in PARTS[:2]]
+    labels = {"to the left": "left", "to the right": "right", "once": 1, "twice": 2}
+    labels |= {"slowly": "slow", "quickly": "fast"}
+    count = 0
+    for name, options in selects().items():
+        kind, part = name.split()[0].lower(), int(name.split()[1])
+        for text, selected, label in options:
+            phrases = text.split(" | ")
+            phrases[0], seconds = phrases[0].split(" @")
+            assert seconds == "1.5"
+            others = [words for words, _ in PARTS]
+            del others[part]
+            (mention,) = understand(phrases.pop(part)).mentions
+            assert phrases == others
+            expected = dict(before[part].attributes)
+            if kind == "action":
+                assert (mention.action == before[part].action) == selected
+                kept = set(actions()[mention.action].takes) & set(ATTRIBUTES)
+                expected = {key: value for key, value in expected.items() if key in kept}
+            else:
+                assert mention.action == before[part].action
+                expected.pop(kind, None)
+                if not label.startswith("any "):
+                    expected[kind] = labels.get(label, label)
+            usual = actions()[mention.action].usual
+            stated = {k: v for k, v in mention.attributes.items() if v != usual}
+            assert stated == {k: v for k, v in expected.items() if v != usual}, (name, label)
+            count += 1
+    assert count > 50
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.locating import find
 from flame_mdm.commands.sample import _distance
+from flame_mdm.conditions.prompts import read_prompt
 from flame_mdm.conditions.vocabulary import advice, check_known
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
@@ -58,6 +59,29 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     assert main(["sample", str(trained), f"text={text}", "seconds=1", "samples=2"]) == 0
     np.testing.assert_allclose(read(file).joints, before.joints, atol=1e-4)  # in the same folder
     assert set(here.rglob("*")) == kept
+
+
+@pytest.mark.parametrize(
+    ("prompt", "parts", "expected"),
+    [
+        ("A person walks.", [("A person walks.", 2.0)], [("A person walks.", 2.0)]),
+        (
+            "walks, then waves",
+            [("walks, then waves", None)],
+            [("walks", None), ("waves", None)],
+        ),
+        (
+            "walks @1 | waves, then sits",
+            [("walks", 1.0), ("waves, then sits", None)],
+            None,
+        ),
+    ],
+)
+def test_only_a_sentence_with_several_actions_is_split(prompt, parts, expected):
+    facts = {"verbs": ["walks", "waves", "sits"]}
+    read = read_prompt(prompt, parts, facts, splits=expected is not None, check_words=False)
+    assert list(read.parts) == (expected or parts)
+    assert list(read.captions) == [words for words, _ in expected or parts]
 
 
 @pytest.mark.slow

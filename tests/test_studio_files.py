@@ -545,6 +545,45 @@ def test_usd_files_are_valid_and_have_the_positions_of_the_motion(
             assert np.abs(positions - expected.positions[frame, nodes]).max() < 0.01 * MILLIMETER
 
 
+@pytest.mark.parametrize("rig", ["mixamo", "unreal"])
+def test_usd_files_have_the_rest_pose_and_the_surface_of_a_glb_file(rig: str, tmp_path: Path):
+    UsdGeom, UsdSkel = pxr("UsdGeom"), pxr("UsdSkel")
+    motion = Motion(synthetic("kick").joints[20:30], 20)
+    motion.save(tmp_path / "kick.usdc", rig=rig)
+    motion.save(tmp_path / "kick.glb", rig=rig)
+    stage = opened(tmp_path / "kick.usdc")
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/person/skeleton"))
+    # USD multiplies row vectors by matrices.
+    rest, binds = (
+        np.array(attribute.Get()).mT
+        for attribute in (skeleton.GetRestTransformsAttr(), skeleton.GetBindTransformsAttr())
+    )
+    paths = list(skeleton.GetJointsAttr().Get())
+    file = glb.read(tmp_path / "kick.glb")
+    nodes = [
+        [name.replace(":", "_") for name in file.names].index(path.rpartition("/")[2])
+        for path in paths
+    ]
+    for joint, path in enumerate(paths):
+        if "/" in path:
+            rest[joint] = rest[paths.index(path.rpartition("/")[0])] @ rest[joint]
+    np.testing.assert_allclose(rest, file.worlds[nodes], atol=1e-6)
+
+    cache, root = UsdSkel.Cache(), UsdSkel.Root(stage.GetDefaultPrim())
+    cache.Populate(root, pxr("Usd").PrimDefaultPredicate)
+    worlds = np.array(cache.GetSkelQuery(skeleton).ComputeJointSkelTransforms(9)).mT
+    (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    binding = UsdSkel.BindingAPI(mesh.GetPrim())
+    points = np.pad(np.array(mesh.GetPointsAttr().Get()), ((0, 0), (0, 1)), constant_values=1)
+    bones, weights = (
+        np.array(primvar.Get()).reshape(len(points), -1)
+        for primvar in (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar())
+    )
+    moves = worlds @ np.linalg.inv(binds)
+    moved = np.einsum("vk,vkij,vj->vi", weights, moves[bones], points)[:, :3]
+    np.testing.assert_allclose(moved, skinned(tmp_path / "kick.glb", 9), atol=1e-5)
+
+
 def test_without_usd_core_the_error_says_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -10,7 +10,7 @@ from support.motions import Page, posed, synthetic
 from evaluators import perturbations as p
 from evaluators.encoding import encode
 from flame_mdm.__main__ import main
-from flame_mdm.formats.faults import LIMITS, find_faults
+from flame_mdm.formats.faults import LIMITS, _away, depths, find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
@@ -97,6 +97,97 @@ def test_faults_are_found_where_they_are(subtests):
             names = {kind for kind, *_ in expected}
             assert names <= LIMITS.keys()
             assert {fault for fault in faults if fault[0] in names or not expected} == expected
+
+
+def test_a_fault_has_its_worst_value(subtests):
+    knee, hip, ankle = AT["left_knee"], AT["left_hip"], AT["left_ankle"]
+
+    def folded(joints: np.ndarray) -> None:
+        """The shin lies at 4, then 12 degrees to the thigh, behind it."""
+        for frame, degrees in zip(range(30, 40), [4] * 3 + [12] * 7, strict=True):
+            turn = np.radians(degrees)
+            thigh = joints[frame, hip] - joints[frame, knee]
+            turned = [[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]]
+            joints[frame, ankle] = joints[frame, knee] + np.array(turned).T @ thigh
+
+    def sunk(joints: np.ndarray) -> None:
+        joints[30:40, AT["left_foot"], 1] -= np.linspace(0.1, 0.06, 10)
+
+    def longer(joints: np.ndarray) -> None:
+        bone = joints[:, AT["head"]] - joints[:, AT["neck"]]
+        joints[30:33, AT["head"]] += np.array([[0.3], [0.5], [0.2]]) * bone[30:33]
+
+    def away(joints: np.ndarray) -> None:
+        joints[30:33, AT["left_wrist"], 2] += [0.0, 1.0, 0.0]
+
+    for change, kind, joint, worst in (
+        (folded, "limit", "left_knee", 4),
+        (place("left_hip", "left_hip", (0, 0, 0.3)), "limit", "left_knee", None),
+        (sunk, "penetration", "left_foot", 0.1),
+        (longer, "bone length", "head", 0.5),
+        (away, "pop", "left_wrist", 2 * FPS**2),
+        (lambda joints: float_(joints, 16, 1.0), "floating", "body", 0.06),
+        (lambda joints: slide(joints, 9), "skating", "left_foot", 0.05 * FPS),
+    ):
+        with subtests.test(kind=kind, joint=joint):
+            joints = body()
+            floor = -joints[30, AT["left_foot"], 1]
+            change(joints)
+            faults = find_faults(Motion(joints, FPS))
+            (fault,) = (fault for fault in faults if (fault.kind, fault.joint) == (kind, joint))
+            if worst is None:
+                assert 15 < fault.worst < 90  # bent forward: more than the limit
+            else:
+                added = {"penetration": floor, "floating": -floor}.get(kind, 0)
+                assert fault.worst == pytest.approx(worst + added, rel=0.12, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("points", "start", "end", "expected"),
+    [
+        ([0.0, 1, 0.5], [0.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]),  # beside the segment
+        ([0.0, 1, -2], [0.0, 0, 0], [0.0, 0, 1], [0.0, 1, -2]),  # before its start
+        ([3.0, 0, 5], [0.0, 0, 0], [0.0, 0, 1], [3.0, 0, 4]),  # after its end
+        ([3.0, 0, 4], [0.0, 0, 0], [0.0, 0, 0], [3.0, 0, 4]),  # a segment without a length
+    ],
+)
+def test_distances_to_a_bone_are_those_to_its_nearest_point(points, start, end, expected):
+    away = _away(np.array([[points]]), np.array([start]), np.array([end]))
+    np.testing.assert_allclose(away[0, 0], expected)
+
+
+def test_a_hand_is_as_deep_in_the_body_as_it_is_inside_the_capsules():
+    joints = body()[:1]
+    names = SMPL22.joints
+    at = {name: joints[0, number] for name, number in AT.items()}
+    middle = (at["neck"] + at["pelvis"]) / 2
+    trunk = 0.18 * np.linalg.norm(at["neck"] - at["pelvis"])
+    thigh = 0.17 * np.linalg.norm(at["left_knee"] - at["left_hip"])
+    along = (at["neck"] - at["pelvis"]) / np.linalg.norm(at["neck"] - at["pelvis"])
+    side = np.array([1.0, 0, 0])  # the shoulders are level and the body faces +z
+    front = np.cross(along, side) * -1
+    for wrist, depth, outward in (
+        (middle + 0.01 * front, trunk - 0.01, front),
+        (middle + 0.014 * side, trunk - 0.01, side),  # the trunk is 1.4 times as wide as deep
+        (middle + 0.4 * front, trunk - 0.4, front),
+        ((at["left_hip"] + at["left_knee"]) / 2 + [0, 0, 0.02], None, None),
+    ):
+        moved = joints.copy()
+        moved[0, AT["left_wrist"]] = wrist
+        deep, away = depths(moved, names, "left")
+        if depth is None:
+            assert thigh - 0.025 < deep[0, 1] <= thigh
+            continue
+        assert deep[0, 1] == pytest.approx(depth, abs=1e-4)
+        np.testing.assert_allclose(away[0, 1], outward, atol=0.02)
+    # the middle of the hand lies beyond the wrist, in the direction of the forearm
+    moved = joints.copy()
+    moved[0, AT["left_elbow"]], moved[0, AT["left_wrist"]] = (
+        middle + 1.3 * front,
+        middle + 0.3 * front,
+    )
+    deep, _ = depths(moved, names, "left")
+    assert deep[0] == pytest.approx([trunk - 1.3, trunk - 0.3, trunk], abs=1e-4)
 
 
 def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys, monkeypatch):

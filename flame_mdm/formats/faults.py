@@ -132,14 +132,17 @@ def _runs(
     A joint is faulty in a frame if its flag is set or, without flags, if its value exceeds the
     limit. Flags and values have the shape (F, J).
     """
-    runs, flags = [], values > LIMITS[kind][0] if flags is None else flags
+    limit, runs = LIMITS[kind][0], []
+    flags = values > limit if flags is None else flags
     for joint in np.flatnonzero(flags.any(0)).tolist():
         flag = binary_opening(flags[:, joint], np.ones(frames)) if frames > 1 else flags[:, joint]
         edges = np.flatnonzero(np.diff(np.r_[0, flag.astype(int), 0]))
         for start, end in edges.reshape(-1, 2).tolist():
-            runs.append(
-                Fault(kind, names[joint], start, end, float(values[start:end, joint].max()))
-            )
+            span = values[start:end, joint]
+            # The more a joint is folded, the smaller is its angle. All other values are worst at
+            # their maximum.
+            worst = span[np.abs(span - limit).argmax()] if kind == "limit" else span.max()
+            runs.append(Fault(kind, names[joint], start, end, float(worst)))
     return runs
 
 

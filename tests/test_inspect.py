@@ -10,7 +10,7 @@ from support.motions import Page, posed, synthetic
 from evaluators import perturbations as p
 from evaluators.encoding import encode
 from flame_mdm.__main__ import main
-from flame_mdm.formats.faults import LIMITS, _away, depths, find_faults
+from flame_mdm.formats.faults import LIMITS, _away, _stretched, depths, find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
@@ -140,6 +140,70 @@ def test_a_fault_has_its_worst_value(subtests):
             else:
                 added = {"penetration": floor, "floating": -floor}.get(kind, 0)
                 assert fault.worst == pytest.approx(worst + added, rel=0.12, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("speed", "frames", "is_fault"),
+    [(0.15, 7, True), (0.25, 7, False), (0.25, 16, True), (0.15, 6, False)],
+)
+def test_a_body_in_the_air_floats_sooner_if_it_is_slower_than_0_2_meters_per_second(
+    speed: float, frames: int, is_fault: bool
+):
+    joints = body()
+    float_(joints, frames, speed)
+    # the frame after which the body falls is not slow
+    end = 30 + frames - (speed < 0.2)
+    floating = {fault for fault in kinds(joints) if fault[0] == "floating"}
+    assert floating == ({("floating", "body", 30, end)} if is_fault else set())
+
+
+@pytest.mark.parametrize(("frames", "is_fault"), [(21, True), (20, False)])
+def test_a_body_is_frozen_if_it_does_not_move_for_a_second(frames: int, is_fault: bool):
+    joints = body()
+    joints[:, :, 0] += 0.05 * np.arange(FRAMES)[:, None]
+    joints[30 : 30 + frames] = joints[30]  # one step fewer than frames
+    frozen = {fault for fault in kinds(joints) if fault[0] == "frozen"}
+    assert frozen == ({("frozen", "body", 30, 29 + frames)} if is_fault else set())
+
+
+@pytest.mark.parametrize(
+    ("usual", "change", "is_fault"),
+    [
+        (1.0, 0.11, True),
+        (1.0, 0.09, False),  # less than 10 %
+        (1.0, -0.11, True),
+        (0.05, 0.008, False),  # less than 1 cm
+        (0.05, 0.012, True),
+    ],
+)
+def test_bones_may_differ_by_10_percent_or_by_a_centimeter(
+    usual: float, change: float, is_fault: bool
+):
+    joints = np.zeros((9, 2, 3))
+    joints[:, 1, 1] = usual
+    joints[4, 1, 1] += change
+    values, flags = _stretched(joints, [(0, 1)])
+    assert flags.any(0).tolist() == [False, is_fault]
+    assert values[4, 1] == pytest.approx(abs(change) / usual)
+    assert not values[[0, 8]].any()
+
+
+@pytest.mark.parametrize(("degrees", "is_fault"), [(20, False), (40, True), (90, True)])
+def test_a_foot_in_line_with_the_shin_does_not_show_the_front_of_the_knee(
+    degrees: float, is_fault: bool
+):
+    joints = body()
+    place("left_hip", "left_hip", (0, 0, 0.3))(joints)  # the knee bends forward
+    ankle, angle = AT["left_ankle"], np.radians(degrees)
+    shin = joints[:, ankle] - joints[:, AT["left_knee"]]
+    shin /= np.linalg.norm(shin, axis=1, keepdims=True)
+    front = np.cross(shin, [1, 0, 0]) * -1
+    front *= np.sign(front[:, 2:])
+    toes = np.cos(angle) * shin + np.sin(angle) * front
+    joints[:, AT["left_foot"]] = joints[:, ankle] + 0.12 * toes
+    joints[..., 1] -= joints[..., 1].min()
+    limits = {fault for fault in kinds(joints) if fault[:2] == ("limit", "left_knee")}
+    assert limits == ({("limit", "left_knee", 30, 40)} if is_fault else set())
 
 
 @pytest.mark.parametrize(

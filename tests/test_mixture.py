@@ -78,6 +78,23 @@ def test_the_license_of_a_row_counts_more_than_the_license_of_its_data_set(peopl
     assert licenses == {"one": "CC-BY-4.0", "two": "CC0", "three": "MIT", "four": "CMU"}
 
 
+def test_licenses_and_files_of_nested_mixtures_are_checked(people: Path):
+    inner = Mixture({"people": Folder(str(people), license="CC-BY-4.0")}, use="research")
+    outer = Mixture({"synthetic": Synthetic(clips=5), "others": inner}, use="research")
+    assert outer.licenses() == {"MIT", "CC0", "CMU"}
+    assert outer.count() == 5 + 4
+    lines = [line for line in outer.check(20.0) if "clips can be prepared" in line]
+    assert lines[0].startswith("synthetic: 5 clips")
+    assert lines[1].endswith("4 clips can be prepared (motions: 3 train, 0 val, 1 test)")
+    (people / "captions.csv").write_text(CAPTIONS.replace("CMU", "CC-BY-NC-4.0"))
+    inner = Mixture({"people": Folder(str(people))}, use="research")
+    outer = Mixture({"others": inner})
+    assert outer.use == "any"
+    for call in (outer.count, lambda: outer.check(20.0), lambda: next(outer.clips(20.0))):
+        with pytest.raises(UserError, match=r"others contains motions with license CC-BY-NC-4\.0"):
+            call()
+
+
 def test_stores_without_licenses_are_written_as_before(tmp_path: Path):
     store = write_store(tmp_path / "store", Synthetic(clips=3), HumanML())
     lines = (store.folder / "clips.jsonl").read_text().splitlines()

@@ -5,7 +5,8 @@ import hashlib
 import io
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,8 +18,15 @@ from evaluators.evaluation_request import EvaluationRequest
 from evaluators.sources import SampleFolder
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
-from flame_mdm.commands.tables import outdated, shows_multimodality
-from flame_mdm.config import compose
+from flame_mdm.commands import tables as tables_command
+from flame_mdm.commands.tables import (
+    TablesSettings,
+    count_lengths,
+    outdated,
+    shows_multimodality,
+)
+from flame_mdm.config import compose, compose_data
+from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.build import build
@@ -878,6 +886,27 @@ def test_lengths_of_a_data_set_are_counted_in_frames_and_hours(tmp_path):
     histogram = part.histograms["mine"]
     assert (histogram.step, len(histogram.counts), sum(histogram.counts)) == (5, 41, 5000)
     assert [histogram.counts[k] for k in (7, 8, 12, 18, 40)] == [0, 2000, 1000, 1000, 1000]
+
+
+def test_lengths_of_a_prepared_data_set_are_written_as_results(tmp_path, monkeypatch, capsys):
+    small = ["data.source.clips=12", f"data_root={tmp_path}"]
+    monkeypatch.setattr(
+        tables_command, "compose_data", lambda name, **keys: compose_data(name, small[:1], **keys)
+    )
+    settings = cast(TablesSettings, SimpleNamespace(data_root=str(tmp_path)))
+    file = tmp_path / "results" / "lengths" / "synthetic.json"
+    count_lengths("synthetic", tmp_path / "results", settings)
+    assert "synthetic is not prepared, so its motion lengths are omitted" in capsys.readouterr().out
+    assert not file.exists()
+    assert main(["prepare", "synthetic", *small]) == 0
+    count_lengths("synthetic", tmp_path / "results", settings)
+    (folder,) = tmp_path.glob("synthetic-*/")
+    store, written = Store(folder), json.loads(file.read_text())
+    assert written["lengths"] == sorted(len(store.motion(clip)) for clip in store.clips)
+    assert (written["fingerprint"], written["fps"]) == (store.fingerprint, 20.0)
+    spec = {"title": "Lengths", "parts": {"All": {"lengths": ["synthetic"]}}}
+    (line,) = build("x", spec, tmp_path / "results").parts[0].lines
+    assert (line.state, line.cells[0] and line.cells[0].text) == ("", "12")
 
 
 @pytest.mark.parametrize(("text", "number"), [

@@ -39,10 +39,6 @@ class Token:
         """Whether the token is a word rather than a punctuation mark."""
         return self.typed[0].isalnum()
 
-    def has_form(self, *bases: str) -> bool:
-        """Returns whether the word is a form of one of `bases`."""
-        return any(base in base_forms(self.word) for base in bases)
-
 
 def tokenize(text: str) -> list[Token]:
     """Splits a sentence into words and punctuation marks."""

@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from support.fixtures import blender
 from support.glb import Glb, changed, odd_character, skinned, write_names
 from support.motions import largest_step, posed, synthetic
@@ -22,7 +24,16 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import preset, presets, retarget
-from flame_mdm.formats.rig import LIMBS, SIDES
+from flame_mdm.formats.rig import (
+    LIMBS,
+    SIDES,
+    RestPose,
+    Rig,
+    _bent,
+    fitted,
+    follow,
+    rest_pose,
+)
 from flame_mdm.formats.rigged import RiggedClip
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.representations.smpl import ADULT
@@ -403,6 +414,155 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
             assert not (tmp_path / "out.glb").exists()
     with pytest.raises(UserError, match=r"out\.bvh: a \.glb character can only"):
         kick.save(tmp_path / "out.bvh", character=tmp_path / "mixamo.glb")
+
+
+OFFSETS = np.array(ADULT[:22])
+
+
+def standing(change: Callable[[np.ndarray], object] = lambda positions: None) -> RestPose:
+    """The rest pose of SMPL's skeleton, whose joints (22, 3) are changed."""
+    positions = np.zeros((22, 3))
+    for parent, joint in SMPL22.edges:
+        positions[joint] = positions[parent] + OFFSETS[joint]
+    change(positions)
+    turns = np.tile(np.eye(3), (22, 1, 1))
+    names, up = SMPL22.joints, (0, 1, 0)
+    return rest_pose("it", names, SMPL22.parents, positions, turns, JOINT, positions, up)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize(
+    ("limb", "bend"), [(("shoulder", "elbow", "wrist"), 1), (("hip", "knee", "ankle"), -1)]
+)
+@pytest.mark.parametrize(
+    ("degrees", "around", "is_shown"),
+    [
+        (30, 0, True),  # bent as usual: elbows forward, knees backward
+        (30, 50, True),  # the limb is twisted
+        (30, 150, False),  # bent the wrong way
+        (10, 50, False),  # nearly straight
+    ],
+)
+def test_a_limb_turns_about_the_axis_that_its_bend_at_rest_shows(
+    side: str, limb: tuple[str, ...], bend: int, degrees: float, around: float, is_shown: bool
+):
+    first, middle, end = (JOINT[f"{side}_{name}"] for name in limb)
+
+    def bent(positions: np.ndarray) -> None:
+        along = unit(positions[middle] - positions[first])
+        ahead = unit(np.array([0, 0, bend]) - along * along[2] * bend)
+        angles = np.radians([degrees, around])
+        across = np.cos(angles[1]) * ahead + np.sin(angles[1]) * np.cross(along, ahead)
+        lower = np.cos(angles[0]) * along + np.sin(angles[0]) * across
+        moved = positions[middle] + np.linalg.norm(OFFSETS[end]) * lower
+        foot = [JOINT[f"{side}_foot"]] if limb[0] == "hip" else []
+        positions[[end, *foot]] += moved - positions[end]
+
+    character = standing(bent)
+    rig = fitted(character, OFFSETS)
+    upper = rig.positions[middle] - rig.positions[first]
+    lower = rig.positions[end] - rig.positions[middle]
+    hinge = np.cross(upper, lower) if is_shown else np.cross(upper, [0, 0, bend])
+    ours = np.cross(OFFSETS[middle], [0, 0, bend])
+    for joint, bone, their_bone in ((first, OFFSETS[middle], upper), (middle, OFFSETS[end], lower)):
+        neutral = rig.neutral[joint]
+        np.testing.assert_allclose(neutral @ unit(their_bone), unit(bone), atol=1e-9)
+        # the axes agree as far as they are perpendicular to the bones
+        theirs = unit(hinge - unit(their_bone) * (unit(their_bone) @ hinge))
+        expected = unit(ours - unit(bone) * (unit(bone) @ ours))
+        np.testing.assert_allclose(neutral @ theirs, expected, atol=1e-9)
+    if limb[0] == "shoulder":
+        np.testing.assert_array_equal(rig.neutral[end], rig.neutral[middle])
+
+
+def test_offsets_and_local_rotations_of_a_scaled_and_turned_skeleton_give_its_rest_pose():
+    random = np.random.default_rng(0)
+    rig = Rig(
+        joints=("root", "hips", "spine", "leg"),
+        parents=(-1, 0, 1, 1),
+        positions=random.normal(size=(4, 3)),
+        turns=Rotation.random(4, random_state=0).as_matrix(),
+        sources=(-1, 0, 3, 1),
+        neutral=np.tile(np.eye(3), (4, 1, 1)),
+        orders=("XYZ",) * 4,
+        frame=Rotation.random(random_state=1).as_matrix(),
+        scales=np.array([1.0, 0.01, 0.01, 0.02]),
+    )
+    offsets, rest = rig.offsets(), rig.rest()
+    turns, positions = [rig.frame @ rest[0]], [rig.frame @ offsets[0]]
+    for joint, parent in list(enumerate(rig.parents))[1:]:
+        turns.append(turns[parent] @ rest[joint])
+        bone = rig.scales[parent] * offsets[joint]
+        positions.append(positions[parent] + turns[parent] @ bone)
+    np.testing.assert_allclose(turns, rig.turns, atol=1e-12)
+    np.testing.assert_allclose(positions, rig.positions, atol=1e-12)
+
+
+def about_y(degrees: float, positions: np.ndarray) -> None:
+    positions[:] = positions @ Rotation.from_euler("y", degrees, degrees=True).as_matrix().T
+
+
+def legs_lean(positions: np.ndarray) -> None:
+    for joint in (4, 5, 7, 8, 10, 11):
+        positions[joint, 2] += 1.2
+
+
+@pytest.mark.parametrize(("degrees", "is_snapped"), [(0, True), (6, True), (12, False), (94, True)])
+def test_a_character_is_turned_to_the_nearest_axis_if_it_is_close(degrees: float, is_snapped: bool):
+    frame = standing(lambda positions: about_y(degrees, positions)).rig.frame
+    turned = round(degrees / 90) * 90 if is_snapped else degrees
+    expected = Rotation.from_euler("y", -turned, degrees=True).as_matrix()
+    np.testing.assert_allclose(frame, expected, atol=1e-9 if is_snapped else 0.03)
+
+
+def test_legs_that_lean_are_no_rest_pose():
+    with pytest.raises(UserError, match="it: the rest pose is not upright: it leans by"):
+        standing(legs_lean)
+
+
+@pytest.mark.parametrize(
+    ("raised", "height"),
+    [(0.0, 0.0), (0.05, 0.0), (-0.05, 0.0), (0.3, 0.3), (-0.3, -0.3)],
+)
+def test_a_body_near_the_floor_stands_on_it_and_another_one_keeps_its_height(
+    raised: float, height: float
+):
+    motion = posed(3, root=[[0, 0.955, 0], [0.1, 0.955, 0.2], [0.2, 0.955, 0.4]])
+    joints = motion.joints.astype(float)
+    joints[..., 1] -= joints[..., 1].min()
+    straight = np.tile(np.eye(3), (22, 1, 1))
+    world = np.tile(straight, (3, 1, 1, 1))
+    moved = joints + np.array([0, raised, 0])
+    _, positions, _ = follow(standing(), moved, OFFSETS, straight, world)
+    # SMPL's own skeleton stands as the body does.
+    np.testing.assert_allclose(positions, joints + np.array([0, height, 0]), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("target", "knee"),
+    [
+        ((0, -0.5, 0), None),
+        ((0.1, -0.4, 0.3), None),
+        ((0, -0.05, 0), None),  # too close: the leg is folded as far as it can be
+        ((0, -2, 0), (0, -0.4, 0)),  # too far: the leg is straight
+    ],
+)
+def test_a_leg_bends_to_its_target_with_bones_of_constant_length(target, knee):
+    hip, before, ankle = (np.array([row], float) for row in ((0, 0, 0), (0, -0.4, 0), (0, -0.7, 0)))
+    forward = np.array([[0, 0, 1.0]])
+    new = _bent(hip, before, ankle, np.array([target], float), forward)[0]
+    assert np.linalg.norm(new) == pytest.approx(0.4, abs=1e-6)
+    distance = np.linalg.norm(target)
+    if 0.1 < distance < 0.7:
+        assert np.linalg.norm(new - target) == pytest.approx(0.3, abs=1e-6)
+        assert new[2] > 0  # a straight leg bends forward
+        assert new[0] == pytest.approx(target[0] * (new @ target) / distance**2, abs=0.08)
+    if knee is not None:
+        np.testing.assert_allclose(new, knee, atol=0.03)
 
 
 def skin_of(clip: RiggedClip, frame: int) -> np.ndarray:

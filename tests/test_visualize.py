@@ -203,6 +203,22 @@ def test_motions_of_different_rates_show_the_frame_of_each_time(monkeypatch):
     assert len(list(render._video([sway(3, 20)], 30, 32, None))) == 5, "0.15 s are 4.5 images"
 
 
+def test_a_picture_shows_the_path_up_to_its_frame_and_no_frame_after_half_a_second():
+    joints = sway(40).joints
+    later = joints.copy()
+    later[31:] += [0.5, 0, 0.5]
+    motions = (Motion(joints, 20), Motion(later, 20))
+    first, second = (np.asarray(render._figure(motion, None, 20, 128)) for motion in motions)
+    np.testing.assert_array_equal(first, second)
+
+    def violet(frame: int) -> int:
+        image = np.asarray(render._figure(motions[0], None, frame, 128))
+        return int((np.abs(image.astype(int) - render.TRAIL).max(2) < 40).sum())
+
+    counts = [violet(frame) for frame in (0, 10, 20)]
+    assert counts[0] < counts[1] < counts[2] - 5, counts
+
+
 @pytest.mark.parametrize(
     ("count", "columns", "rows"),
     [(1, 1, 1), (3, 3, 1), (4, 2, 2), (5, 3, 2), (9, 3, 3), (10, 4, 3), (17, 4, 5)],

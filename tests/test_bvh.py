@@ -130,6 +130,31 @@ def test_what_is_written_reads_back(tmp_path):
     assert (tmp_path / "again.bvh").read_bytes() == (tmp_path / "tree.bvh").read_bytes()
 
 
+def test_cubic_resampling_keeps_accelerated_translations_exact():
+    motion = replace(tree(0, 13), fps=30.0)
+    joint = next(number for number, names in enumerate(motion.channels) if "Xposition" in names)
+    column = motion.columns()[joint].start + motion.channels[joint].index("Xposition")
+    times = np.arange(13) / 30
+    motion.frames[:, column] = 3 * times**3 - times**2 + 1
+    _, moved = motion.resample(50, cubic=True)
+    times = np.arange(len(moved)) / 50
+    assert len(moved) == 21
+    np.testing.assert_allclose(moved[:, joint, 0], 3 * times**3 - times**2 + 1, atol=1e-9)
+
+
+def test_rotations_may_be_listed_before_positions(parse):
+    motion = parse(ARM)
+    names, columns = motion.channels[0], motion.columns()[0]
+    assert len(names) == 6
+    order = [*range(3, 6), *range(3)]
+    swapped = tuple(names[k] for k in order)
+    frames = motion.frames.copy()
+    frames[:, columns] = frames[:, columns][:, order]
+    other = replace(motion, channels=(swapped, *motion.channels[1:]), frames=frames)
+    np.testing.assert_array_equal(other.rotations(), motion.rotations())
+    np.testing.assert_array_equal(other.positions(), motion.positions())
+
+
 def test_resampling_turns_at_a_constant_rate_and_keeps_bones_and_the_last_frame(parse, subtests):
     for frames, expected in ((1, 1), (2, 1), (3, 2), (4, 3), (7, 5), (128, 85), (130, 87)):
         with subtests.test(frames=frames):

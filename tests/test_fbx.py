@@ -1,11 +1,13 @@
 """FBX files: the container, motions written and read back, and files that are damaged or made to do harm."""
 
+import math
 import struct
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.fixtures import SHARED, needs_third_party
 from support.motions import synthetic
 from support.refusals import bounded
@@ -280,6 +282,74 @@ def test_pivots_offsets_and_orders_of_rotation_follow_the_documented_formula(tmp
     # scaled by 2 around the pivot (0, 1, 0): the child stays as well
     motion = animated(tmp_path, ScalingPivot=(0.0, 1.0, 0.0), **{"Lcl Scaling": (2.0, 2.0, 2.0)})
     np.testing.assert_allclose(motion.positions[0, 1], [0, 1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("order", range(6))
+def test_a_node_has_the_product_of_the_matrices_in_the_documentation(order: int, tmp_path: Path):
+    random = np.random.default_rng(order)
+    names = ("RotationOffset", "RotationPivot", "ScalingOffset", "ScalingPivot")
+    moves = {name: random.normal(size=3) for name in names}
+    turns = {name: random.uniform(-90, 90, 3) for name in ("PreRotation", "PostRotation")}
+    angles, sizes = random.uniform(-90, 90, 3), random.uniform(0.5, 2, 3)
+    animation = {"Lcl Rotation": angles, "Lcl Scaling": sizes}
+    values = {name: tuple(map(float, row)) for name, row in (moves | turns | animation).items()}
+    motion = animated(tmp_path, RotationOrder=(float(order),), **values)
+
+    def move(vector: np.ndarray) -> np.ndarray:
+        matrix = np.eye(4)
+        matrix[:3, 3] = vector
+        return matrix
+
+    def turn(axes: str, degrees: np.ndarray) -> np.ndarray:
+        """The rotation about the first axis comes first."""
+        matrix = np.eye(4)
+        for axis in axes:
+            rotation = Rotation.from_euler(axis, degrees["xyz".index(axis)], degrees=True)
+            matrix[:3, :3] = rotation.as_matrix() @ matrix[:3, :3]
+        return matrix
+
+    # Autodesk, "FBX SDK Programmer's Guide", Computing transformation matrices
+    axes = ("xyz", "xzy", "yzx", "yxz", "zxy", "zyx")[order]
+    offset, pivot, size_offset, size_pivot = moves.values()
+    product = move(offset) @ move(pivot) @ turn("xyz", turns["PreRotation"]) @ turn(axes, angles)
+    product = product @ np.linalg.inv(turn("xyz", turns["PostRotation"])) @ move(-pivot)
+    product = product @ move(size_offset) @ move(size_pivot) @ np.diag([*sizes, 1])
+    product = product @ move(-size_pivot)
+    np.testing.assert_allclose(motion.positions[0, 0], product[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(motion.positions[0, 1], (product @ [0, 1, 0, 1])[:3], atol=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [-0.5, 2.0])
+def test_a_take_begins_at_its_first_key(seconds: float, tmp_path: Path):
+    motion = animated(tmp_path)
+    root = fbx.read(tmp_path / "scene.fbx")
+    objects = root.first("Objects")
+    assert objects is not None
+    (curve,) = objects.all("AnimationCurve")
+    (times,) = (record for record in curve.children if record.name == "KeyTime")
+    times.properties[0] = times.properties[0] + round(seconds * fbx_scene.TICKS)
+    fbx.write(tmp_path / "scene.fbx", root)
+    later = fbx_scene.read(tmp_path / "scene.fbx")
+    np.testing.assert_allclose(later.positions, motion.positions, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mode", "custom", "fps"),
+    [(0, 12.5, 12.5), (14, 90.0, 90.0), (6, 12.5, 30), (11, 0.0, 24), (0, 0.0, 30), (0, 1e6, 30)],
+)
+def test_the_rate_of_an_fbx_file_is_that_of_its_mode_or_its_own(
+    mode: int, custom: float, fps: float, tmp_path: Path
+):
+    animated(tmp_path)
+    root = fbx.read(tmp_path / "scene.fbx")
+    settings = root.first("GlobalSettings")
+    block = settings.first("Properties70") if settings else None
+    assert block is not None
+    block.add("P", "TimeMode", "enum", "", "", Int(mode))
+    block.add("P", "CustomFrameRate", "double", "Number", "", custom)
+    fbx.write(tmp_path / "scene.fbx", root)
+    motion = fbx_scene.read(tmp_path / "scene.fbx")
+    assert (motion.fps, len(motion.positions)) == (fps, math.floor(fps) + 1)
 
 
 def test_records_come_back_with_their_types(tmp_path: Path, subtests):

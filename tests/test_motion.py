@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.motions import synthetic
+from support.motions import posed, synthetic
 from support.refusals import error_of
 from support.runs import TINY, untrained
 
@@ -193,6 +193,24 @@ def test_a_joint_far_from_constant_bone_lengths_is_named_with_its_frame(ending, 
     motion.joints[7, 21, 1] += 0.05
     line = motion.save(tmp_path / f"walk.{ending}")
     assert "right_wrist in frame 7, where a bone changes its length" in line
+
+
+def test_joints_at_another_rate_follow_accelerated_paths_and_rotations_turn_evenly():
+    times = np.arange(13)[:, None, None] / 30
+    joints = synthetic("walk").joints[0] + times**2 * [1.0, 2, 3]
+    resampled = Motion(joints, 30.0).resampled(50.0)
+    later = np.arange(21)[:, None, None] / 50
+    assert resampled.fps == 50
+    np.testing.assert_allclose(
+        resampled.joints, synthetic("walk").joints[0] + later**2 * [1.0, 2, 3], atol=1e-5
+    )
+    turning = posed(11, left_shoulder=np.linspace((0, 0, -60), (0, 0, 60), 11))
+    faster = turning.resampled(60.0)
+    expected = posed(31, left_shoulder=np.linspace((0, 0, -60), (0, 0, 60), 31))
+    np.testing.assert_allclose(faster.joints, expected.joints, atol=1e-6)
+    assert faster.poses is not None
+    assert expected.poses is not None
+    np.testing.assert_allclose(faster.poses.rotations, expected.poses.rotations, atol=1e-9)
 
 
 def test_contacts_at_another_rate_are_those_of_the_nearest_frame(walk: Motion):

@@ -237,6 +237,37 @@ def test_a_linear_track_of_rotations_turns_at_a_constant_rate_the_shorter_way():
     np.testing.assert_allclose(angles[:3], [0, 25, 50], atol=1e-9)
 
 
+def test_the_densest_keys_of_all_tracks_determine_the_rate(monkeypatch):
+    times = {0: [0, 0.5, 1], 1: [0, 1 / 60, 2 / 60], 2: [0, 1 / 30, 2 / 30]}
+    monkeypatch.setattr(
+        glb_animation.glb,
+        "numbers",
+        lambda file, accessor, kind: np.array(times[accessor], float)[:, None],
+    )
+    file: Any = SimpleNamespace(document={"asset": {}})
+    items: Any = [
+        SimpleNamespace(samplers=[SimpleNamespace(input=number) for number in numbers])
+        for numbers in ((0, 1), (2,))
+    ]
+    assert glb_animation._rate(file, items) == 60
+    assert glb_animation._rate(file, items[::-1]) == 60
+
+
+def test_an_animated_node_is_scaled_then_turned_then_moved():
+    half = 0.5**0.5
+    node = {"scale": [2, 3, 4], "rotation": [0, 0, half, half], "translation": [7, 8, 9]}
+    slopes = np.zeros((2, 2, 3))
+    moves = glb_animation.Track(
+        np.array([0.0, 1]), np.array([[0.0, 0, 0], [10, 0, 0]]), "LINEAR", slopes
+    )
+    fixed = glb_animation._animated(node, {}, np.array([0.0]))[0]
+    # x becomes 2 y, and y becomes -3 x
+    np.testing.assert_allclose(fixed @ [1, 0, 0, 1], [7, 10, 9, 1], atol=1e-12)
+    np.testing.assert_allclose(fixed @ [0, 1, 0, 1], [4, 8, 9, 1], atol=1e-12)
+    moved = glb_animation._animated(node, {"translation": moves}, np.array([0.25]))[0]
+    np.testing.assert_allclose(moved @ [1, 0, 0, 1], [2.5, 2, 0, 1], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("gaps", "extras", "fps"),
     [

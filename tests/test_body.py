@@ -1,5 +1,6 @@
 """Bodies: a sound mesh, bound to clips and skinned."""
 
+import math
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 from support.motions import degrees, frames_array, posed, sway
 
@@ -15,7 +17,8 @@ from flame_mdm.formats import body as body_module
 from flame_mdm.formats.body import fit_body, proportions
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.people import HEADS, load_body
-from flame_mdm.formats.posture import _toes
+from flame_mdm.formats.poses import _smooth, solve
+from flame_mdm.formats.posture import _flat_foot, _toes, complete, world_rotations
 from flame_mdm.representations.skeleton import JOINT, KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize import player_page, render
@@ -367,6 +370,52 @@ def test_weights_are_rounded_to_255_parts():
     assert parts[:2].tolist() == [[127, 77, 51, 0], [255, 0, 0, 0]]
     assert bones.tolist() == [[2, 0, 3, 0], [1, 0, 0, 0], [4, 3, 2, 1]]
     assert parts[2].tolist() == [84, 71, 57, 43]
+
+
+def test_a_flat_foot_is_as_deep_as_the_ankle_is_above_the_toes_while_both_are_low():
+    offset = np.array([0.03, -0.02, 0.12])
+    length, ahead = np.linalg.norm(offset), np.array([0.03, 0, 0.12]) / np.hypot(0.03, 0.12)
+    cases = (([0.06] * 3, 0.06), ([0.0] * 3, 0.1 * length), ([0.2] * 3, 0.8 * length))
+    for above, drop in cases:
+        toe = np.zeros((9, 3))
+        ankle = toe + np.array([0, 0.5, 0])  # the heel is high in most frames
+        ankle[3:6, 1] = above
+        flat = _flat_foot(ankle, toe, offset)
+        expected = math.sqrt(length**2 - drop**2) * ahead - np.array([0, drop, 0])
+        np.testing.assert_allclose(flat, expected, atol=1e-12)
+
+
+def test_a_body_that_is_never_upright_has_a_level_head_on_average():
+    bowed = Motion(posed(9, pelvis=(70, 0, 0)).joints, 20)
+    neutral, world, _ = complete(
+        bowed.joints.astype(float), np.array(ADULT[:22]), world_rotations(solved(bowed))
+    )
+    assert np.isfinite(neutral).all()
+    assert np.isfinite(world).all()
+    assert degrees(world[:, JOINT["head"]]).max() < 1
+
+
+@pytest.mark.parametrize("heading", [-1.0, 0.7, 2.5])
+def test_the_direction_of_a_level_head_does_not_depend_on_where_the_body_faces(heading: float):
+    results = []
+    for angle in (0.0, heading):
+        motion = posed(5, heading=angle, neck=(25, 0, 10), spine3=(5, 0, 0))
+        offsets = np.array(ADULT[:22])
+        joints, world = motion.joints.astype(float), world_rotations(solved(motion))
+        results.append(complete(joints, offsets, world)[0])
+    np.testing.assert_allclose(results[1], results[0], atol=1e-5)
+    assert degrees(results[0][JOINT["head"]]) > 10
+
+
+def solved(motion: Motion) -> np.ndarray:
+    return solve(torch.from_numpy(motion.joints), motion.fps).rotations.numpy()
+
+
+@pytest.mark.parametrize("frames", [0.4, 3.0])
+def test_bends_are_smoothed_by_a_gaussian_over_frames(frames: float):
+    values = np.random.default_rng(0).normal(size=(40, 3))
+    expected = gaussian_filter1d(values, frames, axis=0, mode="nearest")
+    np.testing.assert_allclose(_smooth(torch.from_numpy(values), frames), expected, atol=1e-7)
 
 
 def test_toes_bend_against_the_pitch_of_the_foot_until_it_leaves_the_floor():

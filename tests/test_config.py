@@ -196,6 +196,7 @@ def test_recipes_outside_the_repository(tmp_path, subtests):
         ("ema: {decays: 0.9}", "unknown config key 'ema.decays'"),
         ("seed: abc", "seed=abc: must be a whole number"),
         ("seed: -1", "seed=-1: must be between 0 and"),
+        ("seed: 4294967296", "seed=4294967296: must be between 0 and 4294967295"),
         ("initial_weights: 3", "initial_weights=3: must be a string or null"),
         ("lr_decay: x", "lr_decay=x: must be a finite number or null"),
         ("lr_warmup: 1.5", "lr_warmup=1.5: must be a whole number or null"),

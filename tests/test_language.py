@@ -14,7 +14,7 @@ from flame_mdm.conditions.language.abilities import Abilities
 from flame_mdm.conditions.language.meaning import is_thing, nearest_actions
 from flame_mdm.conditions.language.parsing import understand
 from flame_mdm.conditions.language.reading import NotUnderstood, Reader
-from flame_mdm.conditions.language.spelling import corrections
+from flame_mdm.conditions.language.spelling import corrections, distance
 from flame_mdm.conditions.language.tables import actions
 from flame_mdm.conditions.language.tokens import corrected_to_action, tokenize
 from flame_mdm.conditions.language.understanding import Mention, Understanding
@@ -231,7 +231,9 @@ def test_a_sentence_without_a_known_action_is_refused_with_three_actions(text, s
 
 def test_a_word_in_no_table_acts_as_the_nearest_action_or_is_known_as_a_thing():
     assert nearest_actions("brawl")[0][0] == "punch"
-    assert understand("two men brawl").mentions[0].action == "punch"
+    brawl, walk = understand("two men brawl, then walk").mentions
+    assert (brawl.action, brawl.typed) == ("punch", "brawl")
+    assert (walk.action, walk.typed) == ("walk", "")
     assert is_thing("helmet")
     assert "helmet" in understand("a person throws a helmet").objects
     assert nearest_actions("qwertzy") == []
@@ -294,6 +296,41 @@ def test_a_word_for_an_action_replaces_one_token_and_keeps_the_others():
     assert [token.typed for token in corrected] == [token.typed for token in tokens]
     assert (corrected[2].start, corrected[2].end) == (tokens[2].start, tokens[2].end) == (13, 20)
     assert corrected_to_action(tokens, [0, 1]) == tokens
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "most", "expected"),
+    [
+        ("walk", "walk", 2, 0),
+        ("wlak", "walk", 2, 1),  # swapped
+        ("wak", "walk", 2, 1),  # missing
+        ("waalk", "walk", 2, 1),  # additional
+        ("wolk", "walk", 2, 1),  # replaced
+        ("", "abc", 5, 3),
+        ("kitten", "sitting", 5, 3),
+        ("kitten", "sitting", 2, 3),  # more than allowed
+        ("wander", "a", 2, 3),
+        ("abcdef", "fedcba", 9, 5),
+    ],
+)
+def test_letters_that_are_swapped_missing_additional_or_replaced_are_counted(
+    first: str, second: str, most: int, expected: int
+):
+    assert distance(first, second, most) == distance(second, first, most) == expected
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("jupm", ("jump",)),
+        ("jxxp", ()),  # two letters of a short word
+        ("cartwhxel", ("cartwheel",)),
+        ("cxrtwhxel", ("cartwheel",)),
+        ("cxrtwhxex", ()),  # three letters of a long word
+    ],
+)
+def test_short_words_may_have_one_wrong_letter_and_long_words_two(word: str, expected: tuple):
+    assert corrections(word) == expected
 
 
 def test_a_word_is_not_corrected_if_it_is_english(subtests):

@@ -3,6 +3,7 @@
 import math
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,24 @@ def test_a_motion_on_each_rig_is_read_back(rig: str | None, tmp_path: Path):
     if "root" in presets().get(rig or "", {}):
         root = motion.positions[:, motion.names.index(expected.joints[0])]
         assert np.abs(root).max() < 0.2 * MILLIMETER
+
+
+def test_a_person_on_soles_is_lifted_in_the_world_also_below_a_turned_root():
+    turned = Rotation.from_euler("xyz", [-90, 20, 0], degrees=True).as_matrix()
+    start = clip("unreal", root_motion=True)
+    rest, turns = start.rest.copy(), start.turns.copy()
+    rest[start.root] = turned
+    turns[:, start.root] = turns[:, start.root] @ turned
+    below = replace(start, rest=rest, turns=turns)
+    assert 0.01 < below.lift < 0.05
+    offsets, moves = below.on_soles()
+    hips = max(below.moves)
+    before, after = below.world()[0], replace(below, offsets=offsets, moves=moves).world()[0]
+    lifted = np.array([0, below.lift, 0])
+    np.testing.assert_allclose(after[:, 1:], before[:, 1:] + lifted, atol=1e-9)
+    np.testing.assert_array_equal(after[:, below.root], before[:, below.root])
+    moved = rest[below.root] @ (offsets[hips] - below.offsets[hips])
+    np.testing.assert_allclose(moved, lifted, atol=1e-12)
 
 
 @pytest.mark.parametrize("fps", [20, 24, 25, 30, 60, 29.97, 12.5])

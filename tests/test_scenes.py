@@ -16,12 +16,12 @@ from support.refusals import bounded
 
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
-from flame_mdm.formats import fbx_scene, glb, glb_animation, scenes
+from flame_mdm.formats import fbx_scene, glb, glb_animation, scenes, vrma
 from flame_mdm.formats.animated import AnimatedNodes
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.visualize.body import mannequin
 
 FILES = SHARED / "data" / "files"
@@ -251,6 +251,44 @@ def test_the_densest_keys_of_all_tracks_determine_the_rate(monkeypatch):
     ]
     assert glb_animation._rate(file, items) == 60
     assert glb_animation._rate(file, items[::-1]) == 60
+
+
+def test_hands_and_toes_of_a_vrm_avatar_follow_the_limb_in_the_rest_pose_of_the_body():
+    motion = posed(1)
+    rig = vrma.rest_rig(motion.posed())
+    turned = rig.turned(np.tile(np.eye(3), (1, 22, 1, 1)))
+    local = rig.local(turned)[0]
+    for side, sign in (("left", 1), ("right", -1)):
+        for name in ("wrist", "foot"):
+            np.testing.assert_allclose(local[JOINT[f"{side}_{name}"]], np.eye(3), atol=1e-9)
+        bones = {
+            "elbow": (sign, 0, 0),
+            "wrist": (sign, 0, 0),
+            "knee": (0, -1, 0),
+            "ankle": (0, -1, 0),
+        }
+        for name, direction in bones.items():
+            joint = JOINT[f"{side}_{name}"]
+            bone = rig.positions[joint] - rig.positions[SMPL22.parents[joint]]
+            np.testing.assert_allclose(bone / np.linalg.norm(bone), direction, atol=1e-9)
+        toes = rig.positions[JOINT[f"{side}_foot"]] - rig.positions[JOINT[f"{side}_ankle"]]
+        assert toes[0] == pytest.approx(0)
+        assert toes[2] > 0
+    # With these rotations, the avatar has the joints of the body.
+    positions = rig.assembled(turned, motion.joints[:, 0].astype(float))
+    np.testing.assert_allclose(positions, motion.joints, atol=1e-6)
+
+
+def test_hips_of_a_vrma_file_are_on_soles_at_rest_and_in_the_motion(tmp_path: Path):
+    motion = synthetic("kick")
+    motion.save(tmp_path / "kick.vrma")
+    poses, fitted = motion.posed(), motion.try_fit()[0]
+    assert fitted is not None
+    hips = Glb(tmp_path / "kick.vrma").document["nodes"][0]["translation"]
+    height = vrma.rest_rig(poses).positions[0, 1] + fitted.lift
+    np.testing.assert_allclose(hips, [0, height, 0], atol=1e-6)
+    moved = glb_animation.read(tmp_path / "kick.vrma").positions[:, 0]
+    np.testing.assert_allclose(moved, poses.root.numpy() + np.array([0, fitted.lift, 0]), atol=1e-5)
 
 
 def test_an_animated_node_is_scaled_then_turned_then_moved():

@@ -214,6 +214,51 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio, monkeypatch
         studio.motions(request.model_copy(update={"seed": 1}))
 
 
+@pytest.mark.parametrize(
+    ("request_", "text", "captions", "advice"),
+    [
+        (
+            DemoRequest(text="a man walks forward, then jumps moonily"),
+            "a man walks forward | jumps moonily",
+            ["a person walks forward", "a person jumps"],
+            [],  # the reading has the words that are ignored
+        ),
+        (
+            DemoRequest(text="a man walks forward, then jumps moonily", split=False),
+            "a man walks forward, then jumps moonily",
+            [],
+            ["never seen in training: moonily. Did you mean 'a person jumps forward'?"],
+        ),
+        (
+            DemoRequest(text="a person walks @1 | waves"),
+            "a person walks @1 | waves",
+            ["a person walks forward", "a person waves"],
+            [],
+        ),
+        (
+            DemoRequest(text="walks", split=False, edits=(DemoEdit(text="a person glorps"),)),
+            "walks",
+            [],
+            ["never seen in training: glorps."],
+        ),
+        (DemoRequest(text=""), "", [], []),
+    ],
+)
+def test_a_sentence_becomes_parts_that_are_read_unless_it_stays_as_it_is(
+    studio, request_: DemoRequest, text: str, captions: list[str], advice: list[str]
+):
+    understood = studio.understood(request_)
+    assert understood == request_.model_copy(update={"text": text})
+    read = [caption for reading in studio.readings(understood) for caption in reading.captions]
+    assert read == captions
+    assert studio.advice(understood) == advice
+
+
+def test_parts_that_are_too_long_for_the_page_are_not_read(studio):
+    with pytest.raises(UserError, match="the parts are too long"):
+        studio.understood(DemoRequest(text="walks @20 | waves @11"))
+
+
 def test_refusals_of_files_name_no_temporary_folder(studio, subtests):
     request = DemoRequest(text="a person walks", **FAST)
     studio.motions(request)

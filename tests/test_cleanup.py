@@ -16,6 +16,7 @@ from flame_mdm.formats.cleanup import (
     _constant_bones,
     _contacts,
     _follow_feet,
+    _keep_heights,
     _least_squares,
     _push_out,
     _smooth,
@@ -26,7 +27,7 @@ from flame_mdm.formats.cleanup import (
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.representations.skeleton import SKELETONS, SMPL22
+from flame_mdm.representations.skeleton import JOINT, SKELETONS, SMPL22
 
 FPS = 20
 
@@ -368,3 +369,38 @@ def test_a_bent_leg_moves_its_foot_by_the_shift_and_keeps_its_bones():
     others = [joint for joint in range(22) if joint not in leg[1:]]
     np.testing.assert_array_equal(moved[:, others], joints[:, others])
     assert (moved[:, 4, 2] > joints[:, 7, 2]).all(), "the knee stays in front"
+
+
+def test_a_foot_that_longer_bones_push_down_is_raised_to_its_height():
+    crouched = posed(5, left_hip=(-40, 0, 0), left_knee=(60, 0, 0), left_ankle=(-20, 0, 0))
+    before = crouched.joints.astype(float)
+    motion = before.copy()
+    toe, ankle = JOINT["left_foot"], JOINT["left_ankle"]
+    motion[:, toe, 1] -= np.array([0, 0.02, 0.05, 0.02, 0])  # only the foot is longer
+    _keep_heights(motion, before, SMPL22)
+    np.testing.assert_allclose(motion[:, toe, 1], before[:, toe, 1], atol=1e-6)
+    raised = [0, 0.02, 0.05, 0.02, 0]
+    np.testing.assert_allclose(motion[:, ankle, 1] - before[:, ankle, 1], raised, atol=1e-6)
+    others = [joint for joint in range(22) if joint not in (JOINT["left_knee"], ankle, toe)]
+    np.testing.assert_array_equal(motion[:, others], before[:, others])
+    # A foot that bones push up is not lowered.
+    higher = before + np.array([0, 0.1, 0])
+    expected = higher.copy()
+    _keep_heights(higher, before, SMPL22)
+    np.testing.assert_array_equal(higher, expected)
+
+
+@pytest.mark.parametrize(("height", "is_lifted"), [(0.4, False), (0.0, True)])
+def test_toes_are_lifted_to_the_floor_but_not_in_the_air(height: float, is_lifted: bool):
+    """A body that hangs has no floor above y = 0."""
+    bent = 1 - np.sin(np.clip((np.arange(200) - 90) / 18, 0, 1) * np.pi) ** 2
+    hips, knees = (np.array([degrees, 0, 0]) * bent[:, None] for degrees in (-50, 80))
+    toes = [JOINT["left_foot"], JOINT["right_foot"]]
+    joints = posed(
+        200, left_hip=hips, left_knee=knees, right_hip=(-50, 0, 0), right_knee=(80, 0, 0)
+    )
+    moved = joints.joints.astype(float)
+    moved[..., 1] += height - np.percentile(moved[:, toes, 1].min(1), 10)
+    assert moved[:, toes, 1].min() < height - 0.1  # the left leg hangs down for a moment
+    lowest = cleanup(moved, 20.0, SMPL22)[:, toes, 1].min() - height
+    assert (lowest > -0.02) == is_lifted

@@ -404,3 +404,18 @@ def test_toes_are_lifted_to_the_floor_but_not_in_the_air(height: float, is_lifte
     assert moved[:, toes, 1].min() < height - 0.1  # the left leg hangs down for a moment
     lowest = cleanup(moved, 20.0, SMPL22)[:, toes, 1].min() - height
     assert (lowest > -0.02) == is_lifted
+
+
+@pytest.mark.parametrize("down", [0.0, 0.2, -0.3, -0.58, -0.65])
+def test_a_bent_leg_keeps_its_bones_wherever_its_foot_is_moved(down: float):
+    leg = np.array([[[0, 0.8, 0], [0, 0.4, 0.1], [0, 0.12, 0], [0, 0.05, 0.1]]], float)
+    thigh, shin, foot = (np.linalg.norm(bone) for bone in np.diff(leg[0], axis=0))
+    moved = leg.copy()
+    bend(moved, [0, 1, 2, 3], np.array([[0, -down, 0.0]]))
+    np.testing.assert_array_equal(moved[0, 0], leg[0, 0])
+    lengths = [np.linalg.norm(bone) for bone in np.diff(moved[0], axis=0)]
+    np.testing.assert_allclose(lengths, [thigh, shin, foot], atol=1e-9)
+    assert moved[0, 1, 2] >= -1e-9  # the knee stays in front
+    distance = 0.68 + down
+    if abs(thigh - shin) + 1e-3 < distance < 0.999 * (thigh + shin):
+        np.testing.assert_allclose(moved[0, 2], [0, 0.12 - down, 0], atol=1e-9)

@@ -279,6 +279,13 @@ def test_pretraining_is_simcse_with_64_clips_per_step_and_a_temperature_of_a_ten
         )
 
 
+def test_captions_are_encoded_in_the_same_order_in_every_process():
+    captions = [f"{a}{b}" for a in "zyxab" for b in "dcb"] + ["longer", "zz", "zz"]
+    text: Any = None  # the method needs no encoder
+    distinct = PretrainedText._distinct(text, captions)
+    assert distinct == ["longer", *sorted({*captions} - {"longer"}), ""]
+
+
 def test_every_option_that_changes_encodings_has_a_cache_of_its_own(tmp_path):
     common: dict[str, Any] = {
         "model": "owner/name",

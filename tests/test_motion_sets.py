@@ -18,9 +18,25 @@ import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Attributes, example
 from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
-from flame_mdm.formats.gaits import Clip, find_cycle, gait, moving, passing, progress, turn
+from flame_mdm.formats.cleanup import bend
+from flame_mdm.formats.gaits import (
+    Clip,
+    closed,
+    find_cycle,
+    gait,
+    loop,
+    moving,
+    passing,
+    progress,
+    straightened,
+    turn,
+    with_neighbors,
+)
 from flame_mdm.formats.grounding import (
+    FEET,
     GroundedMotion,
+    _lack,
+    _shift,
     anchored,
     grounded,
     jolt,
@@ -625,3 +641,172 @@ def test_a_toe_is_planted_if_it_is_slow_before_or_after_a_frame():
     planted = planted_toes(joints, 20.0)
     assert np.flatnonzero(planted[:, 0]).tolist() == list(range(20, 40))
     assert planted[:, 1].all()
+
+
+def moving_body(world: np.ndarray, contacts: np.ndarray, fps: float = 30.0) -> GroundedMotion:
+    """A motion on a root that stays at the origin."""
+    count = len(world)
+    return GroundedMotion(world, np.zeros((count, 2)), np.zeros(count), contacts, fps)
+
+
+def test_a_foot_in_the_air_is_not_planted_and_short_contacts_and_gaps_are_ignored():
+    joints = np.zeros((120, 22, 3))
+    left, right = JOINT["left_foot"], JOINT["right_foot"]
+    joints[:, right, 1] = 0.3
+    joints[40:43, left, 1] = 0.2  # 0.05 s at 60 fps
+    joints[80:, left, 1] = 0.2
+    joints[100:103, left, 1] = 0.0
+    planted = planted_toes(joints, 60.0)
+    assert not planted[:, 1].any()
+    assert np.flatnonzero(planted[:, 0]).tolist() == list(range(80))
+
+
+@pytest.mark.parametrize(
+    ("hip", "shift", "expected"),
+    [
+        (0.7, 0.0, 0.0),
+        (0.79, 0.3, 0.79 - np.sqrt((0.999 * 0.8) ** 2 - 0.09)),
+        (0.6, 0.3, 0.0),  # low enough
+        (0.85, 0.0, 0.0),  # the leg is longer than its bones already
+        (0.85, 0.3, 0.85 - np.sqrt(0.85**2 - 0.09)),
+    ],
+)
+def test_hips_are_lowered_until_the_leg_reaches_the_footprint(
+    hip: float, shift: float, expected: float
+):
+    world = np.zeros((1, 4, 3))
+    knee = np.sqrt(0.4**2 - (min(hip, 0.8) / 2) ** 2)
+    world[0] = [[0, hip, 0], [0, hip / 2, knee], [0, 0, 0], [0, 0, 0.1]]
+    if hip > 0.8:
+        world[0, 1] = [0, hip - 0.4, 0]
+    lack = _lack(world, (0, 1, 2, 3), np.array([[shift, 0, 0]]))
+    length = np.linalg.norm(world[0, 1] - world[0, 0]) + np.linalg.norm(world[0, 1])
+    if hip <= 0.8:
+        assert length == pytest.approx(0.8)
+    assert lack[0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_lowered_body_keeps_its_feet_at_their_height_and_a_fixed_pose_unchanged(at_end: bool):
+    pose = posed(1, left_knee=(2, 0, 0), right_knee=(2, 0, 0)).joints[0].astype(float)
+    world = np.tile(pose, (12, 1, 1))
+    away = np.linspace(0, 0.35, 12)[:: 1 if at_end else -1]
+    lower = 0.15 * away / 0.35  # the knees bend while the left foot is far away
+    world[..., 1] -= lower[:, None]
+    for leg, distance in zip(FEET, (away, 0 * away), strict=True):
+        bend(world, leg, np.stack([distance, lower, 0 * away], 1))
+    motion = moving_body(world, np.ones((12, 2), bool))
+    fixed = planted(motion, fixed_start=not at_end, fixed_end=at_end).world()
+    frame = -1 if at_end else 0
+    np.testing.assert_allclose(fixed[frame], world[frame], atol=1e-6)
+    lowered = (world - fixed)[:, 0, 1]
+    assert lowered[0 if at_end else -1] > 0.05  # otherwise, the leg would be too short
+    toes = fixed[:, JOINT["left_foot"]]
+    np.testing.assert_allclose(toes[:, 1], world[:, JOINT["left_foot"], 1], atol=2e-3)
+    np.testing.assert_allclose(toes[:, 0], toes[frame, 0], atol=2e-3)
+
+
+def test_toes_of_a_fixed_pose_stay_as_low_as_they_are():
+    world = np.tile(posed(1).joints[0].astype(float), (8, 1, 1))
+    world[..., 1] -= world[..., 1].min() + np.linspace(0.0, 0.03, 8)[:, None]
+    motion = moving_body(world, np.zeros((8, 2), bool))
+    fixed = planted(motion, fixed_end=True).world()
+    np.testing.assert_allclose(fixed[-1], world[-1], atol=1e-6)
+    free = planted(motion).world()
+    assert free[-1, JOINT["left_foot"], 1] == pytest.approx(0, abs=1e-3)
+
+
+def test_the_shift_of_a_planted_toe_is_horizontal():
+    toe = np.zeros((9, 3))
+    toe[:, 0] = np.linspace(0, 0.08, 9)
+    toe[:, 1] = np.linspace(0, 0.03, 9)
+    flags = np.zeros(9, bool)
+    flags[2:7] = True
+    shift = _shift(toe, flags, False, False, 3)
+    np.testing.assert_array_equal(shift[:, 1], 0)
+    np.testing.assert_allclose((toe + shift)[2:7, 0], toe[2:7, 0].mean())
+    np.testing.assert_allclose(shift[[0, 8]], shift[[2, 6]])  # held before and after the contact
+
+
+def test_a_foot_slides_as_far_as_it_is_from_where_it_was_planted():
+    world = np.zeros((5, 22, 3))
+    world[:, JOINT["left_foot"], 0] = [0.5, 0, 0.1, 0.04, 0.5]
+    world[:, JOINT["left_foot"], 1] = [0, 0, 9, 0, 0]  # heights do not count
+    contacts = np.zeros((5, 2), bool)
+    contacts[1:4, 0] = True
+    assert slide(moving_body(world, contacts)) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "is_taken"), [(0, True), (30, True), (-30, True), (45, False), (-45, False)]
+)
+def test_a_gait_may_differ_by_35_degrees_and_begins_with_a_landing_of_the_left_foot(
+    walk: GroundedMotion, degrees: float, is_taken: bool
+):
+    cycle = find_cycle(walk, degrees)
+    assert (cycle is not None) == is_taken
+    if cycle is not None:
+        landed = walk.contacts[cycle.first, 0] and not walk.contacts[cycle.first - 1, 0]
+        assert landed
+        assert 0.5 <= (cycle.last - cycle.first) / walk.fps <= 1.8
+
+
+def test_a_straightened_path_is_as_long_as_the_way_in_the_direction():
+    times = np.arange(21) / 20
+    # The root faces +x and accelerates to its left, which is -z, to 2 m/s.
+    motion = GroundedMotion(
+        np.zeros((21, 22, 3)),
+        np.stack([0.3 * times, -(times**2)], 1),
+        np.full(21, np.pi / 2),
+        np.ones((21, 2), bool),
+        20.0,
+    )
+    straight = straightened(motion, 90)
+    np.testing.assert_allclose(straight.path[:, 0], times**2, atol=0.005)
+    np.testing.assert_allclose(straight.path[:, 1], 0, atol=1e-12)
+    assert not straight.heading.any()
+
+
+def test_a_closed_cycle_spreads_the_difference_of_its_ends_around_its_middle():
+    local = np.tile(posed(1).joints[0].astype(float), (5, 1, 1))
+    local[..., 1] += np.linspace(0, 0.1, 5)[:, None]
+    contacts = np.arange(10).reshape(5, 2) % 3 == 0
+    cycle = closed(moving_body(local, contacts))
+    np.testing.assert_allclose(cycle.local, np.tile(local[2], (5, 1, 1)), atol=1e-12)
+    np.testing.assert_array_equal(cycle.contacts[-1], contacts[0])
+    np.testing.assert_array_equal(cycle.contacts[:-1], contacts[:-1])
+
+
+@pytest.mark.parametrize(
+    ("meters", "degrees", "is_kept"),
+    [(1.5, 0, True), (0, 90, True), (0.2, 24, False)],
+)
+def test_a_loop_travels_and_turns_at_a_constant_rate_or_stays(
+    meters: float, degrees: float, is_kept: bool
+):
+    frames = np.arange(61)
+    motion = GroundedMotion(
+        np.tile(posed(1).joints[0].astype(float), (61, 1, 1)),
+        np.stack([0 * frames, meters * frames / 60], 1),
+        np.radians(degrees) * frames / 60,
+        np.ones((61, 2), bool),
+        20.0,
+    )
+    middle = loop(motion)
+    share = np.linspace(0, 1 / 3, 21) if is_kept else np.zeros(21)
+    np.testing.assert_allclose(middle.path[:, 1], share * meters, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(middle.heading), share * degrees, atol=1e-9)
+
+
+def test_clips_have_neighbors_so_that_filters_do_not_mix_them():
+    def of(heights: list[float]) -> GroundedMotion:
+        local = np.zeros((len(heights), 22, 3))
+        local[:, 0, 1] = heights
+        return moving_body(local, np.ones((len(heights), 2), bool))
+
+    clips = [Clip("a", "start", of([1, 2, 3]), ""), Clip("b", "loop", of([5, 6, 7, 5]), "")]
+    joints, slices = with_neighbors(clips, 4)
+    first = [1, 1, 1, 1, 1, 2, 3, 3, 3, 3, 3]
+    second = [7, 5, 6, 7, 5, 6, 7, 5, 6, 7, 5, 6]
+    assert joints[:, 0, 1].tolist() == first + second
+    assert [joints[part, 0, 1].tolist() for part in slices] == [[1, 2, 3], [5, 6, 7, 5]]

@@ -481,15 +481,17 @@ def test_a_limb_turns_about_the_axis_that_its_bend_at_rest_shows(
 
 def test_offsets_and_local_rotations_of_a_scaled_and_turned_skeleton_give_its_rest_pose():
     random = np.random.default_rng(0)
+    angles = random.uniform(-180, 180, (5, 3))
+    frame, *turned = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     rig = Rig(
         joints=("root", "hips", "spine", "leg"),
         parents=(-1, 0, 1, 1),
         positions=random.normal(size=(4, 3)),
-        turns=Rotation.random(4, random_state=0).as_matrix(),
+        turns=np.stack(turned),
         sources=(-1, 0, 3, 1),
         neutral=np.tile(np.eye(3), (4, 1, 1)),
         orders=("XYZ",) * 4,
-        frame=Rotation.random(random_state=1).as_matrix(),
+        frame=frame,
         scales=np.array([1.0, 0.01, 0.01, 0.02]),
     )
     offsets, rest = rig.offsets(), rig.rest()

@@ -18,6 +18,7 @@ from flame_mdm.formats.cleanup import (
     _follow_feet,
     _keep_heights,
     _least_squares,
+    _lift,
     _push_out,
     _smooth,
     bend,
@@ -419,3 +420,15 @@ def test_a_bent_leg_keeps_its_bones_wherever_its_foot_is_moved(down: float):
     distance = 0.68 + down
     if abs(thigh - shin) + 1e-3 < distance < 0.999 * (thigh + shin):
         np.testing.assert_allclose(moved[0, 2], [0, 0.12 - down, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("depth", "lifted"), [(0.005, 0.0), (0.01, 0.0), (0.04, 0.03)])
+def test_a_toe_is_lifted_to_one_centimeter_below_the_floor(depth: float, lifted: float):
+    crouched = posed(9, left_hip=(-40, 0, 0), left_knee=(60, 0, 0), left_ankle=(-20, 0, 0))
+    before = crouched.joints.astype(float)
+    toe = JOINT["left_foot"]
+    before[..., 1] -= before[:, toe, 1].min() + depth - 0.2
+    motion = before.copy()
+    leg = next(chain[1:] for chain in SMPL22.chains if chain[-1] == toe)
+    _lift(motion, leg, 0.2)
+    np.testing.assert_allclose(motion[4, toe] - before[4, toe], [0, lifted, 0], atol=1e-3)

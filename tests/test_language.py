@@ -368,16 +368,16 @@ def selects() -> dict[str, list[tuple[str, bool, str]]]:
     assert "<span>jumps</span> then <span>sits down</span> <del>" in page  # two actions in a part
     assert "<b>" not in page
     assert page.count(" then ") == 3
-    found = {}
+    options_of = {}
     for part, content in enumerate(page.split(" then ")[:2]):
         for name, options in re.findall(r'<select aria-label="(\w+)".*?>(.*?)</select>', content):
-            found[f"{name} {part}"] = [
+            options_of[f"{name} {part}"] = [
                 (unescape(text), bool(selected), unescape(label))
                 for text, selected, label in re.findall(
                     r'<option value="(.*?)"( selected)?>(.*?)</option>', options
                 )
             ]
-    return found
+    return options_of
 
 
 def test_chips_show_the_action_and_attributes_that_a_text_states():

@@ -215,6 +215,13 @@ def test_a_motion_that_no_body_fits_says_why(subtests):
             ]
 
 
+def test_the_summary_of_a_picture_says_why_it_has_no_body(tmp_path):
+    summary = posed().save(tmp_path / "a.gif")
+    assert summary.endswith("animated GIF with at most 50 frames per second")
+    summary = posed(scale=3.0).save(tmp_path / "a.gif")
+    assert "per second; without a body: the bone that ends in left_knee is" in summary
+
+
 @pytest.mark.parametrize(
     "matrix", [np.ones((3, 3)), np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)]
 )

@@ -257,6 +257,7 @@ def test_numbers_are_no_typos_and_no_forms_of_other_words():
         ("a person hops to the right on the left leg", {"side": "left", "direction": "right"}),
         ("a person looks over the left shoulder", {"direction": "left"}),
         ("a person walks back", {"direction": "backward"}),
+        ("a person walks with a hand on the back", {}),
         ("a person walks in a circle to the left", {"direction": "counterclockwise"}),
         ("a person walks to the right in a circle", {"direction": "clockwise"}),
         ("a person walks clockwise in a circle", {"direction": "clockwise"}),

@@ -48,6 +48,12 @@ class Process:
         self.returncode = 143
 
 
+def test_a_parallel_run_needs_two_gibibytes_of_free_memory(monkeypatch):
+    for free, is_enough in ((2 * 2**30, True), (2 * 2**30 - 1, False)):
+        monkeypatch.setattr("flame_mdm.data.resident.free_memory", lambda device, free=free: free)
+        assert trainings._has_memory() == is_enough
+
+
 @pytest.fixture
 def processes(monkeypatch) -> type[Process]:
     Process.started, Process.at_once, Process.codes = [], [], {}

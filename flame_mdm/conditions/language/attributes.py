@@ -112,11 +112,7 @@ class Reader:
         before, after = self._word(position - 1), self._word(position + 1)
         if value in ("up", "down") and "vertical" not in self.entry.takes:
             return
-        if (
-            word in ("back", "reverse", "right", "left")
-            and before in words_of("determiners")
-            and word == "back"
-        ):
+        if word == "back" and before in words_of("determiners"):
             return
         if value in LEFT_OR_RIGHT:
             after = self._word(position + 2) if after in words_of("determiners") else after

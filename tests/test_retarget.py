@@ -19,7 +19,7 @@ from support.motions import largest_step, posed, synthetic
 
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh, character_meshes, characters, fbx_scene, glb, glb_animation
+from flame_mdm.formats import bvh, character_meshes, characters, fbx, fbx_scene, glb, glb_animation
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.posture import world_rotations
 from flame_mdm.formats.readers import read
@@ -624,7 +624,7 @@ def test_meshes_of_a_character_keep_their_parts_materials_and_images(kick: Motio
     document["images"] = [{"bufferView": view, "mimeType": "image/png"}, {"uri": "elsewhere.png"}]
     document["textures"] = [{"source": 1}, {"source": 0}]
     surface = {"baseColorFactor": [0.5, 0.25, 2.0, 1], "baseColorTexture": {"index": 1}}
-    document["materials"] = [{"name": "cloth", "pbrMetallicRoughness": surface}, {}]
+    document["materials"] = [{"name": "../cloth", "pbrMetallicRoughness": surface}, {}]
     (mesh,) = document["meshes"]
     (whole,) = mesh["primitives"]
     bare = {"POSITION": whole["attributes"]["POSITION"]}
@@ -641,7 +641,7 @@ def test_meshes_of_a_character_keep_their_parts_materials_and_images(kick: Motio
     first, second = character_meshes.meshes(glb.read(path))
     assert (first.name, second.name) == ("body 1", "body 2")
     (cloth,), (plain,) = first.palette, second.palette
-    assert (cloth.name, cloth.image) == ("cloth", image.getvalue())
+    assert (cloth.name, cloth.image) == ("../cloth", image.getvalue())
     np.testing.assert_allclose(cloth.color, [0.5 ** (1 / 2.2), 0.25 ** (1 / 2.2), 1])
     assert (plain.name, plain.image) == ("material", b"")
     # The second part is bound to no joint, so it follows its node.
@@ -650,6 +650,12 @@ def test_meshes_of_a_character_keep_their_parts_materials_and_images(kick: Motio
     # It has no normals, so they are computed; the first part has those of the same surface.
     np.testing.assert_allclose(np.linalg.norm(second.normals, axis=1), 1)
     assert (first.normals * second.normals).sum(1).mean() > 0.98
+
+    kick.save(tmp_path / "wave.fbx", character=path)
+    objects = fbx.read(tmp_path / "wave.fbx").first("Objects")
+    assert objects is not None
+    (video,) = objects.all("Video")
+    assert video.value("RelativeFilename") == "___cloth.png", "a file beside the scene"
 
 
 def test_normals_that_a_file_lacks_are_means_of_its_triangles_weighted_by_area():

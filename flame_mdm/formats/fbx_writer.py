@@ -6,6 +6,7 @@ the scene, because Unreal and Unity would treat a node above them as a bone. The
 bones is stored in `PreRotation`, so that rotations of 0 result in the rest pose in every program.
 """
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -203,7 +204,8 @@ class _Writer:
         properties.add("P", "DiffuseFactor", "Number", "", "A", 1.0)
         if material.image:
             ending = "png" if material.image.startswith(b"\x89PNG") else "jpg"
-            file = f"{material.name}.{ending}"
+            # Programs extract the image under this name, so it must not lead to another folder
+            file = re.sub(r"[^ \w-]", "_", material.name) + f".{ending}"
             video, record = self._object("Video", material.name, "Clip")
             record.add("Type", "Clip")
             record.add("UseMipMap", Int(0))

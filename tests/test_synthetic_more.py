@@ -11,8 +11,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from evaluators.metrics.attributes import (
     UNDECIDED,
+    _arms,
+    _is_a_body,
     _kick,
     _locomotion,
+    _lowered,
+    _nods,
     read_all,
     read_attributes,
     right_attributes,
@@ -520,6 +524,222 @@ def test_a_kick_is_far_in_front_and_high_and_each_one_counts(
     view = standing_view(right_ankle=ankle)
     expected = {"action": "kick", "side": "right", "count": count} if count else {}
     assert _kick(view.smooth, 0.0, view.forward) == expected
+
+
+@pytest.mark.parametrize(
+    ("neck", "toes", "stands"), [(0.26, 0.51, True), (0.24, 0.51, False), (0.26, 0.49, False)]
+)
+def test_a_body_stands_if_its_neck_and_its_pelvis_are_high(neck: float, toes: float, stands: bool):
+    still = np.repeat(example({"action": "stand"}, FPS)[:1].astype(np.float64), 40, axis=0)
+    pelvis = still[:, [0], 1]
+    still[:, [12], 1], still[:, [10, 11], 1] = pelvis + neck, pelvis - toes
+    assert read_attributes(still, FPS) == ({"action": "stand"} if stands else {})
+
+
+def test_limbs_of_a_body_have_plausible_lengths_and_move_smoothly():
+    still = np.repeat(example({"action": "stand"}, FPS)[:1].astype(np.float64), 20, axis=0)
+    limbs = [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)]
+    lengths = [np.linalg.norm(still[0, a] - still[0, b]) for a, b in limbs]
+    for scale, plausible in (
+        (0.149 / min(lengths), False),
+        (0.151 / min(lengths), True),
+        (0.599 / max(lengths), True),
+        (0.601 / max(lengths), False),
+    ):
+        assert _is_a_body(scale * still, scale * still) == plausible, scale
+    shift = np.array([0.0, 0.012, 0.016])  # 2 cm
+    assert _is_a_body(still + 0.99 * shift, still)
+    assert not _is_a_body(still + 1.01 * shift, still)
+    # Each of the 8 limbs is 160 times in the motion with 20 frames: 90 % are 144
+    for changed, share, plausible in ((15, 1.26, True), (16, 1.26, False), (19, 1.24, True)):
+        longer = still.copy()
+        bone = still[:, 20] - still[:, 18]
+        longer[:, 20] += (share - 1) * bone * (np.arange(20) < min(changed, 9))[:, None]
+        other = still[:, 21] - still[:, 19]
+        longer[:, 21] += (share - 1) * other * (np.arange(20) < changed - 9)[:, None]
+        assert _is_a_body(longer, longer) == plausible, (changed, share)
+
+
+UPRIGHT, LEVEL = (0.0, 0.5, 0.1), (0.0, 0.2, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "moved", "shown"),
+    [
+        ((0.79, UPRIGHT), (0.71, UPRIGHT), 0.0, {"action": "sit"}),
+        ((0.79, UPRIGHT), (0.73, UPRIGHT), 0.0, {}),
+        ((0.77, UPRIGHT), (0.71, UPRIGHT), 0.0, {}),
+        ((0.79, UPRIGHT), (0.36, UPRIGHT), 0.0, {"action": "sit"}),
+        ((0.79, UPRIGHT), (0.34, UPRIGHT), 0.0, {}),
+        ((0.5, UPRIGHT), (0.9, UPRIGHT), 0.0, {"action": "rise"}),
+        ((0.5, UPRIGHT), (0.9, LEVEL), 0.0, {}),
+        ((0.5, LEVEL), (0.9, UPRIGHT), 0.0, {}),
+        ((0.79, UPRIGHT), (0.34, LEVEL), 0.0, {"action": "lie"}),
+        ((0.79, UPRIGHT), (0.36, LEVEL), 0.0, {}),
+        ((0.77, UPRIGHT), (0.34, LEVEL), 0.0, {}),
+        ((0.5, LEVEL), (0.5, LEVEL), 0.34, {"action": "crawl", "direction": "forward"}),
+        ((0.5, LEVEL), (0.5, LEVEL), -0.34, {"action": "crawl", "direction": "backward"}),
+        ((0.5, LEVEL), (0.5, LEVEL), 0.32, {}),
+        ((0.36, LEVEL), (0.36, LEVEL), 0.5, {"action": "crawl", "direction": "forward"}),
+        ((0.64, LEVEL), (0.64, LEVEL), 0.5, {"action": "crawl", "direction": "forward"}),
+        ((0.34, LEVEL), (0.34, LEVEL), 0.5, {}),
+        ((0.66, LEVEL), (0.66, LEVEL), 0.5, {}),
+    ],
+)
+@pytest.mark.parametrize("floor", [0.0, -0.4])
+def test_lowered_bodies_are_told_apart_by_the_heights_of_the_pelvis_and_the_tilt(
+    start: tuple[float, tuple], end: tuple[float, tuple], moved: float, shown: dict, floor: float
+):
+    view = standing_view(40)
+    for joint, offset in ((0, (0.0, 0.0, 0.0)), (12, None)):
+        for frames, (height, neck) in ((slice(0, 20), start), (slice(20, 40), end)):
+            view.smooth[frames, joint] = np.array([0.0, floor + height, 0.0]) + (offset or neck)
+    view.smooth[..., 2] += 3.0 + np.linspace(0, moved, 40)[:, None]
+    assert _lowered(view.smooth, floor, view.forward, 20.0) == shown
+
+
+def arm_view(frames: int, fps: float, first: int = 5, **there: Any) -> View:
+    """A standing body of which some joints are at a point for `frames` frames, from frame `first` on."""
+    rest = standing_view(int(3 * fps))
+    for name, path in there.items():
+        rest.smooth[first : first + frames, SMPL22.joints.index(name)] = path
+    return rest
+
+
+def up(side: str = "left", height: float = 0.55) -> dict[str, Any]:
+    """An arm that is above the shoulder; the arm is 0.55 m long."""
+    x = 0.2 if side == "left" else -0.2
+    wrist = 1.4 + height
+    return {f"{side}_elbow": (x, wrist - 0.25, 0.0), f"{side}_wrist": (x, wrist, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("frames", "fps", "joints", "sides"),
+    [
+        (7, 20, up(), "left"),
+        (6, 20, up(), None),
+        (11, 30, up("right"), "right"),
+        (10, 30, up("right"), None),
+        (7, 20, up() | up("right"), "both"),
+        (7, 20, up(height=0.415), "left"),
+        (7, 20, up(height=0.41), None),
+    ],
+)
+def test_a_raised_arm_points_up_for_a_third_of_a_second(
+    frames: int, fps: int, joints: dict[str, Any], sides: str | None
+):
+    view = arm_view(frames, fps, **joints)
+    expected = {"action": "raise", "side": sides} if sides else {}
+    assert _arms(view.smooth, view.forward, fps) == expected
+    # An arm that is up from the start does not rise
+    view = arm_view(3 * fps, fps, first=0, **joints)
+    assert _arms(view.smooth, view.forward, fps) == {"action": "stand"}
+
+
+@pytest.mark.parametrize(("swing", "waves"), [(0.5, True), (0.05, False)])
+@pytest.mark.parametrize("sides", [("left",), ("right",), ("left", "right")])
+@pytest.mark.parametrize("fps", [20, 30])
+def test_in_a_wave_the_forearm_swings_about_the_elbow(
+    swing: float, waves: bool, sides: tuple[str, ...], fps: int
+):
+    view = standing_view(3 * fps)
+    angle = swing * np.sin(4 * np.pi * np.arange(3 * fps) / fps)  # twice per second
+    for name in sides:
+        out = 1 if name == "left" else -1
+        elbow = np.array([0.5 * out, 1.4, 0.0])
+        fore = 0.25 * np.stack([out * np.sin(angle), np.cos(angle), 0 * angle], -1)
+        view.smooth[:, SMPL22.joints.index(f"{name}_elbow")] = elbow
+        view.smooth[:, SMPL22.joints.index(f"{name}_wrist")] = elbow + fore
+    side = sides[0] if len(sides) == 1 else "both"
+    expected = {"action": "wave", "side": side} if waves else {"action": "stand"}
+    assert _arms(view.smooth, view.forward, fps) == expected
+
+
+@pytest.mark.parametrize(
+    ("reach", "drawn", "count"), [(0.445, 0.32, 2), (0.435, 0.32, 0), (0.445, 0.34, 1)]
+)
+@pytest.mark.parametrize(("side", "x"), [("left", 0.2), ("right", -0.2)])
+def test_punches_stretch_the_arm_and_are_drawn_back(
+    reach: float, drawn: float, count: int, side: str, x: float
+):
+    view = standing_view(60)
+    wrist = SMPL22.joints.index(f"{side}_wrist")
+    view.smooth[10:14, wrist] = view.smooth[20:24, wrist] = x, 1.4, reach
+    view.smooth[14:20, wrist] = x, 1.4, drawn
+    expected = {"action": "punch", "side": side, "count": count} if count else {}
+    assert _arms(view.smooth, view.forward, 20.0) == expected
+
+
+@pytest.mark.parametrize(
+    ("closed", "opened", "count"), [(0.17, 0.29, 2), (0.18, 0.29, 0), (0.17, 0.27, 1)]
+)
+def test_claps_bring_the_hands_together_and_apart(closed: float, opened: float, count: int):
+    view = standing_view(60)
+    wrists = [SMPL22.joints.index(f"{side}_wrist") for side in ("left", "right")]
+    for frames, apart in (
+        (slice(10, 60), opened),
+        (slice(20, 24), closed),
+        (slice(30, 34), closed),
+    ):
+        for wrist, sign in zip(wrists, (1, -1), strict=True):
+            view.smooth[frames, wrist] = sign * apart / 2, 1.2, 0.3
+    expected = {"action": "clap", "count": count} if count else {}
+    assert _arms(view.smooth, view.forward, 20.0) == expected
+
+
+@pytest.mark.parametrize(
+    ("later", "ahead", "throws"), [(9, 0.39, True), (10, 0.39, False), (9, 0.37, False)]
+)
+def test_a_throw_moves_the_hand_from_above_the_shoulder_to_the_front_in_half_a_second(
+    later: int, ahead: float, throws: bool
+):
+    wrist = np.tile([-0.2, 0.85, 0.0], (60, 1))
+    wrist[20] = -0.2, 1.41, 0.09
+    wrist[21 : 20 + later] = -0.2, 1.41, 0.11
+    wrist[20 + later :] = -0.2, 1.3, ahead
+    view = standing_view(60, right_wrist=wrist)
+    shown = _arms(view.smooth, view.forward, 20.0)
+    assert (shown == {"action": "throw", "side": "right"}) == throws
+    turned = _arms(view.smooth, -view.forward, 20.0)  # to the back
+    assert turned.get("action") != "throw"
+
+
+@pytest.mark.parametrize(
+    ("frames", "offset", "salutes"),
+    [
+        (9, (0.22, 0.0, 0.0), True),
+        (8, (0.22, 0.0, 0.0), False),
+        (9, (0.23, 0.0, 0.0), False),
+        (9, (0.2, -0.07, 0.0), True),
+        (9, (0.2, -0.09, 0.0), False),
+    ],
+)
+def test_a_salute_holds_a_hand_at_the_head(
+    frames: int, offset: tuple[float, float, float], salutes: bool
+):
+    view = arm_view(
+        frames, 20, right_wrist=np.array([0.0, 1.6, 0.0]) - np.array([1, -1, 1]) * offset
+    )
+    shown = _arms(view.smooth, view.forward, 20.0)
+    assert (shown == {"action": "salute", "side": "right"}) == salutes
+    # A hand that stays at the head does not salute
+    held = arm_view(
+        60, 20, 0, right_wrist=np.array([0.0, 1.6, 0.0]) - np.array([1, -1, 1]) * offset
+    )
+    assert _arms(held.smooth, held.forward, 20.0) == {"action": "stand"}
+
+
+@pytest.mark.parametrize(
+    ("angle", "back", "count"), [(33, 21, 2), (31, 21, 0), (33, 23, 1), (-33, -21, 0)]
+)
+def test_nods_pitch_the_head_forward_and_back(angle: float, back: float, count: int):
+    pitch = np.zeros(60)
+    pitch[[*range(10, 14), *range(18, 22)]], pitch[14:18] = np.radians(angle), np.radians(back)
+    head = np.array([0.0, 1.45, 0.0]) + 0.15 * np.stack(
+        [0 * pitch, np.cos(pitch), np.sin(pitch)], -1
+    )
+    view = standing_view(60, head=head)
+    assert _nods(view.smooth, view.forward) == count
 
 
 @pytest.mark.parametrize(("degrees", "shown"), [

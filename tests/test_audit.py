@@ -14,7 +14,7 @@ import torch
 from support.fixtures import ROOT
 
 from evaluators import perturbations
-from evaluators.audit import _agreement, _inputs, _Measure
+from evaluators.audit import _agreement, _differences, _inputs, _interval, _Measure
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
@@ -37,6 +37,7 @@ from flame_mdm.reporting.audit_cards import (
     write_card,
 )
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import write_json
 from flame_mdm.schemas import check_shape
 from flame_mdm.seeds import key
@@ -586,3 +587,162 @@ def test_a_difference_is_seen_if_it_exceeds_its_interval_and_rounding(card):
     level = response((0.5, 0.1), (0.41, 0.1))
     assert level is not None
     assert level.monotone
+
+
+def bodies(monkeypatch: pytest.MonkeyPatch, count: int = 6) -> Scene:
+    """Motions of 40 and more frames whose features are their joint positions, all different."""
+    monkeypatch.setattr(perturbations, "encode", lambda representation, motions: motions)
+    scene, generator = scene_of(count), np.random.default_rng(0)
+    scene.representation = cast(Any, SimpleNamespace(fps=20.0, skeleton=SMPL22))
+    scene.__dict__["joints"] = [
+        generator.normal(size=(40 + number, 22, 3)).cumsum(0) for number in range(count)
+    ]
+    return scene
+
+
+def set_of(name: str, scene: Scene) -> list[np.ndarray]:
+    """The motions of a perturbation with one set."""
+    ((_, make),) = listed(name).motions(scene).items()
+    return make()
+
+
+def test_mirrored_reversed_and_rounded_motions_are_those_of_the_scene(monkeypatch):
+    scene = bodies(monkeypatch)
+    names = SMPL22.joints
+    for x, mirrored, backward, rounded in zip(
+        scene.joints,
+        set_of("mirrored", scene),
+        set_of("reversed", scene),
+        set_of("half precision", scene),
+        strict=True,
+    ):
+        for joint, name in enumerate(names):
+            swap = {"left": "right", "right": "left"}
+            side, _, part = name.partition("_")
+            other = f"{swap[side]}_{part}" if side in swap else name
+            np.testing.assert_allclose(mirrored[:, names.index(other)], x[:, joint] * [-1, 1, 1])
+        np.testing.assert_array_equal(backward, x[::-1])
+        np.testing.assert_array_equal(rounded, x.astype(np.float16))
+    stored = set_of("as stored", scene)
+    assert all(np.array_equal(a, b) for a, b in zip(stored, scene.features, strict=True))
+
+
+def test_every_motion_continues_with_the_half_of_one_other_motion(monkeypatch):
+    scene = bodies(monkeypatch)
+    others = []
+    for number, joined in enumerate(set_of("other half", scene)):
+        joints = scene.joints[number]
+        half = len(joints) // 2
+        assert len(joined) == len(joints)
+        np.testing.assert_array_equal(joined[:half], joints[:half])
+        steps = np.diff(joined[half + 8 : half + 16], axis=0)  # after 0.4 s
+        others += [
+            index
+            for index, other in enumerate(scene.joints)
+            if np.allclose(np.diff(other[len(other) // 2 :][8:16], axis=0), steps)
+        ]
+        assert len(others) == number + 1
+        assert others[-1] != number
+    assert sorted(others) == list(range(6))
+
+
+def test_a_repetition_is_cut_only_out_of_motions_that_repeat(monkeypatch):
+    scene = bodies(monkeypatch, 4)
+    angle = 2 * np.pi * np.arange(60) / 20  # three periods
+    scene.joints[1] = np.sin(angle)[:, None, None] * np.linspace(0.5, 1, 66).reshape(1, 22, 3)
+    counts: list[Any] = [1, 3, "many", None]
+    for row, count in zip(scene.rows, counts, strict=True):
+        row.clip.attributes.update({"count": count} if count else {})
+    assert [perturbations.repetitions(row) for row in scene.rows] == [1, 3, 1, 1]
+    changed = set_of("dropped repetition", scene)
+    assert [len(x) for x in changed] == [40, 40, 42, 43]
+    assert all(changed[number] is scene.joints[number] for number in (0, 2, 3))
+    assert listed("dropped repetition").offered(scene, True) == [listed("dropped repetition")]
+    assert listed("dropped repetition").offered(scene_of(4), True) == []
+
+
+def test_memorized_motions_have_the_same_captions_or_else_the_same_action(monkeypatch):
+    scene = scene_of(3)
+    texts = [row.clip.captions for row in scene.rows]
+    training = [
+        Entry("same 1", 0, 30, "train", "", texts[0], 7, {}),
+        Entry("same 2", 0, 50, "train", "", texts[0], 7, {}),
+        Entry("same action", 0, 60, "train", "", ["other"], 0, {}),
+        Entry("action 1", 0, 70, "train", "", ["one of " + texts[1][0]], 1, {}),
+    ]
+    splits = []
+
+    def clips(split: str) -> Any:
+        splits.append(split)
+        return SimpleNamespace(clips=training, crop=lambda length, draws: np.arange(length // 2))
+
+    scene.data = cast(Any, SimpleNamespace(clips=clips))
+    monkeypatch.setattr(perturbations, "real_motions", lambda source, rows: rows)
+    copies: Any = set_of("memorized", scene)
+    chosen = [row.clip.id for row in copies]
+    assert chosen[0] in ("same 1", "same 2")
+    # No training motion shows the third action, so that the motion itself is kept
+    assert chosen[1:] == ["action 1", "clip 2"]
+    assert [len(row.frames) for row in copies] == [row.clip.length // 2 for row in copies]
+    assert [row.id for row in copies] == ["clip 0", "clip 1", "clip 2"]
+    assert splits == ["train"]
+    drawn = {set_of("memorized", replace(scene, seed=seed))[0].clip.id for seed in range(20)}  # type: ignore[attr-defined]
+    assert drawn == {"same 1", "same 2"}
+
+
+def test_wrong_captions_are_of_other_motions_and_near_misses_differ_in_one_attribute():
+    scene = scene_of()
+    for row, count in zip(scene.rows, range(40), strict=True):
+        row.clip.attributes["count"] = 1 + count // 20
+        row.clip.captions[:] = [
+            f"{name} {value}"
+            for name, value in [("all", " ".join(map(str, row.clip.attributes.values())))]
+        ]
+    wrong = scene.wrong
+    assert list(wrong) == [
+        "wrong captions",
+        "near misses",
+        "near misses: count",
+        "near misses: side",
+    ]
+    for number, row in enumerate(scene.rows):
+        said = row.clip.attributes
+        for kind, texts in wrong.items():
+            text = texts[number]
+            if text is None:
+                assert kind == "near misses: side"
+                assert "side" not in said
+                continue
+            differing = {
+                name
+                for name in said.keys() | text.requested
+                if said.get(name) != text.requested.get(name)
+            }
+            if kind == "wrong captions":
+                assert differing
+            elif kind == "near misses":
+                assert len(differing) == 1
+                assert differing <= {"count", "side"}
+            else:
+                assert differing == {kind.removeprefix("near misses: ")}
+    seen_attributes = {
+        name
+        for row, text in zip(scene.rows, wrong["near misses"], strict=True)
+        if text
+        for name in row.clip.attributes
+        if row.clip.attributes[name] != text.requested[name]
+    }
+    assert seen_attributes == {"count", "side"}
+    assert replace(scene, seed=1).wrong["wrong captions"] != wrong["wrong captions"]
+    assert replace(scene).wrong == wrong
+
+
+def test_intervals_are_95_percent_of_the_resamples_and_differences_are_paired():
+    assert _interval(np.array([2.0, 1.0, 3.0, 1.0, 3.0])) == [2.0, 1.96]
+    assert _interval(np.array([2.0, 1.0, np.nan])) == [None, None]
+    base = {"fid": np.array([1.0, 3.0, 1.0]), "r": np.array([0.5, 0.5, 0.5])}
+    changed = {"fid": np.array([4.0, 6.5, 3.5])}
+    assert _differences(changed, base) == {
+        "fid": [4.0, 2.94, 3.0, 0.98],
+        "r": [None] * 4,
+    }

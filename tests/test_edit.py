@@ -209,6 +209,12 @@ def test_a_part_of_a_motion_begins_and_ends_at_the_nearest_frame(diffusion, moti
     assert len(part.features) == 15
 
 
+def test_a_part_of_a_motion_keeps_its_text_and_its_notes(diffusion, motion):
+    source = replace(motion, notes=("resampled",))
+    part = part_of(diffusion.representation, source, [0, 1])
+    assert (part.text, part.id, part.notes) == ("a person walks", "walk", ("resampled",))
+
+
 def test_the_last_frame_of_a_read_motion_steps_on_at_the_same_height(diffusion):
     """Features have a row for each pair of frames, so that the last frame is continued over the floor."""
     representation = diffusion.representation
@@ -366,6 +372,12 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
     for model, options, message in cases:
         with subtests.test(message=message), one_line_error(message):
             edit(model, motion, **options)
+
+
+def test_a_motion_as_long_as_the_longest_training_motion_is_edited(motion):
+    model = build(TINY, max_frames=len(motion.features))
+    (edited,) = edit(model, motion, region="suffix", num_inference_steps=2)
+    assert len(edited.joints) == len(motion.features)
 
 
 def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path, subtests):

@@ -80,6 +80,27 @@ def test_nearest_is_that_of_all_windows_of_which_copies_have_distance_zero(subte
             assert best > 0.05
 
 
+def test_a_motion_longer_than_all_training_motions_has_no_neighbor():
+    motions = [walk(seed, 20) for seed in (0, 1)]
+    distances = training(motions).nearest([walk(2, 21), walk(3, 40), walk(4, 41)], None)
+    assert distances.tolist() == [[torch.inf]] * 3
+    # The only window is the entire set
+    assert training(motions[:1]).nearest([moved(motions[0], 2.0, (1, 1))], None).item() < 1e-9
+
+
+def test_features_are_compared_only_if_both_sides_have_them_and_without_rounding():
+    motions = [walk(seed, 20) for seed in (0, 1)]
+    features = 1000 + torch.randn(30, 8, generator=torch.Generator().manual_seed(0))
+    store = training(motions, features)
+    assert store.nearest(motions, None).shape == (2, 1)
+    assert training(motions).nearest(motions, features[:2]).shape == (2, 1)
+    copies = store.nearest([motions[0]] * 30, features)
+    assert copies[:, 1].tolist() == [0.0] * 30
+    # The nearest of the training motions counts, not the one with the same number
+    shifted = store.nearest(motions, features[[7, 3]] + torch.tensor([3.0, 4.0, *[0.0] * 6]) / 1000)
+    torch.testing.assert_close(shifted[:, 1].float(), torch.full((2,), 0.005), rtol=0.05, atol=0)
+
+
 def test_copies_are_counted():
     metric = NearestTraining()
     real = torch.linspace(0.1, 0.2, 100, dtype=torch.float64)[:, None]

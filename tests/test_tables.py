@@ -293,6 +293,9 @@ def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model(subtests)
     config = compose("quickstart", ["denoiser=mdm_unet", "optimizer.lr=0.1", "+process.min_snr=5"])
     network = "denoiser._target_=flame_mdm.denoisers.unet.MDMUNet"
     assert recipe_changes(config) == [network, "optimizer.lr=0.1", "process.min_snr=5"]
+    denoiser = compose("quickstart")["denoiser"] | {"_target_": "mine.Denoiser", "width": 7}
+    config = compose("quickstart", ["+denoiser_width=3"]) | {"denoiser": denoiser}
+    assert recipe_changes(config) == ["denoiser._target_=mine.Denoiser", "denoiser_width=3"]
     assert (
         recipe_changes({"experiment": "mine"}) == recipe_changes({"experiment": "quickstart"}) == []
     )

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.motions import posed
 from support.npm import node
 from support.refusals import error_of
@@ -47,11 +49,11 @@ from flame_mdm.formats.grounding import (
     slide,
 )
 from flame_mdm.formats.motion import Motion
-from flame_mdm.representations.skeleton import JOINT
+from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampling import motion_sets
 from flame_mdm.sampling.motion_sets import make_set, read_set, rig_clips, write_set
-from flame_mdm.sampling.reading import with_features
+from flame_mdm.sampling.reading import decoded, with_features
 from flame_mdm.visualize.body import mannequin
 
 CENTIMETER = 0.01
@@ -412,6 +414,95 @@ def test_candidates_are_compared_by_poses_feet_and_faults(monkeypatch, values, s
         ("Walk_Loop", "loop"),
         ("Walk_Stop", "stop"),
     ]
+
+
+def test_the_best_candidate_is_kept_and_has_the_bones_of_the_standing_body(
+    monkeypatch, walk: GroundedMotion
+):
+    content = motion_sets.MotionSet.model_validate(
+        {
+            "stand": "Idle",
+            "candidates": 3,
+            "motions": {
+                "Walk": {"text": "walks", "kind": "gait"},
+                "Idle": {"text": "stands", "kind": "loop"},
+                "Turn": {"text": "turns", "kind": "turn", "degrees": 90.0},
+            },
+        }
+    )
+    sizes = {"stands": 1.1, "walks": 0.9, "turns": 0.9}
+    scores = {"Idle": [5.0, 2.0, 3.0], "Walk": [4.0, 7.0, None], "Turn": [None] * 3}
+    calls: list[Any] = []
+
+    def takes(model: Any, motion: Any, content: Any, seed: int, options: Any) -> list[Any]:
+        calls.append((motion.text, seed, options))
+        return [replace(walk, local=sizes[motion.text] * walk.local) for _ in range(3)]
+
+    def clips(name: str, motion: Any, take: GroundedMotion, stand: np.ndarray) -> Any:
+        score = scores[name].pop(0)
+        clip = Clip(f"{name} {score}", motion.kind, take, motion.text)
+        return None if score is None else (score, [clip])
+
+    monkeypatch.setattr(motion_sets, "_takes", takes)
+    monkeypatch.setattr(motion_sets, "_clips", clips)
+    model: Any = SimpleNamespace(representation=SimpleNamespace(skeleton=SMPL22))
+    result = make_set(model, content, seed=7, guidance_scale=2.0)
+    assert calls == [(text, 7, {"guidance_scale": 2.0}) for text in ("stands", "walks", "turns")]
+    assert [clip.name for clip in result.clips] == ["Idle 2.0", "Walk 4.0"]
+    assert result.left_out == {"Turn": "none of 3 motions for 'turns' turns by 90 degrees"}
+
+    def lengths(joints: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(SMPL22.bones(torch.from_numpy(joints)).numpy(), axis=-1)
+
+    np.testing.assert_allclose(
+        lengths(result.clips[1].motion.local),
+        np.tile(lengths(1.1 * walk.local[0]), (len(walk), 1)),
+        atol=1e-6,
+    )
+
+
+@pytest.mark.parametrize(("kind", "frames"), [("loop", 3 * 40 + 1), ("gait", 40)])
+def test_candidates_are_sampled_as_the_set_says_and_loops_are_three_times_as_long(
+    monkeypatch, model: flame_mdm.MotionGenerator, kind: str, frames: int
+):
+    content = motion_sets.MotionSet.model_validate(
+        {
+            "stand": "Idle",
+            "candidates": 2,
+            "fps": 40.0,
+            "motions": {"Idle": {"text": "stands", "kind": kind, "seconds": 2.0}},
+        }
+    )
+    sampled = decoded(
+        model.representation,
+        torch.from_numpy(
+            with_features(model.representation, synthetic("a person walks")).features[:40]
+        ),
+        "walks",
+        "walk",
+    )
+    requested: list[Any] = []
+
+    def generate(model: Any, text: str, **options: Any) -> list[Motion]:
+        requested.append((text, options))
+        return [sampled] * options["samples"]
+
+    monkeypatch.setattr(motion_sets, "generate", generate)
+    monkeypatch.setattr(motion_sets, "cleaned", lambda take, contacts: take)
+    takes = motion_sets._takes(model, content.motions["Idle"], content, 3, {"eta": 0.5})
+    expected = {"samples": 2, "seconds": 2.0, "seed": 3, "loop": kind == "loop", "split": False}
+    assert requested == [("stands", {**expected, "eta": 0.5})]
+    assert len(takes) == 2
+    for take in takes:
+        assert take.fps == 40
+        # Twice the frame rate: one more frame between each pair of frames
+        assert len(take) == 2 * (frames - 1) + 1
+        period = 2 * 40
+        if kind == "loop":
+            heights = take.local[..., 1]
+            np.testing.assert_allclose(
+                heights[period + 8 : 2 * period], heights[8:period], atol=0.01
+            )
 
 
 def test_contacts_are_in_the_description_and_markers_in_the_files(small: Path, tmp_path: Path):

@@ -266,6 +266,7 @@ def test_frames_that_were_not_used_can_be_replaced(model, subtests):
             ),
         ):
             late.go_back(at)
+        assert late.text == "a person sits down", "a refused request changes nothing"
     with pytest.raises(UserError, match="cleanup=true: a cleaned block depends on the next block"):
         stream(model, "a person walks", cleanup=True).go_back(1)
 
@@ -651,6 +652,9 @@ def test_waypoints_change_later_blocks_alone_and_are_ahead_again_after_going_bac
     led.go_back((frame - 3) / FPS)
     assert led.reached == []
     next(led)
+    assert len(led.reached) == 1
+    with pytest.raises(UserError, match="not in the last 4 blocks"):
+        led.go_back(0)
     assert len(led.reached) == 1
     led.lead([])
     assert not np.allclose(next(plain).joints, blocks[0].joints, atol=1e-2)

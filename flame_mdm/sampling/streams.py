@@ -385,15 +385,16 @@ class Streams(Iterator[list[Motion]]):
         Raises:
             UserError: If the frame is not in one of the last `HELD` blocks.
         """
-        self.schedules[0].drop(frame)
-        self.waypoints.go_back(frame)
-        if frame == self.frames[0]:
-            return
         blocks = [block for block in self._past if block.begin < frame]
-        if not blocks or frame > self.frames[0]:
+        is_end = frame == self.frames[0]
+        if not is_end and (not blocks or frame > self.frames[0]):
             raise UserError(
                 f"frame {frame} is not in the last {HELD} blocks, which end at frame {self.frames[0]}. Use a later time"
             )
+        self.schedules[0].drop(frame)
+        self.waypoints.go_back(frame)
+        if is_end:
+            return
         self._past = deque(blocks, maxlen=HELD)
         block = blocks[-1]
         kept = frame - block.begin

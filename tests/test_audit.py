@@ -18,6 +18,8 @@ from evaluators.audit import _agreement, _differences, _inputs, _interval, _Meas
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
+from evaluators.metrics.distribution import frechet_distance
+from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.samples import SampleMetric
 from evaluators.perturbations import BASE, PERTURBATIONS, REAL
 from evaluators.protocol import DrawnClip, load_protocol
@@ -746,3 +748,42 @@ def test_intervals_are_95_percent_of_the_resamples_and_differences_are_paired():
         "fid": [4.0, 2.94, 3.0, 0.98],
         "r": [None] * 4,
     }
+
+
+def test_values_of_fewer_motions_are_those_of_the_first_ones(scene):
+    measure, sets, texts, _, _ = scene
+    few = {name: values[:16] for name, values in sets[BASE].items()}
+    values = measure(few, texts[:16])
+    generated = torch.from_numpy(sets[BASE]["features"][:16])
+    real = torch.from_numpy(sets[REAL]["features"])
+    for number in (0, 1, 50):
+        times = torch.from_numpy(measure.weights[number])
+        drawn = generated.repeat_interleave(times[:16], 0)
+        expected = frechet_distance(drawn, real.repeat_interleave(times, 0)).item()
+        assert values["fid"][number] == pytest.approx(expected)
+    sums, counts = sets[BASE]["jitter"][:16].T
+    np.testing.assert_allclose(
+        values["jitter"],
+        measure.weights[:, :16] @ sums / (measure.weights[:, :16] @ counts),
+    )
+    pairs = torch.cdist(generated, generated)
+    diversity = Diversity(pairs=4, replace=True).weighted({"generated": generated}, measure.weights)
+    for number in (0, 3):
+        rows = torch.arange(16).repeat_interleave(torch.from_numpy(measure.weights[number, :16]))
+        assert diversity[""][number] == pytest.approx(float(pairs[rows][:, rows].mean()))
+
+
+def test_a_card_states_which_values_are_exact_and_what_they_depend_on(scene):
+    measure, sets, texts, _, _ = scene
+    facts = {name: measure.facts_of(name) for name in measure(sets[BASE], texts)}
+    exact = {name for name, of_value in facts.items() if of_value["exact"]}
+    assert exact == {name for name in facts if name.startswith("attributes/")}
+    assert measure.truth == "attributes/all"
+    assert facts["fid"]["depends_on_count"]
+    assert not facts["jitter"]["depends_on_count"]
+    assert (facts["jitter"]["unit"], facts["fid"]["unit"]) == ("m/s^3", "")
+    assert [facts[f"attributes/{name}"]["sums_up"] for name in ("all", "action")] == [True, False]
+    assert facts["attributes/action"]["sees_meaning"]
+    assert not facts["jitter"]["sees_meaning"]
+    assert measure.direction_of("fid") is False
+    assert measure.direction_of("attributes/action") is True

@@ -333,6 +333,13 @@ def test_skating_resizing_wrists_drawn_in_and_pops(walk, subtests):
     sizes = np.linalg.norm(changed[:, [18, 19, 20, 21]], axis=-1)
     np.testing.assert_allclose(sizes, [[0.05, 0.05, 0.1, 0.1]] * len(walk))
     assert not np.delete(changed, [18, 19, 20, 21], 1).any()
+    # A wrist does not move past the axis of the trunk
+    far = p.draw_in(walk, 300)
+    axis = walk[:, 0] + 0.4 * (walk[:, AT["neck"]] - walk[:, 0])
+    for side in ("left", "right"):
+        np.testing.assert_allclose(far[:, AT[f"{side}_wrist"]], axis)
+        half = (axis - walk[:, AT[f"{side}_wrist"]]) / 2
+        np.testing.assert_allclose(far[:, AT[f"{side}_elbow"]], walk[:, AT[f"{side}_elbow"]] + half)
     kinds = [
         {fault.kind for fault in find_faults(Motion(p.draw_in(walk, grade), 20.0))}
         for grade in (0, 40)

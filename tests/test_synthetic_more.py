@@ -474,6 +474,56 @@ def test_a_slash_goes_down_and_inward_within_half_a_second(
     assert check("slash", standing_view(**cast(Any, {f"{side}_wrist": wrist}))) == expected
 
 
+@pytest.mark.parametrize(
+    ("walked", "lifted", "sunk", "shift", "side"),
+    [
+        (0.34, 0.1, 0.03, 0, "left"),
+        (0.34, 0.1, 0.03, 5, "right"),
+        (0.34, 0.1, 0.03, 2.5, None),
+        (0.32, 0.1, 0.03, 0, None),
+        (0.34, 0.019, 0.03, 0, None),
+        (0.34, 0.1, 0.019, 0, None),
+    ],
+)
+def test_in_a_limp_the_body_sinks_on_one_leg_while_the_other_foot_is_up(
+    walked: float, lifted: float, sunk: float, shift: float, side: str | None
+):
+    """The right foot is up in every second half of a period of 10 frames."""
+    phase = 2 * np.pi * np.arange(41) / 10
+    right_up = 0.5 + 0.5 * np.cos(phase)
+    low = 0.5 + 0.5 * np.cos(phase - 2 * np.pi * shift / 10)
+    ahead = np.linspace(0, walked, 41)
+    zero = np.zeros(41)
+    view = standing_view(
+        41,
+        right_ankle=np.stack([zero - 0.2, 0.08 + lifted * right_up, ahead], -1),
+        left_ankle=np.stack([zero + 0.2, zero + 0.08, ahead], -1),
+        pelvis=np.stack([zero, 0.95 - sunk * low, ahead], -1),
+    )
+    assert check("limp", view) == ({"action": "limp", "side": side} if side else {})
+
+
+@pytest.mark.parametrize(
+    ("stroke", "back", "count"), [(0.3, 0.2, 3), (0.3, 0.22, 1), (0.24, 0.2, 2)]
+)
+def test_knocks_are_strokes_near_the_farthest_point_of_the_hand(
+    stroke: float, back: float, count: int
+):
+    """The hand begins at its side and goes to 0.3 m ahead, to `stroke` m and to 0.3 m again."""
+    ahead = np.array([0, 0.3, back, stroke, back, 0.3, *[0.2] * 14])
+    wrist = np.stack([0 * ahead - 0.2, 0 * ahead + 1.2, ahead], -1)
+    expected = {"action": "knock", "side": "right", "count": count}
+    assert check("knock", standing_view(right_wrist=wrist)) == expected
+
+
+@pytest.mark.parametrize(("height", "stretches"), [(1.61, True), (1.59, False)])
+def test_a_stretch_sideways_has_both_hands_above_the_head(height: float, stretches: bool):
+    hands = {"left_wrist": (0.2, 1.9, 0.0), "right_wrist": (-0.2, height, 0.0)}
+    shown = check("stretch sideways", standing_view(head=(-0.14, 1.6, 0.0), **cast(Any, hands)))
+    expected = {"action": "stretch sideways", "direction": "right"}
+    assert shown == (expected if stretches else {})
+
+
 def test_a_rise_counts_after_the_signal_was_low():
     assert count_rises(np.array([5.0, 1, 3, 5, 3, 5, 2, 4.1, 0]), 4.0, 2.0) == 1
     assert count_rises(np.array([1.0, 4.0, 1.9, 4.1, 4.2, 1.9, 9]), 4.0, 2.0) == 2

@@ -13,6 +13,7 @@ from support.runs import TINY, inputs_of, untrained
 
 import flame_mdm
 from flame_mdm.__main__ import main
+from flame_mdm.batch import Edit
 from flame_mdm.commands.edit import EditSettings, origin
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
@@ -372,6 +373,24 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
     for model, options, message in cases:
         with subtests.test(message=message), one_line_error(message):
             edit(model, motion, **options)
+
+
+def test_only_variations_of_entire_motions_have_targets(diffusion, motion):
+    """Targets replace the kept part of an edit, so that both together would lose it."""
+    representation, frames = diffusion.representation, len(motion.features)
+    known = representation.normalize(torch.from_numpy(motion.features))[None]
+    keep = torch.zeros_like(known, dtype=torch.bool)
+    options: dict[str, Any] = {
+        "frames": frames,
+        "targets": {"root": [{"time": 1.0, "position": [0.1, 0.2]}]},
+        "num_inference_steps": 2,
+    }
+    whole = Edit(known, keep, strength=0.5)
+    (varied,) = flame_mdm.generate(diffusion, "a person walks", edit=whole, **options)
+    assert len(varied.joints) == frames
+    part = replace(whole, keep=keep.index_fill(1, torch.tensor([0]), True))
+    with one_line_error("an edit changes a single motion: omit .* targets"):
+        flame_mdm.generate(diffusion, "a person walks", edit=part, **options)
 
 
 def test_a_motion_as_long_as_the_longest_training_motion_is_edited(motion):

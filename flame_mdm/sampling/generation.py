@@ -82,7 +82,7 @@ def generate(
     """
     request = SamplingRequest.of("generate", {"texts": texts, **keywords})
     if edit is not None:
-        request.check_edit(edit.strength is not None)
+        request.check_edit(edit.strength is not None and not bool(edit.keep.any()))
     resolved = resolve(request, model)
     resolved = resolved if edit is None else replace(resolved, edit=edit)
     return sample(model, resolved, score=score, stages=stages)

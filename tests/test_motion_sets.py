@@ -577,6 +577,8 @@ def test_a_rig_without_a_root_moves_its_hips(tmp_path: Path):
         ({"prefix: Hero_": "prefix: ../up"}, 'prefix is "../up"'),
         ({"  Turn": "  ../Turn"}, "../Turn"),
         ({"fps: 30": "rig: unrael"}, "Did you mean unreal"),
+        ({"{kind: loop, text: a person stands, seconds: 2}": "5"}, "motions.Idle is 5"),
+        ({"{kind: loop, text: a person stands, seconds: 2}": "[a]"}, "motions.Idle is "),
     ],
 )
 def test_an_invalid_description_is_refused_in_one_line(

@@ -410,6 +410,14 @@ def test_bad_motions_and_options(subtests):
             if isinstance(representation, HumanML):
                 with pytest.raises(UserError, match=f"motion 1: .*{message}"):
                     representation.encode_many([wander(), motion])
+    for fps in (1, 12.5, 1000):
+        assert Rifke(fps=fps).fps == fps
+    for fps in (0.99, 1000.5, math.nan, math.inf):
+        with (
+            subtests.test(fps=fps),
+            pytest.raises(UserError, match=f"representation.fps={fps}: expected 1 to 1000"),
+        ):
+            Rifke(fps=fps)
     with pytest.raises(UserError, match="bone_lengths: got 2 numbers, but smpl22 has 22 joints"):
         HumanML(bone_lengths=[1.0, 2.0])
     with pytest.raises(UserError, match=r"smpl23.*smpl22"):

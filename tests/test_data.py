@@ -67,6 +67,37 @@ def store(root) -> Store:
     return Store(root / "s-humanml-clean-smpl22")
 
 
+def test_samples_are_padded_to_a_multiple_and_masks_mark_the_real_frames():
+    samples = [
+        ("a", torch.ones(5, 2), "walks", 1),
+        ("b", 2 * torch.ones(3, 2), "sits", 0),
+    ]
+    for multiple, most, frames in ((1, 0, 5), (4, 100, 8), (4, 7, 7), (4, 2, 5), (5, 9, 5)):
+        batch = collate(samples, multiple, most)
+        assert batch.x.shape == (2, frames, 2), (multiple, most)
+        assert batch.mask.tolist() == [[i < length for i in range(frames)] for length in (5, 3)]
+        assert batch.x[..., 0].sum(1).tolist() == [5, 6]
+        assert not batch.x[~batch.mask].any()
+    assert batch.lengths.tolist() == [5, 3]
+    assert (batch.ids, batch.text, len(batch)) == (["a", "b"], ["walks", "sits"], 2)
+    assert batch.action is not None
+    assert batch.action.tolist() == [1, 0]
+    partly = collate([samples[0], ("b", torch.ones(3, 2), None, None)])
+    assert partly.text is None
+    assert partly.action is None
+
+
+def test_all_tensors_of_a_batch_move_to_a_device():
+    batch = collate([("a", torch.ones(5, 2), "walks", 1), ("b", torch.ones(3, 2), "sits", 0)])
+    for moved in (batch, replace(batch, action=None)):
+        there = moved.to(torch.device("meta"))
+        assert there.x.device.type == there.mask.device.type == "meta"
+        assert (there.x.shape, there.mask.dtype) == ((2, 5, 2), torch.bool)
+        assert (there.action is None) == (moved.action is None)
+        assert there.action is None or there.action.device.type == "meta"
+        assert (there.ids, there.text) == (batch.ids, batch.text)
+
+
 def test_a_store_holds_what_was_encoded_and_samples_are_normalized_crops(store, tmp_path):
     made = next(iter(Synthetic(clips=40, seed=1).clips(20.0)))
     entry = next(e for e in store.clips if e.id == made.id)

@@ -19,13 +19,13 @@ from torch import Tensor
 
 import flame_mdm
 from flame_mdm import generate, stream
-from flame_mdm.batch import Condition, MotionBatch
+from flame_mdm.batch import Condition, Edit, MotionBatch
 from flame_mdm.data.standing import standing
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generator import MotionGenerator
+from flame_mdm.generator import Blocks, MotionGenerator
 from flame_mdm.processes.guidance import Positions
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampler_options import SamplerOptions
@@ -489,6 +489,28 @@ def test_a_jump_between_blocks_fades_in_half_a_second(model, monkeypatch):
         assert running._streams.blocks.fade == frames
         running.change("a person sits down", at=0.7)
         assert running._streams.schedules[0].until_change(0) == round(0.7 * fps)
+
+
+def test_a_fade_moves_the_generated_pose_but_not_what_an_edit_keeps(model):
+    prefix, _ = starting_point(model, None)
+    options = SamplerOptions(num_inference_steps=2).over(model.sampler_options)
+    batch = MotionBatch(prefix, torch.ones(1, CONTEXT, dtype=torch.bool), ["a"], text=["walks"])
+    cond = model.encode(batch)
+    known = torch.full((1, BLOCK, prefix.shape[2]), 3.0)
+    keep = torch.zeros_like(known, dtype=torch.bool)
+    keep[:, 1:4, 4:70] = True
+    edit = Edit(known, keep)
+    sharp, faded = (
+        Blocks(model, ["a"], prefix, options, fade=fade).sample(cond, edit=edit) for fade in (0, 8)
+    )
+    assert (sharp[keep] == 3).all()
+    assert (faded[keep] == 3).all()
+    pose = model.representation.pose
+    changed = (sharp != faded).any(1)[0]
+    assert not changed[: pose.start].any()
+    assert not changed[pose.stop :].any()
+    assert changed[pose].any()
+    assert torch.equal(sharp[:, 8:], faded[:, 8:])
 
 
 def test_the_target_of_a_block_is_the_position_in_its_last_frame_seen_from_its_first_one():

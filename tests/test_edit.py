@@ -375,6 +375,19 @@ def test_bad_edits_are_one_line(diffusion, flow, motion, subtests):
             edit(model, motion, **options)
 
 
+def test_the_error_of_kept_features_is_the_largest_one_in_standard_deviations(flow, motion):
+    stages: list[Motion] = []
+    options: dict[str, Any] = {"joints": "left_arm", "method": "mfm", "num_inference_steps": 3}
+    (edited,) = edit(flow, motion, "a person walks", stages=stages, fps=motion.fps, **options)
+    off = np.abs(edited.features - motion.features) / flow.representation.std.numpy()
+    assert edited.feature_error == pytest.approx(off[edited.keep].max(), rel=1e-3)
+    assert edited.feature_error > 10 * off[edited.keep].min()
+    assert len(stages) == 4  # three estimates and the motion
+    assert np.array_equal(stages[-1].joints, edited.joints)
+    with one_line_error("fps=30: this motion has 20 frames per second. Omit fps"):
+        edit(flow, motion, "a person walks", fps=30, **options)
+
+
 def test_only_variations_of_entire_motions_have_targets(diffusion, motion):
     """Targets replace the kept part of an edit, so that both together would lose it."""
     representation, frames = diffusion.representation, len(motion.features)

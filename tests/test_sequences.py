@@ -54,6 +54,25 @@ def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop, subtests
     assert not covered.weights[~covered.batch.mask].any()
 
 
+def test_windows_of_motions_of_different_lengths_have_weights_that_sum_to_one():
+    lengths, overlap = [[10, 10], [7], [12, 9, 30]], 4
+    positions = [
+        (row, first, size)
+        for row, parts in enumerate(lengths)
+        for _, first, size in spans(parts, 16, overlap)
+    ]
+    totals = [sum(parts) for parts in lengths]
+    windows = cover(positions, totals, overlap, 16, torch.device("cpu"))
+    for row, total in enumerate(totals):
+        of_row = windows.rows == row
+        sums = torch.zeros(total).index_add(
+            0, windows.frames[of_row].flatten(), windows.weights[of_row].flatten()
+        )
+        torch.testing.assert_close(sums, torch.ones(total))
+        # A frame that only one window contains has weight 1
+        assert windows.weights[of_row][0, 0] == 1
+
+
 def test_windows_of_a_long_part_are_evenly_spaced():
     """Starts are rounded to the nearest frame."""
     assert spans([200], longest=60, overlap=16) == [

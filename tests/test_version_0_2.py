@@ -20,6 +20,7 @@ from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import read_saved, renamed
 from flame_mdm.errors import UserError
 from flame_mdm.generator import DistilledGenerator, MotionGenerator
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training.adaptation import AdaptationTask
 from flame_mdm.training.distillation import DistillationTask
@@ -98,6 +99,10 @@ def test_a_student_loads_without_its_teacher_and_is_written_again(tmp_path):
     assert "trajectory" not in model.process.edit_modes
     with pytest.raises(UserError, match="the guidance is built into this distilled model"):
         flame_mdm.generate(model, model.facts["captions"][0], guidance_scale=2)
+    model.check_request(None, unconditioned=False)
+    model.check_request(SamplerOptions(guidance_scale=1.0), unconditioned=False)
+    with pytest.raises(UserError, match="trained only with conditions"):
+        model.check_request(None, unconditioned=True)
     assert main(["export", str(file), str(tmp_path / "again.safetensors")]) == 0
     again = flame_mdm.load(tmp_path / "again.safetensors")
     torch.testing.assert_close(again.state_dict(), model.state_dict(), rtol=0, atol=0)

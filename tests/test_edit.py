@@ -24,7 +24,15 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
 from flame_mdm.representations.smpl import SMPL
-from flame_mdm.sampling.editing import Edited, _part_length, edit
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.editing import (
+    MFM_STEPS,
+    Edited,
+    _part_length,
+    edit,
+    method_options,
+)
+from flame_mdm.sampling.motion_request import EditRequest
 from flame_mdm.sampling.reading import decoded, part_of, read_motion, with_features
 from flame_mdm.seeds import seeded_noise
 
@@ -208,6 +216,23 @@ def test_a_part_of_a_motion_begins_and_ends_at_the_nearest_frame(diffusion, moti
     part = part_of(diffusion.representation, motion, [0.52, 1.23])
     np.testing.assert_allclose(part.features[:, 4:67], motion.features[10:25, 4:67], atol=1e-4)
     assert len(part.features) == 15
+
+
+def test_a_part_may_be_the_entire_motion_but_not_empty_or_longer(diffusion, motion):
+    representation, seconds = diffusion.representation, len(motion.features) / 20
+    assert len(part_of(representation, motion, [0, seconds]).features) == len(motion.features)
+    for cut in ([0.5, 0.51], [0, seconds + 0.05], [-0.05, 1]):
+        with one_line_error("is not a range within walk, which lasts 2 seconds"):
+            part_of(representation, motion, cut)
+
+
+def test_mfm_edits_take_their_own_number_of_steps_unless_one_is_chosen(flow):
+    mfm = EditRequest(method="mfm")
+    for chosen, steps in ((None, MFM_STEPS), (7, 7)):
+        _, options = method_options(flow.process, mfm, SamplerOptions(num_inference_steps=chosen))
+        assert options.num_inference_steps == steps
+    _, options = method_options(flow.process, EditRequest(method="mdm"), SamplerOptions())
+    assert options.num_inference_steps is None
 
 
 def test_a_part_of_a_motion_keeps_its_text_and_its_notes(diffusion, motion):

@@ -172,6 +172,16 @@ def test_places_are_found_and_undone():
     torch.testing.assert_close(placement.undo(moved), pose.double())
 
 
+def test_a_placement_does_not_change_heights():
+    local = torch.randn(1, 22, 3, generator=torch.Generator().manual_seed(0)).double()
+    placement = Placement(
+        torch.tensor([0.7], dtype=torch.float64), torch.tensor([[1.0, 0.0, -2.0]]).double()
+    )
+    raised = placement.apply(local) + torch.tensor([0.0, 0.5, 0.0])
+    fitted = Placement.fit(local, raised)
+    torch.testing.assert_close(vars(fitted), vars(placement))
+
+
 def test_a_text_changes_later_blocks_only(model):
     plain, changed = (
         stream(model, "a person walks", seed=3),

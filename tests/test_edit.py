@@ -416,14 +416,14 @@ def test_the_error_of_kept_features_is_the_largest_one_in_standard_deviations(fl
 def test_only_variations_of_entire_motions_have_targets(diffusion, motion):
     """Targets replace the kept part of an edit, so that both together would lose it."""
     representation, frames = diffusion.representation, len(motion.features)
-    known = representation.normalize(torch.from_numpy(motion.features))[None]
-    keep = torch.zeros_like(known, dtype=torch.bool)
+    features = representation.normalize(torch.from_numpy(motion.features))[None]
+    keep = torch.zeros_like(features, dtype=torch.bool)
     options: dict[str, Any] = {
         "frames": frames,
         "targets": {"root": [{"time": 1.0, "position": [0.1, 0.2]}]},
         "num_inference_steps": 2,
     }
-    whole = Edit(known, keep, strength=0.5)
+    whole = Edit(features, keep, strength=0.5)
     (varied,) = flame_mdm.generate(diffusion, "a person walks", edit=whole, **options)
     assert len(varied.joints) == frames
     part = replace(whole, keep=keep.index_fill(1, torch.tensor([0]), True))

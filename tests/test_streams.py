@@ -506,10 +506,10 @@ def test_a_fade_moves_the_generated_pose_but_not_what_an_edit_keeps(model):
     options = SamplerOptions(num_inference_steps=2).over(model.sampler_options)
     batch = MotionBatch(prefix, torch.ones(1, CONTEXT, dtype=torch.bool), ["a"], text=["walks"])
     cond = model.encode(batch)
-    known = torch.full((1, BLOCK, prefix.shape[2]), 3.0)
-    keep = torch.zeros_like(known, dtype=torch.bool)
+    features = torch.full((1, BLOCK, prefix.shape[2]), 3.0)
+    keep = torch.zeros_like(features, dtype=torch.bool)
     keep[:, 1:4, 4:70] = True
-    edit = Edit(known, keep)
+    edit = Edit(features, keep)
     sharp, faded = (
         Blocks(model, ["a"], prefix, options, fade=fade).sample(cond, edit=edit) for fade in (0, 8)
     )

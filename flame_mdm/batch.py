@@ -71,8 +71,8 @@ class Condition:
     Attributes:
         pooled: (B, C), one vector per sample.
         tokens: (B, S, C), one vector per word piece, or S = 0 if the encoder returns no tokens.
-        token_mask: (B, S) bool, True = real token. If the null condition has no mask (None), a
-            sample keeps its own mask when its condition is replaced by the null condition.
+        token_mask: (B, S) bool, True = real token. If the null condition has no mask (None),
+            samples that receive the null condition keep their own masks.
         null: the null condition ("no condition"), with batch size 1, or None if the encoder has
             none.
         prefix: (B, P, D), normalized features of the P clean frames before the motion, or None if
@@ -271,7 +271,7 @@ def padded_length(length: int, multiple: int, most: int) -> int:
 def sent(x: Tensor, device: torch.device) -> Tensor:
     """Moves a tensor to a device.
 
-    Copies to a GPU do not wait for earlier work on the GPU.
+    A copy to a GPU does not wait for earlier work on that GPU.
     """
     copied = device.type == "cuda" and x.device.type == "cpu"
     return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
@@ -315,8 +315,7 @@ def collate(
         samples: (id, normalized features (F, D), caption, action) for each motion.
         multiple: the length of the longest sample is rounded up to a multiple of this number of
             frames.
-        most: maximum number of frames after rounding. Samples that are longer than this are not
-            cut.
+        most: maximum number of frames after rounding. Longer samples are not cut.
     """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])

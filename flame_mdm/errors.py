@@ -84,8 +84,8 @@ _shown: dict[str, str] = {}
 def show_as(path: str, name: str) -> None:
     """Makes all later messages show a name instead of a path.
 
-    Commands that work on a temporary copy of a file call this, so that their messages contain the
-    name that the user typed.
+    If a command works on a temporary copy of a file, it calls this function, so that its messages
+    contain the name that the user typed.
     """
     _shown[path] = name
 

@@ -72,7 +72,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the number of frames that all training lengths are multiples of."""
+    """Returns the unit of the training lengths: all are multiples of this number of frames."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -345,8 +345,8 @@ class Blocks:
         seed: seed of the noise.
         replication: index of the replication, used to sample several motions per id.
         unconditioned: whether all conditions are null conditions. Guidance is then not applied.
-        fade: number of frames after a seam over which a jump between two blocks is faded out; see
-            `joined`. 0 = no fading, as in DiP's code.
+        fade: if two blocks do not fit together, the jump at the seam is faded out over this number
+            of frames; see `joined`. 0 = no fading, as in DiP's code.
 
     Raises:
         UserError: If the prefix is missing or has the wrong shape.

@@ -43,7 +43,7 @@ def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
 
 
 class _MaskedSquaredError(torch.autograd.Function):
-    """Computes `masked_mean((a - b).square(), mask)` in about half as many passes.
+    """Computes `masked_mean((a - b).square(), mask)` with about half as many passes over the data.
 
     The results are identical, bit for bit.
     """
@@ -79,7 +79,8 @@ class MotionLosses(nn.Module):
 
     Sources: Tevet et al. 2022, eq. 3-5, and Liang et al. 2024, InterGen. All losses are means over
     real frames and entries: the norms in MDM's paper are divided by the number of entries per
-    frame, as in its code. Velocities are in units per frame. Losses with weight 0 are not computed.
+    frame, as in MDM's code. Velocities are in units per frame. Losses with weight 0 are not
+    computed.
 
     Args:
         to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F,
@@ -91,7 +92,7 @@ class MotionLosses(nn.Module):
         foot_contact: weight of the squared velocity of feet that touch the ground in the data (eq.
             4). As in the paper's sum over all frames, feet that are not in contact contribute 0 to
             the mean.
-        bone_length: weight of the squared error of the bone lengths, in square meters. This is
+        bone_length: weight of the squared error, in square meters, of the bone lengths. This is
             InterGen's bone-length loss (arXiv:2304.05684), but at all noise levels; InterGen
             applies it only up to a certain noise level.
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.

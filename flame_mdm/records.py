@@ -53,10 +53,11 @@ class Value(Schema):
 
 
 def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
-    """Returns the 95 % interval of a value from its bootstrap values, centered on the value.
+    """Returns the 95 % interval of a value, estimated from bootstrap values.
 
     Source: Efron and Tibshirani 1993, section 13.3. Some metrics, such as Fréchet distances, are
-    larger for sets with repeated motions (section 10.6), so the interval is shifted to the value.
+    larger for sets with repeated motions (section 10.6). The bootstrap values are therefore shifted
+    so that their mean is the value.
     The interval is valid only for sets of the same size.
 
     Example:

@@ -76,7 +76,7 @@ def main(settings: BenchmarkSettings) -> None:
 def check(
     table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]
 ) -> list[tuple[str, bool]]:
-    """Returns a line for each expected range, paired with whether the measured value is in it."""
+    """Returns a line for each expected range, and whether the measured value is in that range."""
     parts = {part.name: part for part in table.parts}
     checks = []
     for part, rows in expected.items():

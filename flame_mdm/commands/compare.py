@@ -164,7 +164,7 @@ def _motions(
 def _texts(prompts: PromptFile) -> list[str]:
     """Returns the prompts in a file.
 
-    Raises the error for the first prompt that no model can sample.
+    If any prompts are refused, raises the error for the first of them.
     """
     for number in sorted(prompts.refused):
         raise prompts.refused[number]

@@ -183,7 +183,10 @@ def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset())
 
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
-    """Writes the motion lengths of a data set to `results`, or reports that it must be prepared."""
+    """Writes the motion lengths of a data set to `results`.
+
+    If the data set is not prepared, prints a message instead.
+    """
     nodes = compose_data(
         dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data")
     )

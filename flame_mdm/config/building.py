@@ -55,9 +55,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     """Checks that an untrusted configuration contains only plain values and no interpolations.
 
     Hydra and OmegaConf would resolve interpolations (`${...}`), which can run any code and read any
-    environment variable. The only interpolation allowed is `but`, at the start of a string. Raises
-    a `UserError` that names the file `where` if the check fails or if the content is too large, is
-    nested too deeply or contains itself.
+    environment variable. Only the interpolation that the argument `but` contains is allowed, at the
+    start of a string. Raises a `UserError` that names the file `where` if the check fails or if the
+    content is too large, is nested too deeply or contains itself.
     """
     count = 0
 
@@ -134,8 +134,8 @@ def moved(node: Any, folders: Mapping[str, str]) -> Any:
 def instantiate(node: Config, offered: Mapping[str, Any] | None = None, /, **derived: Any) -> Any:
     """Instantiates the object that a mapping with a `_target_` describes, and all nested objects.
 
-    Supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text,
-    and mappings and lists are passed as plain copies, as with Hydra's `_convert_: all`.
+    Supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text.
+    Mappings and lists are passed as plain copies, as with Hydra's `_convert_: all`.
 
     Args:
         node: the mapping.
@@ -190,8 +190,8 @@ def trust(config: Config) -> None:
     """Checks that a checkpoint's configuration names only permitted classes and arguments.
 
     A class is permitted for a part if `MODULES` lists its module for this part, or if a file in the
-    part's folder of `experiments/` names it. The environment variable FLAME_MDM_TRUST permits
-    additional packages, separated by commas. The check does not import the classes.
+    part's folder of `experiments/` names the class. The environment variable FLAME_MDM_TRUST
+    permits additional packages, separated by commas. The check does not import the classes.
     """
     names = [name.strip() for name in os.environ.get("FLAME_MDM_TRUST", "").split(",")]
     added = [name for name in names if name]

@@ -145,7 +145,7 @@ def is_text(kind: type[Any], key: str) -> bool:
 
 
 def with_keys(kind: type[Any], words: Sequence[str]) -> list[str]:
-    """Adds the omitted keys to the leading words, which specify a command's objects."""
+    """Converts the leading words, which specify a command's objects, to the form `key=value`."""
     objects, annotations = getattr(kind, "OBJECTS", ()), _annotations(kind)
     leading = list(takewhile(_is_object, words))
     rest = list(words[len(leading) :])
@@ -204,8 +204,8 @@ def _help(kind: type[Any]) -> list[str]:
 def make_variables() -> list[str]:
     """Converts the variables that were passed to make to command-line arguments.
 
-    `EXP` names the recipe, and other upper-case variables are keys. Make lists the variables in
-    MAKEFLAGS after ` -- `, the latest one first, with escaped spaces and doubled dollar signs.
+    `EXP` names the recipe, and other upper-case variables are keys. `make` lists the variables
+    in MAKEFLAGS after ` -- `, the latest one first, with escaped spaces and doubled dollar signs.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
     words = [

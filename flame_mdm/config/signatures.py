@@ -104,7 +104,7 @@ def check_top_level(config: Config) -> None:
 def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if a value does not match the annotation of its parameter.
 
-    Any value matches an unsupported annotation.
+    An annotation that this check does not support accepts any value.
     """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)

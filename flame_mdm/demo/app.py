@@ -110,7 +110,7 @@ class Writers:
 
     Attributes:
         turns: semaphore that is held while a file is written.
-        waiting: number of requests that are waiting for a file, including a file that is being
+        waiting: number of requests that are waiting for a file, including those whose file is being
             written.
     """
 

@@ -79,7 +79,7 @@ def _step(
 def _action_label(action: str) -> str:
     """Returns the words for an action without its usual direction.
 
-    Another chip may contradict this direction.
+    The direction is omitted, because another chip may contradict it.
     """
     return predicate(Mention(action)).removesuffix(f" {actions()[action].usual}")
 

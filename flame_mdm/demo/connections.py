@@ -96,7 +96,7 @@ class Connection(H11Protocol):
         self.stall = self.loop.call_later(self.limits.stall_seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Stops the timer of `pause_writing`, because the client is reading again."""
+        """Stops the timer that `pause_writing` started, because the client is reading again."""
         super().resume_writing()
         if self.stall is not None:
             self.stall.cancel()

@@ -66,7 +66,7 @@ class Call(Post):
 
 
 class Reset(Post):
-    """A message that the page is no longer waiting for the result of a call."""
+    """A message in which the page states that it no longer waits for the result of a call."""
 
     event_id: Id
 
@@ -106,9 +106,9 @@ class Guard:
     It checks the host, origin, path, size and content of the request. `hosts` contains the names of
     this server, in addition to localhost and numeric addresses. A request with any other host name
     may come from a page whose domain name was made to resolve to this computer (DNS rebinding).
-    `calls` maps the index of each function that the page can call to the function's path and a
-    check of the arguments. `is_open` returns whether a session has called a function and may
-    therefore read results.
+    `calls` contains one entry per function that the page can call: the key is the function's index,
+    and the value consists of the function's path and a check of the arguments. `is_open` returns
+    whether a session has called a function and may therefore read results.
     """
 
     def __init__(

@@ -80,7 +80,10 @@ class Studio:
         return self._models[name]
 
     def reader(self, name: str) -> Reader | None:
-        """Returns a model's text reader, or None if its captions do not describe single actions."""
+        """Returns a model's text reader.
+
+        Returns None if the model's captions do not describe single actions.
+        """
         self.model(name)
         return self._readers.get(name)
 
@@ -92,7 +95,7 @@ class Studio:
     ) -> Sequence[Motion]:
         """Returns the motions for a request, from memory if possible.
 
-        `report` is called with the number of network calls so far.
+        `report` is called with the number of times that the neural network has been called so far.
         """
         with self._working:
             model = self.model(request.model)
@@ -135,7 +138,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request, with a sentence of several actions converted to a sequence.
+        """Returns the request; a sentence with several actions is converted to a sequence.
 
         Raises the same errors as `generate`.
         """

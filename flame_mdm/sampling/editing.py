@@ -284,7 +284,7 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options for `Edit` and for the sampler that an editing method requires.
+    """Returns the options of `Edit` and of the sampler, as required by an editing method.
 
     If the request does not name a method, the process's default method is used.
     """

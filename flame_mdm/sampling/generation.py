@@ -242,7 +242,10 @@ def _sample_streams(
 
 
 def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit | None:
-    """Returns the edit for a batch x (B, F, D), including targets and padded to F frames."""
+    """Returns the edit for a batch x (B, F, D).
+
+    The edit includes the targets and is padded to F frames.
+    """
     edit, frames = resolved.edit, x.shape[1]
     if resolved.targets is not None:
         goal = resolved.targets.edit(model.representation, frames, model.device)

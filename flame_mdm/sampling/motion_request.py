@@ -63,7 +63,7 @@ class EditRequest:
     """Keywords of `flame_mdm.edit`: the part of the motion to resample, and the editing method.
 
     Raises:
-        UserError: If a value is invalid for any motion.
+        UserError: If a value is invalid for all motions.
 
     Example:
         >>> EditRequest(region_seconds=[[0, 1], [3, 4]], joints="left_arm").ranges

@@ -14,12 +14,12 @@ from flame_mdm.sampling.motion_request import check_length, read_parts
 
 @dataclass(frozen=True)
 class PromptFile:
-    """A text file with one prompt per line. Refused prompts do not keep others from being sampled.
+    """A text file with one prompt per line. If some prompts are refused, the others are sampled.
 
     Attributes:
         path: name of the file, as the user typed it.
         lines: the prompts by line number, starting at 1. Blank lines are omitted.
-        refused: for each refused prompt, the reason why it cannot be sampled, by line number.
+        refused: the errors that state why prompts cannot be sampled, by line number.
     """
 
     path: str

@@ -76,7 +76,7 @@ def read_motion(
 
 
 def part_of(representation: Representation, motion: Motion, cut: Sequence[float]) -> Motion:
-    """Returns the part `cut` of a motion, as [begin, end] in seconds.
+    """Returns the part of a motion between two times; `cut` is [begin, end] in seconds.
 
     The returned motion begins at the origin.
 

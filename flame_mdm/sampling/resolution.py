@@ -263,7 +263,7 @@ def _continued(
     """Returns the features (F, D) of the motion to continue, the edit, and the motion's notes.
 
     The edit keeps the end of the motion, whose last frames are generated again so that they connect
-    to the new frames. A model that continues frames reads these frames instead and needs no edit.
+    to the new frames. A model that continues frames needs no edit: it reads the end of the motion.
     The notes of a motion in memory are omitted, because they were shown when the motion was read.
     """
     if request.after is None:

@@ -35,15 +35,15 @@ def part_frames(
     is_sequence: bool,
     loop: bool,
 ) -> list[int]:
-    """Returns the number of frames of each part of a prompt.
+    """Returns the number of frames in each part of a prompt.
 
     Args:
         model: the model that samples the motion.
         text: the prompt, as it is quoted in error messages.
         parts: the parts of the prompt, with their durations in seconds if the prompt states them.
         usual: the unrounded length, in frames, of each part whose duration the prompt does not
-            state. None stands for `USUAL_SECONDS` or, if that is too long for one window, as many
-            frames as fit into it.
+            state. None stands for `USUAL_SECONDS` or, if that is too long for one window, for the
+            number of frames that fit into the window.
         is_sequence: whether the motion is sampled in windows. If not, the prompt has a single part.
         loop: whether the last frame should lead back to the first one.
 

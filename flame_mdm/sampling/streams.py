@@ -97,8 +97,8 @@ class Stream(Iterator[Motion]):
     """An endless motion, as an iterator of blocks; created by `flame_mdm.stream`.
 
     Each block is a `Motion` that is placed in the world where the previous block ends. A block is
-    computed when it is requested; with `cleanup`, so is the next block. The same seed and the same
-    text changes at the same times produce the same motion.
+    computed when it is requested. With `cleanup`, the next block is computed at the same time. Two
+    streams with the same seed are identical if their texts are the same at all times.
 
     Example:
         >>> import itertools, flame_mdm
@@ -380,7 +380,7 @@ class Streams(Iterator[list[Motion]]):
         self.waypoints = waypoints
 
     def go_back(self, frame: int) -> None:
-        """Drops the frames of a single stream from `frame` on, and later changes of its text.
+        """Drops all frames from `frame` on, and later changes of the text, in a single stream.
 
         Raises:
             UserError: If the frame is not in one of the last `HELD` blocks.
@@ -420,7 +420,7 @@ class Streams(Iterator[list[Motion]]):
         return [torch.cat(part) for part in parts]
 
     def _conditions(self) -> list[str]:
-        """Returns the condition of the next block of each stream."""
+        """Returns, for each stream, the condition of the next block."""
         return [
             schedule.at(frame) for schedule, frame in zip(self.schedules, self.frames, strict=True)
         ]

@@ -54,7 +54,7 @@ class JointTarget(Timed):
 
 
 class PoseTarget(Timed):
-    """A pose to reach, taken from a frame of a motion file, at a given position or anywhere.
+    """A frame of a motion file whose pose should be reached, at a given position or anywhere.
 
     `heading` is in degrees.
     """
@@ -135,9 +135,9 @@ class Targets:
         """Returns the targets in the window of `frames` frames that starts at `begin`.
 
         Frames are counted from the beginning of the window. If the root has a target after the
-        window, a target is added at the end of the window: the point that the root reaches by then
-        at a constant speed. The root starts from its last target in the window or, if there is
-        none, from `here`.
+        window, a target is added at the end of the window. It is the point that the root reaches by
+        then if it moves toward the later target at a constant speed. This movement starts at the
+        root's last target in the window or, if there is none, at `here`.
 
         Args:
             begin: first frame of the window.
@@ -188,8 +188,8 @@ class Targets:
         """Returns the edit (1, F, D) that leads to the targets.
 
         Poses are imposed, and positions guide the clean estimates. `to_joints` maps normalized
-        features to world joint positions. The default places the beginning of the motion at the
-        origin.
+        features to world joint positions. By default, the positions are computed for a motion that
+        begins at the origin.
         """
         imposed = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(imposed, dtype=torch.bool)
@@ -276,7 +276,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
 def _pose(
     representation: Representation, entry: PoseTarget, folder: Path, where: str
 ) -> tuple[np.ndarray, Tensor]:
-    """Returns the joint positions (J, 3) of a pose with its root at x = z = 0, and its features."""
+    """Returns the joint positions (J, 3) and the features of a pose; its root is at x = z = 0."""
     motion = read_motion(
         representation, folder / entry.file if Path(entry.file).suffix else entry.file
     )

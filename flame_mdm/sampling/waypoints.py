@@ -48,7 +48,7 @@ def bends(
     points: Sequence[Point],
     fps: float,
 ) -> list[float]:
-    """Returns the angles (F,) to add to the root's turns so that it passes through the waypoints.
+    """Returns the angles (F,) to add to the turns so that the root passes through the waypoints.
 
     The direction of travel approaches the direction of the next waypoint. The added angle, in
     radians, is limited per second and per meter of the path. If a waypoint is beside the person and
@@ -180,5 +180,5 @@ class Route:
                 self.reached.append(frame)
 
     def go_back(self, frame: int) -> None:
-        """Marks the waypoints that were reached in or after the given frame as not yet reached."""
+        """Undoes `follow` for all frames from the given frame on."""
         self.reached = [number for number in self.reached if number < frame]

@@ -32,7 +32,7 @@ class Claim:
         when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
             time.
         seconds: claimed duration; None = not stated.
-        parts: for a claim about order, its two claims, of which the first happens earlier.
+        parts: for a claim about order, the claims about the two events, in the claimed order.
     """
 
     kind: str
@@ -67,11 +67,12 @@ class Claim:
 
 
 def falsified(claim: Claim) -> list[tuple[str, Claim]]:
-    """Returns the variants of a claim that are false if it is true, each with its kind of change.
+    """Returns changed versions of a claim, each with its kind of change.
 
-    The kinds of change are "side", "direction", "speed", "count" (one more, and one fewer),
-    "duration" (twice as long, and half as long), "start or end" (the other end), "posture" (one
-    that excludes the claimed posture at that time) and "order".
+    If the claim is true, all changed versions are false. The kinds of change are "side",
+    "direction", "speed", "count" (one more, and one fewer), "duration" (twice as long, and half as
+    long), "start or end" (the other end), "posture" (one that excludes the claimed posture at that
+    time) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]

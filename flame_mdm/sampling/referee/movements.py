@@ -122,7 +122,7 @@ def _turn(yaw: np.ndarray, direction: str) -> Reading:
 
 
 def circle(body: Body, claim: Claim) -> Reading:
-    """Measures how far the direction of travel turns while the body is moving, in degrees."""
+    """Measures by how many degrees the direction of travel turns while the body is moving."""
     moving = body.speed > MOVING
     if moving.sum() < 0.5 * RATE:
         return Reading(0.0, 0.0, "degrees", "path")
@@ -287,7 +287,7 @@ def count_raises(body: Body, claim: Claim) -> Reading:
 
 
 def count_spins(body: Body, claim: Claim) -> Reading:
-    """Counts the full turns in the largest turn of the body in either direction."""
+    """Measures the largest turn of the body in either direction, as a number of full turns."""
     reading = turn(body, claim)
     turns = reading.number / 360
     claimed = claim.amount or 1

@@ -79,7 +79,7 @@ def existence(
 def of_side(readings: Sequence[Reading], side: str, margin: float) -> Reading:
     """Combines the readings of the left and the right limb into the reading for a side.
 
-    For "both", the lower reading is used, and for "", the higher one. For "left" and "right", the
+    "both" uses the lower reading, and "" uses the higher one. For "left" and "right", the
     reading is unclear if the two readings differ by less than `margin`, because the other limb then
     does the same.
     """

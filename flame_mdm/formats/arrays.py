@@ -125,7 +125,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 def _axis_angles(poses: np.ndarray) -> np.ndarray:
     """Returns the axis-angle vectors (F, 72) of SMPL's joints.
 
-    If the file does not contain the hands' rotations, their vectors are 0.
+    If the file does not contain the hands' rotations, the vectors of the hands are 0.
     """
     count = int(np.prod(poses.shape[1:]))
     if poses.ndim > 3 or (poses.ndim == 3 and poses.shape[2] != 3) or count not in AXIS_ANGLES:
@@ -145,8 +145,8 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     """Checks the numbers in an array with one entry per frame.
 
     Raises:
-        UserError: If the array has no frames or too many frames, or if it contains numbers that are
-            not real or not finite, or absolute values of a million or more.
+        UserError: If the array has no frames or too many frames, or if a number is not real, is not
+            finite, or has an absolute value of a million or more.
     """
     if not is_real(values):
         raise UserError(f"{name} must be an array of real numbers")

@@ -52,8 +52,8 @@ def bone_poses(
         layout: the skeleton of the file.
         joints: (F, 22, 3), positions of SMPL's joints in meters, y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
-        in_front: (J, 3, 3), rotations relative to the parents in a rest pose that precedes
-            the motion, or None if there is no such pose.
+        in_front: (J, 3, 3), the rest pose that precedes the motion, as rotations relative to the
+            parents; None if there is no such pose.
     """
     if layout.mirrored:
         return BoneRotations(reason="the motion in the file is mirrored")

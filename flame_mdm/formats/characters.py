@@ -5,9 +5,9 @@ pose must be upright with flat feet.
 
 The arms and legs point in the directions of the motion's bones. The rotations of the trunk, the
 head, the hands and the feet relative to the rest pose are the same as in the motion. The path of
-the hips is scaled in proportion to the leg length. Then the legs are bent so that the toes reach
-the motion's toe positions, which are also scaled, and adjusted to the height of the character's
-toes.
+the hips is scaled in proportion to the leg length. The toe positions of the motion are also scaled,
+and adjusted to the height of the character's toes. Then the legs are bent so that the character's
+toes reach these positions.
 """
 
 import copy
@@ -279,7 +279,7 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
-    """Writes a copy of the character's file that contains the motion; returns a summary line.
+    """Writes the motion to a copy of the character's file; returns a summary line.
 
     The motion becomes the first animation in the file.
     """
@@ -325,7 +325,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 
 
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
-    """Writes a copy of the character's file that contains the motion; returns a summary line."""
+    """Writes the motion to a copy of the character's file; returns a summary line."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
             f"{path}: a .bvh character has no meshes, so it can only be saved as a .bvh file"

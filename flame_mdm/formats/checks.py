@@ -121,9 +121,9 @@ def below_floor(joints: np.ndarray) -> str:
 def rest_frames(joints: np.ndarray, fps: float) -> int:
     """Returns the number of initial frames that show a rest pose or lead from it to the motion.
 
-    Several programs write a T-pose or A-pose as the first frame. If the recorded person really
-    stands in a rest pose at first, the pose does not change more from the first frame to the second
-    than between later frames.
+    Several programs write a T-pose or A-pose as the first frame. The pose then jumps to the motion,
+    or changes to it within a few frames. If the person really stood in a rest pose at first, there
+    is no such jump, and no frames are counted.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0

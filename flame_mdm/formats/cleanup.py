@@ -85,8 +85,8 @@ def cleanup(
 ) -> np.ndarray:
     """Corrects pops, bone lengths, sliding feet, toes below the floor, and hands inside the body.
 
-    The height of the floor is the 10th percentile of the lowest toe's height over all frames, or 0
-    if this percentile is positive.
+    The height of the lowest toe is measured in each frame. The floor is at the 10th percentile of
+    these heights, or at 0 if this percentile is positive.
 
     Args:
         joints: (F, J, 3), joint positions in meters, y up. Motions with fewer than 4 frames are
@@ -94,8 +94,8 @@ def cleanup(
         fps: frames per second.
         skeleton: skeleton of the joints.
         contacts: (F, N), probability that each of `skeleton.feet` stays on the floor until the next
-            frame, as predicted by models for some representations. None = the contacts are
-            estimated from the height and speed of the toes.
+            frame. With some representations, models predict these probabilities. None = the
+            contacts are estimated from the height and speed of the toes.
 
     Returns:
         The new joint positions (F, J, 3), float32.
@@ -175,7 +175,10 @@ def _smooth(motion: np.ndarray) -> np.ndarray:
 
 
 def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """Returns the motion with the same bone directions and with median bone lengths."""
+    """Returns a copy of the motion in which each bone has its median length in all frames.
+
+    The bones keep their directions.
+    """
     out = motion.copy()
     for parent, joint in skeleton.edges:
         bone = motion[:, joint] - motion[:, parent]

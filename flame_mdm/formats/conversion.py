@@ -59,8 +59,9 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
 
     Joint positions are resampled with cubic splines, and rotations with spherical interpolation
     (slerp). KIT-ML's 21 joints are computed from SMPL's joints. If SMPL rotations are unknown, they
-    are computed from the bones of the file or, without bones, fitted to the joints. The body then
-    has an adult's bones, and its path is scaled in proportion to the leg length.
+    are computed from the bones of the file or, without bones, fitted to the joints. Rotations that
+    are computed or fitted in this way are for a body with an adult's bones, whose path is scaled in
+    proportion to the leg length.
 
     Raises:
         UserError: If the representation cannot encode the skeleton of the motion.
@@ -132,8 +133,8 @@ def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
         joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:
-        The poses, and the distances in meters between their joints and the scaled `joints`, with
-        shape (F, 22).
+        The poses, and an array (F, 22): the distance in meters between each joint in these poses
+        and the same joint in the scaled `joints`.
     """
     adult = body.offsets.new_tensor(ADULT[: len(SMPL22)])
     legs = list(LEGS)

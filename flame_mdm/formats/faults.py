@@ -211,9 +211,10 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
         side: "left" or "right".
 
     Returns:
-        The depths (F, 3) in meters for the elbow, the wrist and the middle of the hand, negative
-        outside the body; and a unit vector (F, 3, 3) for each of these points, which points away
-        from the axis of the body part in which the point is deepest.
+        Two arrays for three points: the elbow, the wrist and the middle of the hand. The first
+        contains their depths (F, 3) in meters, which are negative outside the body. The second
+        contains, for each point, a unit vector (F, 3, 3) away from the axis of the body part in
+        which the point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

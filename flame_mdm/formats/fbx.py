@@ -74,7 +74,7 @@ class Record:
             stored as shorter integers.
         children: nested records.
         block: whether a terminator is written even if the record has no children. Some readers
-            require it.
+            require this terminator.
     """
 
     name: str
@@ -158,7 +158,7 @@ class _Reader:
         return root
 
     def _record(self, start: int, limit: int, depth: int) -> tuple[Record, int] | None:
-        """Returns the record at `start` and its end, or None at the terminator of a list."""
+        """Returns the record at `start`, and where the record ends; None at the end of a list."""
         end, count, size, length = self.head.unpack_from(self.content, start)
         if end == 0:
             return None

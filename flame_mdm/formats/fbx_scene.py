@@ -87,7 +87,8 @@ class Curve:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F,) at times (F,) in seconds.
 
-        The value of the first key is held before it, and the value of the last key after it.
+        Times before the first key get the value of the first key, and times after the last key get
+        the value of the last key.
         """
         if len(self.times) == 1:
             return np.full(len(times), self.values[0])
@@ -198,7 +199,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of the takes with keys in an FBX file."""
+    """Returns the names of those takes in an FBX file that contain keys."""
     root = fbx.read(path)
     try:
         return [name for name, _ in _Scene(root).takes()]

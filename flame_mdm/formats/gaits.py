@@ -112,7 +112,7 @@ def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.nda
 
 
 def find_cycle(motion: GroundedMotion, degrees: float) -> Cycle | None:
-    """Returns the gait cycle in a direction whose first and last poses differ least.
+    """Returns the cycle whose first and last poses differ least, for a gait in a given direction.
 
     Returns None if no cycle is found. Cycles that begin with a landing of the left foot are
     preferred, so that the loops of a set begin with the same foot.
@@ -187,7 +187,7 @@ def gait(
 
 
 def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
-    """Returns the motion with a root that faces +z and moves along a straight line."""
+    """Returns a copy of the motion in which the root faces +z and moves along a straight line."""
     along, _ = progress(motion, degrees)
     distance = np.concatenate([[0], np.cumsum((along[1:] + along[:-1]) / 2) / motion.fps])
     return replace(
@@ -196,7 +196,7 @@ def straightened(motion: GroundedMotion, degrees: float) -> GroundedMotion:
 
 
 def closed(motion: GroundedMotion) -> GroundedMotion:
-    """Returns the cycle with equal first and last poses.
+    """Returns a copy of a cycle in which the first and last poses are equal.
 
     The difference between these poses is distributed evenly over the cycle.
     """
@@ -244,8 +244,8 @@ def turn(motion: GroundedMotion, degrees: float, stand: np.ndarray) -> GroundedM
 def loop(motion: GroundedMotion) -> GroundedMotion:
     """Returns the middle repetition of a loop that was generated with three repetitions.
 
-    If the person moves or turns during the loop, the root does so at a constant speed, along a
-    straight line. Otherwise, the root stays in place.
+    If the person moves or turns during the loop, the root moves along a straight line and turns,
+    both at a constant speed. Otherwise, the root stays in place.
     """
     count = (len(motion) - 1) // 3
     cycle = closed(motion.cut(count, 2 * count))

@@ -149,7 +149,7 @@ def _item(items: Sequence[Item], index: int, name: str) -> Item:
 
 
 def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
-    """Returns the node indices, with parents before their children, and each node's parent.
+    """Returns the node indices, parents first, and a mapping from child nodes to their parents.
 
     Raises:
         ValueError: If the nodes do not form trees.

@@ -105,7 +105,8 @@ class Track:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F, C) at times (F,). Rotations are not normalized.
 
-        The value of the first key is held before it, and the value of the last key after it.
+        Times before the first key get the value of the first key, and times after the last key get
+        the value of the last key.
         """
         # Each time lies in a segment between two keys. CUBICSPLINE stores slopes per second, which
         # are converted to slopes per segment.
@@ -171,7 +172,7 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
 
 def animations(path: Path) -> list[str]:
-    """Returns the names of all animations that move nodes in a file."""
+    """Returns the names of those animations in a file that move nodes."""
     file = glb.read(path)
     try:
         return [name for name, _ in _animations(file)]

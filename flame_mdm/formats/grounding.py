@@ -155,7 +155,7 @@ def anchored(
 
 
 def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns the joints (F, 22, 3) with the same bone lengths as in a pose (22, 3).
+    """Returns a copy of the joints (F, 22, 3) with the bone lengths of a pose (22, 3).
 
     The bones keep their directions.
     """
@@ -178,11 +178,11 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
 def planted(
     motion: GroundedMotion, *, fixed_start: bool = False, fixed_end: bool = False
 ) -> GroundedMotion:
-    """Returns the motion with toes that stay in place during contacts.
+    """Returns a copy of the motion in which the toes stay in place during contacts.
 
     The toes also stay above the floor. If a leg is too short to reach, the body is lowered. With
-    `fixed_start` and `fixed_end`, the first and the last pose do not change. A foot that is planted
-    in such a fixed pose stays where it is in that pose.
+    `fixed_start`, the first pose does not change; with `fixed_end`, the last pose does not change.
+    A foot that is planted in such a fixed pose stays where it is in that pose.
     """
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
     # whole body is lowered smoothly for a moment. Then the legs bend to reach the footprints.
@@ -303,7 +303,7 @@ def repeated(motion: GroundedMotion, copies: int = COPIES) -> GroundedMotion:
 
 
 def planted_loop(motion: GroundedMotion) -> GroundedMotion:
-    """Returns a loop with planted toes.
+    """Returns a copy of a loop in which the toes stay in place during contacts.
 
     The result is still a loop: its last pose equals its first pose.
     """

@@ -84,7 +84,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The names of the joints that the map uses in the files."""
+        """The names, as used in the files, of the joints that the map uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -94,7 +94,7 @@ class Layout(BaseModel):
 
     @property
     def bones(self) -> Mapping[str, str]:
-        """For each SMPL joint, the name of the bone in the files whose rotation it follows.
+        """For each SMPL joint, the name (in the files) of the bone whose rotation it follows.
 
         The joint's position, in contrast, may be the mean position of several joints.
         """
@@ -102,20 +102,20 @@ class Layout(BaseModel):
 
     @property
     def rig(self) -> str:
-        """The name of the skeleton in `rigs.yaml` with the same joints, or "" if there is none."""
+        """The name of the `rigs.yaml` skeleton that has the same joints, or "" if there is none."""
         return self._rig
 
     def bone(self, joint: str) -> str:
-        """Returns the name of the joint in the files that turns in the same way as an SMPL joint.
+        """Returns the name (in the files) of the joint that turns in the same way as an SMPL joint.
 
-        This is the SMPL joint's bone or, if it has no bone, the joint with the largest weight in
-        its position.
+        This is the SMPL joint's bone. If the SMPL joint has no bone, its position is a weighted
+        mean of joints in the files, and the joint with the largest weight is returned.
         """
         shares = _shares(self.map[joint])
         return self.bones.get(joint) or max(shares, key=lambda name: shares[name])
 
     def named(self, name: str, map: Mapping[str, Source]) -> Layout:
-        """Returns the layout with a different map and with the name of a supported layout."""
+        """Returns a copy of the layout with the given map and the name of a supported layout."""
         layout = self.model_copy(update={"map": dict(map)})
         layout._name = name
         return layout
@@ -213,7 +213,7 @@ LAYOUTS: dict[str, Layout] = {
 
 @cache
 def _variants() -> dict[str, Layout]:
-    """Returns the supported layouts, keyed by name, with variants that use end sites."""
+    """Returns the supported layouts and their variants that use end sites, keyed by name."""
     variants = {name: layout.named(name, layout.map) for name, layout in LAYOUTS.items()}
     toes, hands = {"foot": "ankle"}, {"wrist": "elbow"}
     for parts, ends in (("toes", toes), ("hands", hands), ("toes and hands", toes | hands)):
@@ -249,8 +249,9 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
 def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns the layout and joint names of a file that was read with `read_tree`.
 
-    `fields` override the fields of the supported layout. If arrays with this skeleton are in
-    meters, BVH files are assumed to be in centimeters, like those written by `flame_mdm.formats`.
+    `fields` override the fields of the supported layout. The file is assumed to be in centimeters,
+    like the BVH files written by `flame_mdm.formats`, unless the layout specifies a unit or
+    `fields` contain a map.
     """
     layout = find_layout(file.joints, fields)
     if "map" not in fields and "unit" not in layout.model_fields_set:
@@ -438,7 +439,7 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
 
 
 def _usual_unit(leg: float, unit: float) -> str:
-    """Returns advice for a leg length of `leg` meters that is wrong in every common unit."""
+    """Returns advice for a file whose `leg` length in meters is implausible in all common units."""
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"

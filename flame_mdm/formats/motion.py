@@ -1,4 +1,4 @@
-"""`Motion`, a single motion that does not depend on any model, and the writers of motion files.
+"""The class `Motion`, which does not depend on any model, and the writers of motion files.
 
 `docs/formats.md` describes the files. The 6D rotations in the 263 features of HumanML3D are never
 exported, because they are not SMPL's rotations: they are based on different chains and do not
@@ -74,8 +74,8 @@ class Motion(PosedFigure):
         features: (F, D) float32 features in the units of the data, or empty if there are none.
         representation: name of the representation to which the features belong.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
-        degenerate: number of frames in which the features do not determine the rotation of at least
-            one joint.
+        degenerate: number of frames in which the features leave the rotation of at least one joint
+            undetermined.
         parts: text, first frame and end (exclusive) of each part of a sequence; () if there is only
             one part.
         notes: lines for the user about the file that was read, for example about frames that were
@@ -348,7 +348,7 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
 def _write_rigged(
     motion: Motion, path: Path, rig: str | None, body: Mesh | None, root_motion: bool
 ) -> str:
-    """Writes a .glb, .fbx or USD file with the moving skeleton and, if a body fits, its skin."""
+    """Writes the skeleton and, if a body fits, the skin of the body to a .glb, .fbx or USD file."""
     poses = motion.posed()
     fitted, reason = motion.try_fit(body)
     name = motion.text or motion.id or "motion"

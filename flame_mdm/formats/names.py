@@ -86,7 +86,7 @@ def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]])
     listed earlier. If several prefixes match equally well, the match is ambiguous.
 
     Args:
-        names: joint names in a file. At least one is required.
+        names: joint names in a file. At least one name is required.
         skeletons: for each skeleton, a mapping from spellings of a joint to the joint's name in the
             skeleton. The first spelling is preferred.
     """

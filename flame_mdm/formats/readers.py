@@ -522,7 +522,7 @@ def _smpl_poses(pelvis: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
 
 
 def _poses(data: dict[str, Any]) -> Poses | None:
-    """Returns the rotations that a file with joints contains as AMASS arrays or SMPL features.
+    """Returns rotations from the AMASS arrays or SMPL features in a file that also has joints.
 
     HumanML3D features contain no such rotations.
     """

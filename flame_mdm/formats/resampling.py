@@ -69,14 +69,16 @@ def check_tree(frames: int, joints: int, size: int) -> None:
 def frame_pairs(
     frames: int, rate: float, fps: float, joints: int, slack: float = 1e-6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the frames before and after each new frame, and its position between them, from 0 to 1.
+    """Returns the old frames before and after each new frame, and where the new frame lies.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame. The last new frame may lie up
-    to `slack` frames after the last frame.
+    The third array contains the position of each new frame between the two old frames, from 0 to 1.
+
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last old frame. The last new frame may
+    lie up to `slack` frames after the last old frame.
 
     Raises:
         UserError: If there are more than `MAX_FRAMES` frames before resampling, or more than
-            `MAX_RESAMPLED` positions after it.
+            `MAX_RESAMPLED` joint positions after resampling.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1

@@ -97,7 +97,8 @@ class RiggedClip:
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to the parents.
         moves: for each joint whose position changes, its positions (F, 3) relative to the parent.
-        lift: the thickness of the soles, by which a person is raised above these positions.
+        lift: the thickness of the soles; writers raise a person by this height above the joint
+            positions in this clip.
         skins: the skinned meshes; () if no person fits the motion.
         scales: (J,), scale of each joint: units of its parent per unit of the joint.
         root: index of the joint on the floor that is the parent of the hips; -1 = no such joint.
@@ -140,7 +141,7 @@ class RiggedClip:
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
     def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """For each of `CONTACTS`, returns the K frames in which it changes, and its new values.
+        """For each of `CONTACTS`, returns the K frames with a change, and the K values after it.
 
         The first frame is always included. The result is empty if the contacts are unknown.
         """
@@ -177,7 +178,7 @@ class RiggedClip:
         return replace(self, turns=turns, moves=moves)
 
     def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Returns `offsets` and `moves` with the person standing on the soles.
+        """Returns `offsets` and `moves`, changed so that the person stands on the soles.
 
         The hips are lifted, but a root on the floor stays there.
         """

@@ -31,8 +31,8 @@ def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
     """Returns a joint name for each node, in the form that skeleton layouts use.
 
     If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the
-    tip of a bone is always named `NAME.end`, like an end site in a BVH file, regardless of its
-    suffix in the file.
+    tip of a bone is always named `NAME.end`, like an end site in a BVH file, regardless of the
+    node's suffix in the file.
     """
     if scene.humanoid:
         humanoid = {node: joint for joint, node in scene.humanoid.items()}

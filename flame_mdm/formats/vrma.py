@@ -1,10 +1,10 @@
 """Writes a motion as a VRM animation (.vrma), which can be applied to any VRM avatar.
 
 Source: VRM consortium, "VRMC_vrm_animation 1.0", https://github.com/vrm-c/vrm-specification. A
-.vrma file is a .glb file without a mesh that declares which nodes are the bones of a humanoid. The
-rest pose is VRM's T-pose: limbs along the axes, feet pointing straight ahead, soles on the floor.
-Programs apply the rotations relative to this pose, and scale the path of the hips by the ratio of
-the avatar's hip height to the hip height in the file.
+.vrma file is a .glb file that contains no mesh, but declares which nodes are the bones of a
+humanoid. The rest pose is VRM's T-pose: limbs along the axes, feet pointing straight ahead, soles
+on the floor. Programs apply the rotations relative to this pose, and scale the path of the hips by
+the ratio of the avatar's hip height to the hip height in the file.
 """
 
 from pathlib import Path

@@ -72,8 +72,8 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
 
     No files are left behind after a failure. The temporary name is unique, so several processes can
     write the same file; the last one wins. If `path` is a link, the link is replaced, and its
-    target is not changed. Before this process writes its first file to the folder, temporary files
-    that killed processes left there are removed.
+    target is not changed. Before this process writes its first file to the folder, it removes
+    temporary files left behind by killed processes.
 
     Args:
         path: file to write.
@@ -101,7 +101,7 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
     """Yields a temporary folder whose files are moved to the folder `path` at the end.
 
     Either all files are moved, or none are. If `path` exists, files with the same names are
-    replaced, and all other files are kept. Temporary folders that killed processes left behind are
+    replaced, and all other files are kept. Temporary folders left behind by killed processes are
     removed. Links must not lead out of the folder `within`. Raises the same errors as
     `atomic_write`.
     """
@@ -151,9 +151,10 @@ def _temporary(path: Path) -> Iterator[Path]:
 
 @functools.cache
 def _remove_abandoned_once(folder: Path) -> None:
-    """Removes files that killed processes left behind, but only once per folder and process.
+    """Removes temporary files left behind by killed processes.
 
-    Listing the folder again for each of thousands of files would take too long.
+    Each process does this only once per folder, because listing the folder again for each of
+    thousands of files would take too long.
     """
     with suppress(PermissionError):  # a folder that cannot be listed
         remove_abandoned(folder)
@@ -205,7 +206,7 @@ def write_json(
 
 @contextmanager
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
-    """Adds the name of a file to every `UserError` whose message does not contain it.
+    """Adds the name of a file to every `UserError` whose message does not contain the name.
 
     The exceptions in `errors` are converted to `UserError`, and `prefix` is added before their
     messages.
@@ -224,12 +225,13 @@ def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
     """Holds a lock file that names the process and the host.
 
-    Yields the name of a dead process that left the file behind, or "". If another process holds the
-    lock, `busy` is called with the name of that process, and then, unless `busy` raises an error,
-    this function waits for the lock. `advice` is part of the warning about file systems that do not
-    support locks. When the process ends, for whatever reason, the operating system releases the
-    lock. The lock is a POSIX record lock. Unlike the locks of `filelock`, such a lock also works
-    between hosts on NFS and Lustre, but it is not available on Windows.
+    If a dead process left the lock file behind, the name of that process is yielded, otherwise "".
+    If another process holds the lock, `busy` is called with the name of that process. Unless `busy`
+    raises an error, this function then waits for the lock. `advice` is part of the warning about
+    file systems that do not support locks. When the process ends, for whatever reason, the
+    operating system releases the lock. The lock is a POSIX record lock. Unlike the locks of
+    `filelock`, such a lock also works between hosts on NFS and Lustre, but it is not available on
+    Windows.
     """
     while True:
         with made_folder(path.parent), open_in_place(path) as file:
@@ -448,7 +450,7 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 
 @contextmanager
 def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
-    """Yields an open file of arrays and its size.
+    """Yields a file of arrays, opened for reading, and the size of the file.
 
     Errors caused by damaged content are converted to `UserError`.
     """
@@ -522,7 +524,7 @@ def check_members(count: int) -> None:
 
 
 class _DirectoryReader:
-    """A file that limits how many bytes are read at once, until `limit` is set to None."""
+    """A file from which at most `limit` bytes can be read at once; None = no limit."""
 
     def __init__(self, file: IO[bytes]):
         self.file, self.limit = file, DIRECTORY_LIMIT
@@ -539,7 +541,7 @@ class _DirectoryReader:
 def check_member(member: zipfile.ZipInfo) -> None:
     """Raises `UserError` if a zip member is encrypted, or if it is neither stored nor deflated.
 
-    `zipfile` limits the number of unpacked bytes only for such members.
+    For any other compression method, `zipfile` does not limit the number of unpacked bytes.
     """
     if member.flag_bits & 1 or member.compress_type not in (
         zipfile.ZIP_STORED,

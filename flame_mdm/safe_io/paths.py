@@ -119,7 +119,7 @@ def _machine() -> str:
 
 
 def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool = False) -> None:
-    """Removes temporary files and folders that dead processes left behind.
+    """Removes temporary files and folders left behind by dead processes.
 
     Args:
         folder: folder of the temporary files and folders.

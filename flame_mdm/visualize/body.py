@@ -49,8 +49,8 @@ class Figure:
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
         text: the caption or the name of the action, or "" if there is neither.
-        id: name of the motion: the name of a clip or file or, for a generated motion, the text and
-            the sample number, which together determine the noise.
+        id: the name of the clip or file. For a generated motion, the text and the sample number,
+            which together determine the noise.
         contacts: (F, N) bool, whether each joint in `skeleton.feet` is on the floor; None =
             unknown.
     """
@@ -161,7 +161,7 @@ def read_body(name: str) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class FittedBody:
-    """A body with B = 28 bones and the bone lengths of a clip, and its motion over F frames."""
+    """A moving body with B = 28 bones and F frames, fitted to the bone lengths of a clip."""
 
     mesh: Mesh
     # (22, 3, 3), linear map from each joint's part of the stored mesh to the proportions of the

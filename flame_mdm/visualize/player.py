@@ -66,8 +66,8 @@ def player_page(
             must already be escaped.
         columns: number of motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.
-        beside: for each motion, the id of an earlier motion that it is shown next to, such as the
-            original of an edited motion; "" = none.
+        beside: for each motion, the id of the earlier motion next to which it is shown; "" = none.
+            For example, an edited motion is shown next to its original.
         marks: for each motion, the spans of frames to mark on the timeline. Each span consists of
             its first frame, its end (exclusive), its kind and a description.
         body: the body to draw; None = the mannequin.

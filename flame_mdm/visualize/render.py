@@ -169,7 +169,7 @@ def _palette() -> Image.Image:
 def _video(
     motions: Sequence[Figure], fps: float, size: int, mesh: Mesh | None
 ) -> Iterator[Image.Image]:
-    """Yields images of all panels and a progress bar, one for every 1 / fps seconds of motion."""
+    """For every 1 / fps seconds of motion, yields an image of all panels and a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     bodies = [motion.try_fit(mesh)[0] for motion in motions]

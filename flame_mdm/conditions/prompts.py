@@ -1,5 +1,5 @@
 # pyright: standard
-"""Prompts as models read them: parts with captions, a summary, changes and unknown words."""
+"""Prompts as models read them: captions for each part, a summary, changes and unknown words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

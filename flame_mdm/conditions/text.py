@@ -46,8 +46,8 @@ class PretrainedText(ConditionEncoder):
             implementation, the map is drawn with a fixed seed, but a released checkpoint can
             replace it.
         revision: full 40-digit commit hash on the hub; required for models from the hub.
-        package: installed Python package from which the files are loaded instead of from the hub.
-            In this case, `model` is used only as a name.
+        package: installed Python package that contains the files. If it is set, nothing is loaded
+            from the hub, and `model` is used only as a name.
         sha256: hash of the package's model.safetensors, checked before loading; required with
             `package`.
         normalize: whether to scale the pooled vector to norm 1.

@@ -78,7 +78,7 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
 def vocabulary(
     captions: Iterable[str], shared: Iterable[str] | None = None
 ) -> dict[str, list[str]]:
-    """Returns the words and captions of the training data that are saved in a checkpoint.
+    """Returns the words and captions of the training data, for saving in a checkpoint.
 
     Args:
         captions: all captions of the training clips.

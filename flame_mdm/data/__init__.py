@@ -158,7 +158,7 @@ class MotionSource(ABC):
         return self.captions_may_be_shared
 
     def licenses(self) -> set[str]:
-        """Returns the licenses of all motions without reading the motions.
+        """Returns the licenses of all motions. The motions are not read.
 
         An empty string stands for an unknown license.
         """
@@ -166,7 +166,7 @@ class MotionSource(ABC):
 
     @abstractmethod
     def count(self) -> int:
-        """Returns the number of clips that `clips` yields, without reading motions.
+        """Returns the number of clips that `clips` yields. The motions are not read.
 
         Raises:
             FileNotFoundError: If the raw data is missing. The message explains how to obtain it.

@@ -183,7 +183,7 @@ class Amass:
         function: Callable[[Argument, Recording], Result],
         workers: int = 0,
     ) -> Iterator[tuple[str, Result]]:
-        """Applies a function to recordings in worker processes.
+        """Applies a function to recordings, using worker processes.
 
         Yields pairs (key, result), sorted by key.
 

@@ -60,10 +60,11 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
 
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
-    """Returns `path` if it is a folder, or a temporary folder with the `members` of the archive.
+    """Returns `path` if it is a folder; otherwise, unpacks the archive and returns a folder.
 
-    The temporary folder is removed when `owner` is garbage-collected. The returned folder is its
-    deepest subfolder that contains all members.
+    The `members` of the archive are unpacked into a temporary folder, which is removed when
+    `owner` is garbage-collected. In this case, the result is the deepest folder that contains all
+    members.
 
     Raises:
         UserError: For the same reasons as `members`, and if a member would be unpacked outside

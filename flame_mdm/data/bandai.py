@@ -140,9 +140,9 @@ class Bandai(MotionSource):
         mirror: whether a mirrored copy follows each clip of the training split.
         workers: number of processes; 0 = one per core.
         exclude: file names (without extension) of the takes to leave out.
-        split: with "takes", the combinations of content and style in the takes that are held out
-            also occur in training. With "compositional", the combinations in `HELD_OUT` are held
-            out, so training includes their contents and styles only in other combinations.
+        split: with "takes", the combinations of content and style in the held-out takes also occur
+            in training. With "compositional", the combinations in `HELD_OUT` are held out, so
+            training includes their contents and styles only in other combinations.
     """
 
     name = "bandai"
@@ -313,8 +313,8 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
     split. The takes of walk-turn-left and walk-turn-right in normal style overlap in time, so all
     of them are used for training.
 
-    With the rule "compositional", the combinations in `HELD_OUT` form the test split. All other
-    takes that would be in the test split under the rule "takes" are used for training.
+    With the rule "compositional", the combinations in `HELD_OUT` form the test split. Other takes
+    that the rule "takes" would assign to the test split are used for training.
     """
     if rule == "compositional":
         if (content, style) in HELD_OUT:

@@ -20,8 +20,8 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str]]]:
     """Yields the rows of a caption table.
 
-    Each row is a pair of its location (file and line), for error messages, and its cells, keyed by
-    column.
+    For each row, the result is a pair: the location (file and line) for error messages, and a
+    dictionary that maps each column to its cell.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in
@@ -60,8 +60,8 @@ def drawn_splits(
 
     Splits are drawn with a hash of the source, so that all motions from the same source are in the
     same split. If no motion is drawn for training, the source with the highest hash in the largest
-    split is moved to training. With `SPLITTABLE` or more motions, the same applies to empty val and
-    test splits.
+    split is moved to training. If there are at least `SPLITTABLE` motions, empty val and test
+    splits also receive a source in this way.
 
     Args:
         sources: maps the name of each motion to its source.

@@ -117,9 +117,9 @@ class CMU(MotionSource):
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
             subfolders; or an archive of such a folder.
-        captions: clone of HumanML3D's repository, a folder with texts, splits and index, or a
+        captions: clone of HumanML3D's repository; a folder with texts, splits and index; or a
             folder with `captions.csv`. Default: `path`. KIT-ML's captions for AMASS (kitml*.json)
-            are used if either folder contains them.
+            are used if `path` or `captions` contains them.
         motion: "joints" for joint positions, or "smpl" for SMPL's rotations, which are computed
             from the joint positions.
     """
@@ -183,7 +183,7 @@ class CMU(MotionSource):
     def humanml3d(
         self,
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
-        """HumanML3D's clips from CMU recordings, and their captions and splits, keyed by name.
+        """HumanML3D's clips from CMU recordings, with their captions and splits, keyed by name.
 
         All of them are empty if the user provides captions.
         """
@@ -346,7 +346,7 @@ class CMU(MotionSource):
 
 @dataclass
 class _Part:
-    """A part of a recording in a caption table: frames `start` to `end` at 20 fps."""
+    """A part of a recording, as listed in a caption table: frames `start` to `end` at 20 fps."""
 
     name: str
     trial: str
@@ -493,7 +493,7 @@ def decide_rate(
 
 
 def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Returns a recording with the bones of CMU's own files, and the fields of its `Layout`.
+    """Converts a recording to the bones of CMU's own files, and also returns its `Layout` fields.
 
     Both conversions begin with a T-pose, which is removed. The joints `pelvis` and `face` are added
     at the positions of SMPL's pelvis and head. In the Daz figure, `upperneck` is also added. Other
@@ -565,7 +565,7 @@ def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
 
 
 def _read(kind: str, task: tuple[list[Path], Evidence, list[Item]]) -> list[np.ndarray] | str:
-    """Returns the motions in the first readable file, or the first error if there is none."""
+    """Returns the motions in the first readable file, or the first error if no file is readable."""
     files, evidence, items = task
     errors = []
     for file in files:

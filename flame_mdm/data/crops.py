@@ -130,7 +130,7 @@ class Fixed(Crop):
 
 
 class Clips(Dataset[Sample]):
-    """The clips of a split that are long enough for the crop rule.
+    """Those clips of a split that are long enough for the crop rule.
 
     Each time a clip is drawn, it is cropped and then normalized. `advice` is added to the error
     message for a split without clips; see `flame_mdm.data.advice_on_splits`.

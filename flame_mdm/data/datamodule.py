@@ -312,7 +312,7 @@ class MotionDataModule(LightningDataModule):
         """Returns a loader that yields each validation clip exactly once across all ranks.
 
         If there are fewer clips than ranks, every rank gets all clips. A rank without a batch would
-        skip the validation, and all other ranks would wait for it.
+        skip the validation, and all other ranks would wait for this rank.
         """
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size

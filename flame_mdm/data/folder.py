@@ -41,7 +41,7 @@ MOST_COPIES = 16
 
 
 class MotionFile(NamedTuple):
-    """A motion file, and the name of the animation in it, or None if it contains only one."""
+    """A motion file and, if it contains several animations, the name of one of them."""
 
     path: Path
     animation: str | None = None
@@ -78,9 +78,9 @@ class Folder(MotionSource):
             clip occurs at most 16 times. 0 = clips are not repeated.
         license: license of motions for which the table does not specify a license. This is a key in
             `licenses.yaml`, or "" if the license is unknown.
-        prefixes: words to insert before captions, each mapped to the actions whose captions it
-            precedes. A model can then distinguish these motions from motions with the same action
-            name in another data set.
+        prefixes: maps each word to a list of actions. The word is inserted before the captions of
+            these actions. A model can then distinguish these motions from motions with the same
+            action name in another data set.
     """
 
     name = "folder"
@@ -244,7 +244,7 @@ class Folder(MotionSource):
         ]
 
     def failure_lines(self) -> list[str]:
-        """Returns one line per motion that cannot be prepared, and a line with their number."""
+        """Returns one line for each motion that cannot be prepared, and a line with the total."""
         if not self.failures:
             return []
         summary = f"error: {len(self.failures)} of {len(self.files)} motions in {self.path} cannot be prepared"
@@ -303,7 +303,7 @@ class Folder(MotionSource):
     def notes(self) -> dict[str, Note]:
         """Captions and labels of each motion, from the table and text files.
 
-        Either all motions or none of them must have captions. The same applies to actions.
+        If one motion has captions, all motions must have captions. The same applies to actions.
         """
         notes = {name: Note() for name in self.files}
         if os.path.lexists(self.path / TABLE):
@@ -341,7 +341,7 @@ def _put_prefixes(prefixes: Mapping[str, str], notes: Collection[Note], table: P
         table: the file that lists the actions, for the error message.
 
     Raises:
-        UserError: If no motion has one of the actions.
+        UserError: If `prefixes` contains an action that no motion has.
     """
     unknown = set(prefixes) - {note.action for note in notes}
     if unknown:

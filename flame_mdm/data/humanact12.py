@@ -126,7 +126,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
 
 def find(path: Path, name: str) -> Path:
-    """Returns `path` if it is a file, or else the file `name` in this folder or a subfolder.
+    """Returns `path` or, if it is a folder, the file `name` in it or in a subfolder.
 
     The error for a missing file states where the data set is published.
     """

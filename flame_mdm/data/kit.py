@@ -35,10 +35,10 @@ class KITTemos(MotionSource):
     """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
 
     The recordings have 100 frames per second, and every eighth frame is used. Source: Petrovich,
-    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions with fewer than 10 or
-    more than 500 frames are left out of the training and validation splits. The test split contains
-    all motions, but only the first caption of each motion. The attribute `ghosh_test` states
-    whether a clip is in Ghosh et al.'s test split.
+    Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions shorter than 10 frames
+    or longer than 500 frames are left out of the training and validation splits. The test split
+    contains all motions, but only the first caption of each motion. The attribute `ghosh_test`
+    states whether a clip is in Ghosh et al.'s test split.
 
     The folder `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`
     for each motion. The folder `splits` contains TEMOS's lists of these numbers.
@@ -135,7 +135,7 @@ class KITTemos(MotionSource):
             yield clip
 
     def counts(self) -> dict[str, int]:
-        """Returns the number of motions, of captions, and of names in each split."""
+        """Returns the numbers of motions and captions, and the number of names in each split."""
         texts = sum(len(read_json(path)) for path in self.path.glob("*_annotations.json"))
         splits = list(read_splits(self.splits, "", self.get_it).values())
         counts = {split: splits.count(split) for split in SPLITS} | {

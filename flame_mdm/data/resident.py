@@ -79,7 +79,7 @@ class ResidentLoader:
 
     Args:
         clips: clips of the split.
-        batches: for each batch, the list of its draws.
+        batches: for each batch, a list with the `Draw` of each clip.
         features: (N + 1, D), as returned by `resident_features`.
         multiple: number of frames; each batch is padded to a multiple of it.
     """

@@ -1,9 +1,9 @@
-"""Reader for pickles that does not run any code that they contain.
+"""Reader for pickles. It never runs code that a pickle contains.
 
 The reader supports arrays, numbers, text, lists, tuples, and dictionaries with text keys. A pickle
 can name any function, and Python calls this function when the pickle is loaded. This reader never
 calls these functions: it only records the arguments and the state of each object, and creates
-arrays from the recorded bytes. NumPy's own functions are not used for this purpose, because a wrong
+arrays from the recorded bytes. NumPy's own functions are not used to create arrays, because a wrong
 byte in a dtype can crash them.
 
 Python's C unpickler allocates as much memory as a file declares, even if the file has only ten
@@ -71,8 +71,8 @@ class _Dictionary(dict[str, Any]):
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    `opaque` contains prefixes of global names. Objects of these globals are replaced by their
-    state.
+    `opaque` contains prefixes of the names of globals. An object of such a global is replaced by
+    its state.
     """
 
     stack: list[Any]
@@ -189,8 +189,8 @@ class _Unpickler(pickle._Unpickler):
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle with protocol 0 to 5.
 
-    Objects of globals whose names begin with one of the prefixes in `opaque` are also permitted,
-    and are replaced by their state.
+    A global is also permitted if its name begins with one of the prefixes in `opaque`. Its objects
+    are replaced by their state.
 
     Raises:
         UserError: If the file is damaged, or refers to other globals.

@@ -161,8 +161,8 @@ class Store:
     def licenses(self) -> list[dict[str, Any]]:
         """Lists each license with the number of its clips, their total minutes and their actions.
 
-        The list is empty if the data set does not specify licenses. Copies of a clip are counted
-        once.
+        The list is empty if the data set does not specify licenses. A clip and its copies count as
+        one clip.
         """
         frames: dict[str, dict[int, int]] = {}
         actions: dict[str, set[str]] = {}
@@ -388,9 +388,9 @@ def training_statistics(
 def _encoded(
     clips: Iterable[Clip], representation: Representation, workers: int
 ) -> Generator[tuple[Clip, np.ndarray]]:
-    """Yields each clip with the features of its entire motion, encoded in worker processes.
+    """Yields each clip with the features of its entire motion.
 
-    If a motion has several clips, it is encoded only once.
+    Worker processes encode the motions. If a motion has several clips, it is encoded only once.
     """
     groups: deque[list[Clip]] = deque()
 

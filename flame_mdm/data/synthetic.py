@@ -87,8 +87,8 @@ def draw_captions(
 ) -> tuple[list[str], Attributes]:
     """Draws `count` different captions for a clip, and also returns the attributes that they state.
 
-    If `incomplete` is True, all captions omit the same attributes, provided that the grammar
-    contains such captions.
+    If `incomplete` is True and the grammar contains captions that omit attributes, all captions
+    omit the same attributes.
     """
     everything = {
         name
@@ -225,7 +225,7 @@ class Synthetic(MotionSource):
         actions: "core" for 22 actions, or "all" to add 54 actions, clips of two simultaneous
             actions, and parts of cycles.
         core_share: if `actions` is "all", the fraction of clips whose action is drawn from the 22
-            core actions, as with "core". For all other clips, it is drawn from all actions.
+            core actions, as with "core". The actions of the other clips are drawn from all actions.
         often: names of actions to show more often, each with the same probability. This helps with
             quick, small and rare motions, which models learn last.
         often_share: fraction of the clips whose action is drawn from `often`.

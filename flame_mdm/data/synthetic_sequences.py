@@ -55,7 +55,7 @@ HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothin
 
 
 class SyntheticSequences(Synthetic):
-    """Clips that show the end of a previous motion, followed by the motion in the captions.
+    """Clips with the end of a previous motion, followed by the motion that the captions describe.
 
     The previous motion is a different action, the same action, or standing still. The described
     motion begins before the body comes to rest. A person who sits, lies or kneels stands up first.
@@ -132,7 +132,10 @@ def _joined(rng: np.random.Generator, attributes: Attributes, fps: float) -> Bod
 
 
 def _earlier(rng: np.random.Generator, start: str) -> Attributes:
-    """Draws the attributes of a motion that precedes a motion with the initial posture `start`."""
+    """Draws the attributes of the previous motion in a clip.
+
+    `start` is the initial posture of the motion that follows it.
+    """
     if start == "standing":
         if rng.random() < RESTING:
             return {"action": "stand"}

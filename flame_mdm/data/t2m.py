@@ -158,7 +158,7 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Maps the name of each motion that is not excluded to its split."""
+        """Maps names of motions to splits. Excluded motions are left out."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property

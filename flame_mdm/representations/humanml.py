@@ -64,7 +64,7 @@ class HumanML(Representation):
         bone_lengths: for each of the J joints, the length of the bone that ends there, in the
             features' unit. All motions are retargeted to these lengths. None = each motion keeps
             its own bone lengths.
-        units_per_metre: number of the features' length units per meter.
+        units_per_metre: how many of the features' length units make up one meter.
         contact_threshold: squared displacement of a foot per frame, in the features' unit, below
             which the foot is considered to be in contact with the floor. HumanML3D uses 0.002, and
             KIT uses 0.05.

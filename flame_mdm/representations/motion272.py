@@ -121,9 +121,10 @@ class Motion272(Representation):
         return ground + height, torch.cat([root, turned[..., 1:, :, :]], -3)
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns rotations (..., F, 3, 3) to body coordinates, and ground positions (..., F, 3).
+        """Returns the rotations from world to body coordinates, and the ground positions.
 
-        The ground position is the position of the root with y = 0.
+        The shapes are (..., F, 3, 3) and (..., F, 3). The ground position is the position of the
+        root with y = 0.
         """
         inverse = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 0, :], "rows")
         step = 1

@@ -37,8 +37,8 @@ class Rifke(Representation):
 
     Args:
         fps: frames per second.
-        units_per_metre: number of the features' length units per meter. KIT's unit is 1/640 meter.
-            Input and output joint positions are in meters.
+        units_per_metre: how many of the features' length units make up one meter. KIT's unit is
+            1/640 meter. Input and output joint positions are in meters.
 
     Example:
         >>> representation = Rifke()

@@ -2,7 +2,7 @@
 
 Rotations are represented by axis-angle vectors, quaternions, matrices, two kinds of 6D vectors, or
 Euler angles. Every function accepts any leading batch shape, preserves the dtype and is
-differentiable. Quaternions have the order (w, x, y, z) and unit length. Matrices act on column
+differentiable. Quaternions are in (w, x, y, z) order and have unit length. Matrices act on column
 vectors. Angles are in radians.
 """
 
@@ -149,7 +149,7 @@ def _shorter(normalized: Tensor) -> Tensor:
 
 
 def _completed(rot6d: Tensor) -> Tensor:
-    """Returns 6D vectors (..., 6) in which one or both vectors are replaced by basis vectors."""
+    """Replaces one or both halves of each 6D vector (..., 6) with basis vectors."""
     first, second = F.normalize(rot6d[..., :3], dim=-1), F.normalize(rot6d[..., 3:], dim=-1)
     basis = torch.eye(3, dtype=rot6d.dtype, device=rot6d.device)
     replaced = _shorter(first)

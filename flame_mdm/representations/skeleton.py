@@ -49,9 +49,9 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """For each joint, the joint to which its rotation in HumanML3D is relative.
+        """For each joint, the reference joint of its rotation in HumanML3D.
 
-        This is the parent or, at the start of a chain, the root.
+        The reference joint is the parent or, at the start of a chain, the root.
         """
         starts = {chain[1] for chain in self.chains}
         return tuple(0 if joint in starts else parent for joint, parent in enumerate(self.parents))

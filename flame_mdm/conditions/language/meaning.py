@@ -1,4 +1,4 @@
-"""Meanings of words that are not in the tables: similar actions, and detection of things."""
+"""Finds actions similar to words that are not in the tables, and detects words for things."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -54,7 +54,10 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 
 
 def is_thing(word: str) -> bool:
-    """Returns whether a word names a thing, based on listed words with similar meanings."""
+    """Returns whether a word names a thing.
+
+    This is the case if most of the listed words that are closest in meaning name things.
+    """
     vector = word_table().vector(word)
     if vector is None:
         return False
@@ -68,7 +71,7 @@ def is_thing(word: str) -> bool:
 def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
     """Returns the actions with their scores, best first.
 
-    The score is the mean of the similarity to the action's closest word and the similarity to the
+    The score is the mean of two similarities: one to the action's closest word, and one to the
     action's center.
     """
     names, rows, vectors = _action_vectors()
@@ -82,9 +85,10 @@ def _ranked(vector: np.ndarray) -> list[tuple[str, float]]:
 
 @cache
 def _action_vectors() -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Returns the names of the actions, and two arrays about the single words that name them.
+    """Returns the names of the actions, and two arrays for the single words that name actions.
 
-    The arrays contain the index of each word's action, and the vector of each word.
+    The first array contains the index of each word's action, and the second contains each word's
+    vector.
     """
     table, weak = word_table(), words_of("weak")
     names = list(actions())

@@ -67,7 +67,7 @@ def is_explained(word: str) -> bool:
 def _nearest(tokens: Sequence[Token]) -> tuple[str, ...]:
     """Returns the actions that are closest in meaning to the unknown words of a sentence.
 
-    If the tables contain every word, all words are used.
+    If there are no unknown words, all words are used.
     """
     words = [token.word for token in tokens if token.is_word]
     free = [word for word in words if not is_explained(word)] or words
@@ -264,6 +264,9 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _without_idle(step: Step) -> Step:
-    """Removes duplicate actions, and "stands still" if the step contains another action."""
+    """Removes duplicate actions.
+
+    If the step contains another action, "stands still" is also removed.
+    """
     moving = [mention for mention in step if mention.action != "idle"] or step[:1]
     return tuple({mention.action: mention for mention in moving}.values())

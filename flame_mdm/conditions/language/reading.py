@@ -1,4 +1,4 @@
-"""Conversion of sentences to captions that a model knows, with a list of ignored words."""
+"""Converts sentences to captions that a model knows, and lists the ignored words."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -83,9 +83,9 @@ class Reader:
     def read(self, text: str) -> Reading:
         """Returns a sentence as the model reads it.
 
-        Two kinds of sentences are passed to the model unchanged. The first are training captions
-        that name an action outside the model's list. The second are sentences in which no action is
-        understood, but whose unknown words are all in the model's vocabulary.
+        A training caption is passed to the model unchanged if it names an action outside the
+        model's list. The same applies to a sentence in which no action is understood, provided that
+        the model's vocabulary contains all unknown words of the sentence.
 
         Raises:
             UserError: If the sentence is not English, or names an action that the model does not
@@ -253,7 +253,7 @@ class NotUnderstood(UserError):
 
 @dataclass
 class _Notes:
-    """Changes to a sentence, and its words without effect, collected while it is read."""
+    """Changes to a sentence, and words without effect. Both are collected during reading."""
 
     changes: list[str]
     ignored: list[str] = field(default_factory=list)
@@ -301,7 +301,10 @@ def _caption(step: Step, words: str, special: Set[str]) -> str:
 
 
 def _without_style(text: str) -> tuple[str, str]:
-    """Separates a style that adapters teach, such as "in limp style", from a sentence."""
+    """Returns a sentence without its style, and the style, such as "in limp style".
+
+    Adapters teach such styles. If the sentence states no style, the second result is "".
+    """
     before, separator, style = text.rstrip(" .").rpartition(" in ")
     if separator and style.endswith(" style") and style.count(" ") == 1:
         return before, f" in {style}"

@@ -55,7 +55,7 @@ def distance(first: str, second: str, most: int) -> int:
 
 @cache
 def corrections(word: str) -> tuple[str, ...]:
-    """Returns the words in the tables that a misspelled word may stand for.
+    """Returns the words that a misspelled word may stand for, taken from the tables.
 
     The tuple is empty if no word is similar. All returned words are equally likely: they differ
     from the misspelled word by the same number of edits of the same kind. A word of up to five

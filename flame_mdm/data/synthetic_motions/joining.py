@@ -23,10 +23,10 @@ STEP_SECONDS, STEP_HEIGHT = 0.35, 0.07
 def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) -> Body:
     """Returns a body that moves like `first` until the end of `first`, and then like `second`.
 
-    The changes during the second motion are added to the end of the first motion. The difference
-    between the end of the first and the beginning of the second motion is faded out, except for the
-    position in the world. A foot that has a different position at the beginning of the second
-    motion takes a step to this position.
+    The changes during the second motion are added to the end of the first motion. The body at the
+    end of the first motion may differ from the body at the beginning of the second motion. This
+    difference is faded out, except for the position in the world. A foot that has a different
+    position at the beginning of the second motion takes a step to this position.
 
     Args:
         first: a body at evenly spaced times.

@@ -157,9 +157,9 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """Reader that limits the expanded size of a compressed file of `packed` bytes.
+    """Reader for the expanded content of a compressed file of `packed` bytes.
 
-    It raises an error if the size is implausible.
+    It raises an error if the expanded size is implausible.
     """
 
     def __init__(self, file: IO[bytes], packed: int):

@@ -2,8 +2,8 @@
 
 The motions from http://mocap.cs.cmu.edu are read from ASF/AMC files, or from BVH files that were
 converted from them. The motions are free for all uses. Captions: Guo et al., CVPR 2022 (HumanML3D),
-and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` lists the required downloads, and how
-this data differs from HumanML3D and KIT-ML.
+and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` lists the required downloads, and
+describes how this data differs from HumanML3D and KIT-ML.
 """
 
 import re

@@ -32,8 +32,8 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
     Returns:
         The content of the report: the data set, the hashes of its `files`, its `figures` next to
-        the published ones, the number of captions and of clips per action, the lengths of the
-        clips, clips that are `still` or `duplicates`, deviations of the stored statistics, and
+        the published ones, the number of captions, the number of clips per action, the lengths of
+        the clips, clips that are `still` or `duplicates`, deviations of the stored statistics, and
         `excluded` clips.
 
     Raises:

@@ -37,7 +37,9 @@ A caption that states the value contains one of these parts.
 
 
 class Abilities:
-    """Actions and attributes known to a model whose captions each name one action from a list.
+    """Actions and attributes that a model knows.
+
+    Each of the model's captions names one action from a list.
 
     Args:
         facts: facts about the model: "actions", "vocabulary" and, if known, "captions".

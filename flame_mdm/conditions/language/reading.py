@@ -62,7 +62,9 @@ class Reading:
 
 
 class Reader:
-    """Reads sentences for a model whose captions each name one action from a list.
+    """Reads sentences for a model.
+
+    Each of the model's captions names one action from a list.
 
     Args:
         facts: facts about the model: "actions", "vocabulary" and, if known, "captions".

@@ -248,7 +248,7 @@ class _Measure:
     def facts_of(self, name: str) -> dict[str, Any]:
         """Returns the properties that a card lists for a value; see `AuditedMetric`.
 
-        The direction of the value is not included.
+        They do not include whether a higher value is better.
         """
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]

@@ -107,7 +107,7 @@ class Evaluate(Callback):
                 )
 
     def _add(self, name: str, value: Value, real: Value | None) -> None:
-        """Stores a value for checkpoint selection and its curves for dashboards."""
+        """Stores a value twice: for checkpoint selection, and as a curve for dashboards."""
         assert value.mean is not None
         self.values[name] = value.mean
         label = f"{name} ({value.unit})" if value.unit else name

@@ -72,7 +72,7 @@ def evaluate(request: EvaluationRequest) -> None:
 class Evaluation:
     """Evaluates a split of a data set under a protocol.
 
-    All ranks must create and run it together.
+    All ranks must create and run the evaluation together.
     """
 
     # Protocol to follow

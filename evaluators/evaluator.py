@@ -73,7 +73,7 @@ An input is a tensor, or a list of N entries (such as joints).
 class Evaluator:
     """Computes metrics for motions, with one feature pass for all metrics.
 
-    For the same features, all values are bit-identical for any batch size and order. Several
+    If the features are the same, all values are bit-identical for any batch size and order. Several
     processes share the feature pass: each one receives whole batches, so that features do not
     depend on the number of processes. The first process computes the metrics.
 
@@ -293,8 +293,8 @@ class Evaluator:
     ) -> dict[str, SampleMetric]:
         """Returns the metrics that can be computed.
 
-        With `skip_features`, metrics that lack features are left out. Any other missing input
-        raises `UserError`.
+        With `skip_features`, metrics are left out if the features that they require are missing.
+        Any other missing input raises `UserError`.
         """
         available = {
             *motions,

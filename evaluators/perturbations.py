@@ -113,7 +113,7 @@ def play(joints: Joints, factor: float, fps: float) -> Joints:
 def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
     """Resamples a motion linearly to another frame rate and back.
 
-    Frames after the last resampled frame repeat this frame.
+    Frames after the last resampled frame are copies of it.
     """
     back = resample(resample(joints, fps, rate), rate, fps)
     return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
@@ -127,9 +127,9 @@ def crop(joints: Joints, percent: float) -> Joints:
 def drop_repetition(joints: Joints, count: int) -> Joints:
     """Shortens a motion by cutting out one of its `count` repetitions.
 
-    The cut joins the two frames with the most similar poses among all pairs of frames that are
-    about one period apart (within 20 %). The second part continues at the position where the first
-    part ends.
+    Among all pairs of frames that are about one period apart (within 20 %), the cut joins the pair
+    with the most similar poses. The second part continues at the position where the first part
+    ends.
     """
     poses = joints - joints[:, :1] * GROUND
     change = np.linalg.norm(np.diff(poses, axis=0), axis=-1).mean(1)
@@ -321,7 +321,7 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same motions, with texts of which this share (in percent) has been replaced."""
+        """Returns the same motions, and texts after replacing this share of them (in percent)."""
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]

@@ -91,9 +91,9 @@ class Multimodality(ClosedSchema):
 class Protocol(ClosedSchema):
     """A named and versioned evaluation procedure, described by a file in experiments/evaluation.
 
-    The caption and crop of a clip and the noise of the generated motion depend only on (seed,
-    replication, id). Generated motions are as long as the real clips. Real motions are measured in
-    the same way and compared with a second draw of real motions.
+    The caption and the crop that are drawn from a clip, as well as the noise for the generated
+    motion, depend only on (seed, replication, id). Generated motions are as long as the real clips.
+    Real motions are measured in the same way and compared with a second draw of real motions.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -224,7 +224,7 @@ class Protocol(ClosedSchema):
         return f"{self.name}-{self.version}"
 
     def selected(self, clips: Clips) -> list[Entry]:
-        """Returns the clips with the attributes of `only` that are longer than the context."""
+        """Returns the clips that have the attributes in `only` and are longer than the context."""
         shortest = self.context_frames + (CONTEXT_STARTS if self.context == "start" else 1)
         chosen = [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
         return [clip for clip in chosen if not self.context_frames or clip.length >= shortest]

@@ -215,7 +215,7 @@ class SampleFolder:
 
     Each file holds these arrays:
 
-    - `ids` (N,): names of clips of the split.
+    - `ids` (N,): names of clips in the split.
     - `lengths` (N,): numbers of frames.
     - `features` (sum of lengths, D) in the data's units, or `joints` (sum of lengths, J, 3) in
       meters, y up, at the data's frame rate.

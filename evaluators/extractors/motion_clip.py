@@ -115,12 +115,12 @@ def info_nce(
     meaning: Tensor | None = None,
     wrong_text: Tensor | None = None,
 ) -> Tensor:
-    """Contrastive loss over the pairs of all ranks: the mean of both cross-entropies.
+    """Contrastive loss over the pairs of all ranks: the mean cross-entropy of both directions.
 
     See Oord et al. 2018, eq. 4. The loss is symmetric, as in Radford et al. 2021. Each rank
     compares its own pairs (B, E) with the motions and texts of all ranks, and DDP averages
-    gradients over ranks. If all ranks have the same number of pairs, the averages of losses and
-    gradients equal the loss and gradient of a single rank with all pairs.
+    gradients over ranks. If all ranks have the same number of pairs, the averaged loss and gradient
+    equal those of a single rank with all pairs.
 
     Args:
         motion: (B, E) features of the motions on this rank.

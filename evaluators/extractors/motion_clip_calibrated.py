@@ -38,8 +38,9 @@ LENGTH = 10.0
 class CalibratedMotionCLIPTask(MotionCLIPTask):
     """Trains a motion-CLIP whose distances have a known scale, with texts that differ in details.
 
-    - Texts: motions of clips with the same captions or attributes are not negatives of each other's
-      captions. Near-miss captions (see `near_misses`) are additional negatives.
+    - Texts: if two clips have the same captions or attributes, the motion of one clip is not a
+      negative for the captions of the other. Near-miss captions (see `near_misses`) are additional
+      negatives.
     - Motions: half of them come with a noisy copy. The strength of the noise is drawn from [0, 1],
       with small values more likely. The distance between the features of a motion and its copy,
       both scaled to norm 1, is trained to equal this strength. Half of the copies have white noise

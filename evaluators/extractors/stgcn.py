@@ -17,8 +17,8 @@ TEMPORAL_KERNEL = 9
 def adjacency(parents: Sequence[int]) -> Tensor:
     """Returns the three matrices of a graph convolution, as (3, V, V).
 
-    They gather from a vertex itself, from its neighbors that are not nearer to the root, and from
-    its neighbors that are.
+    The first matrix gathers from the vertex itself, the second from neighbors that are not nearer
+    to the root, and the third from neighbors that are nearer to the root.
 
     Entry (v, w) is the weight of vertex v in the sum for vertex w, divided by the number of
     vertices that contribute to w. In the authors' code, all vertices beyond distance 1 from the
@@ -109,7 +109,7 @@ class _Block(nn.Module):
 
 
 class UESTC(STGCN):
-    """The UESTC classifier used for the tables of ACTOR, MDM and MFM, with 40 actions.
+    """The classifier for the 40 actions of UESTC, used for the tables of ACTOR, MDM and MFM.
 
     It reads joint rotations.
     """

@@ -135,9 +135,9 @@ class T2MEvaluator(nn.Module):
 
     The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units and
     are normalized with the `mean` and `std` (D,) of the released weights. After normalization,
-    motions are padded with zeros to `max_frames`, as in the authors' code for real motions, so the
-    convolutions read 3 frames past the end. The network reads the first `used_features` features
-    (67 for MARDM, 64 for KIT); None = all features except the contacts.
+    motions are padded with zeros to `max_frames`, as the authors' code does for real motions.
+    Therefore, the convolutions read 3 frames past the end. The network reads the first
+    `used_features` features (67 for MARDM, 64 for KIT); None = all features except the contacts.
     """
 
     mean: Tensor

@@ -63,8 +63,8 @@ def matching_loss(
     """Computes the contrastive loss of Guo et al. 2022 over B pairs. Returns a scalar.
 
     The formula is eq. 4 of Hadsell et al. 2006, without its factor 1/2. Each text is compared with
-    its own motion and with a wrong motion: the motion of the closest preceding pair whose motion
-    the text does not describe. The wrong motion adds no loss if its distance is larger than
+    its own motion and with a wrong motion. The wrong motion is the first one, going back from the
+    row of the text, that the text does not describe. It adds no loss if its distance is larger than
     `margin`. The authors shift the motions by a random number of rows instead, which also pushes
     matching pairs apart.
 

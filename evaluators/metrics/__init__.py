@@ -33,8 +33,8 @@ errors) require real motions in the order of the generated motions.
 
 `compute()` returns a number, or a dict that maps names to numbers. If there are no samples, it
 returns None. It raises `UserError` if a number would be meaningless, for example because there are
-too few samples. For the same features, values are bit-identical for any batch size, order and
-number of processes. Random draws depend only on `seed`.
+too few samples. If the features are the same, values are bit-identical for any batch size, order
+and number of processes. Random draws depend only on `seed`.
 """
 
 from __future__ import annotations

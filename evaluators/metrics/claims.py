@@ -1,5 +1,5 @@
 # pyright: standard
-"""Share of the claims in captions that are true of the motions, as judged by the referee."""
+"""Share of true claims: a referee judges which claims in captions are true of the motions."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -94,7 +94,7 @@ class ClaimAccuracy(Timed, MotionMean):
         return {name: torch.tensor(values, dtype=torch.float64) for name, values in flags.items()}
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the joints of each motion, because the captions determine what is measured.
+        """Returns the joints themselves, because the captions determine what is measured.
 
         "positions" (N, F, 3 J) are int16, in units of `STEP`, relative to the starting point on the
         floor. "frames" (N,) are the lengths of the motions.

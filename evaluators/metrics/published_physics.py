@@ -149,8 +149,8 @@ def _speed(points: Tensor) -> Tensor:
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
     """Counts the frames of `foot_floating` in a motion (F, J, 3).
 
-    `feet` (F, 2, 3) contains the positions of the two feet, and `contact` (F, 2) bool contains
-    their contacts.
+    `feet` (F, 2, 3) contains the positions of the two feet, and `contact` (F, 2) bool states
+    whether each foot is in contact.
 
     Returns the numbers of frames of three kinds. In the first kind, the feet on the ground do not
     move in accordance with the body. In the second kind, a foot in the air moves much less than the
@@ -184,11 +184,11 @@ def _runs(aloft: Tensor) -> list[tuple[int, int]]:
 class KimodoQuality(PublishedPhysics):
     """Foot skating of Kimodo (7330e7e), in m/s, from joints and from predicted contacts.
 
-    - `skate_from_height`: mean speed of toes that are lower than 5 cm.
+    - `skate_from_height`: mean speed of toes at heights below 5 cm.
     - `skate_ratio`: fraction of the toes' frame-to-frame movements that are faster than 0.2 m/s,
-      among movements that begin and end lower than 5 cm.
-    - `low`: mean fraction of the toes' movements that begin lower than 5 cm. If this fraction is 0,
-      the first two values are also 0.
+      among movements that begin and end at heights below 5 cm.
+    - `low`: mean fraction of the toes' movements that begin at a height below 5 cm. If this
+      fraction is 0, the first two values are also 0.
     - `skate_from_contacts`, `skate_max`: mean and maximum speeds of heels and toes in contact.
     - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15 m/s
       and lower than 10 cm). Higher is better.
@@ -274,16 +274,17 @@ class KimodoQuality(PublishedPhysics):
 
 
 class KimodoConstraints(MotionMean):
-    """Constraint errors of Kimodo (7330e7e) for edits: distances between kept parts and the real motion.
+    """Constraint errors of Kimodo (7330e7e) for edits: distances of kept parts from real motions.
 
     Distances are in meters and are averaged over motions.
 
-    - `root2d_err`: horizontal distance between the roots, in frames in which the root is kept.
+    - `root2d_err`: horizontal distance of the root from the real root, in frames in which the root
+      is kept.
     - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
-    - `root2d_acc`: fraction of the frames with a kept root in which the two roots are at most 10 cm
-      apart.
-    - `fullbody_keyframe`: distance between all joints, in frames in which all joints are kept.
-    - `end_effector`: distance between the kept joints, in all other frames.
+    - `root2d_acc`: fraction of these frames in which the distance is at most 10 cm.
+    - `fullbody_keyframe`: distance of all joints from the real joints, in frames in which all
+      joints are kept.
+    - `end_effector`: distance of the kept joints from the real joints, in all other frames.
 
     In Kimodo's code, the user draws the root trajectory; in this implementation, the root
     trajectory of the real motion is used.
@@ -355,11 +356,11 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
 class PhysicalFootContact(PublishedPhysics):
     """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration without a planted foot.
 
-    The score is the mean over frames of a product of three factors: the horizontal movements of
-    both feet, in meters per frame, and the acceleration of the root divided by its largest value.
-    Downward accelerations count as 0. The movement of a foot is the smaller of the movements of its
-    ankle and its toe. Motions without acceleration are left out of the mean, whereas EDGE's code
-    includes them as NaN. Lower is better.
+    The score is the mean over frames of a product of three factors: the horizontal movement of each
+    foot, in meters per frame, and the root's acceleration relative to its maximum. Downward
+    accelerations count as 0. The movement of a foot is the smaller of the movements of its ankle
+    and its toe. Motions without acceleration are left out of the mean, whereas EDGE's code includes
+    them as NaN. Lower is better.
 
     Args:
         fps: frames per second of the motions. For rates other than 30, `compute` raises
@@ -399,14 +400,14 @@ class PhysicalFootContact(PublishedPhysics):
 class TransitionJerk(SampleMetric):
     """Peak jerk and area under the jerk, at transitions between kept and generated frames.
 
-    The computation follows FlowMDM's code (e81c67f). The jerk of a frame is the L1 norm of the
-    third difference of a joint's position, in meters per frame^3, for the joint with the largest
-    norm. A window is centered at the first frame after each change between kept and generated
-    frames, provided that the motion contains the whole window. The jerk is averaged over windows,
-    frame by frame. `peak` is the maximum of this mean curve. `area` is the sum of the curve's
-    absolute differences from the jerk of real motions, and grows with the size of the window; it is
-    undefined at frame rates that are not in `JERK_OF_REAL_MOTIONS`. `windows` is the number of
-    windows.
+    The computation follows FlowMDM's code (e81c67f). The jerk of a joint is the L1 norm of the
+    third difference of its position, in meters per frame^3. The jerk of a frame is the largest jerk
+    of any joint. A window is centered at the first frame after each change between kept and
+    generated frames, provided that the motion contains the whole window. The jerk is averaged over
+    windows, frame by frame. `peak` is the maximum of this mean curve. `area` is the sum of the
+    curve's absolute differences from the jerk of real motions, and grows with the size of the
+    window; it is undefined at frame rates that are not in `JERK_OF_REAL_MOTIONS`. `windows` is the
+    number of windows.
 
     Args:
         fps: frames per second of the motions.

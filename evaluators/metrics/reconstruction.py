@@ -19,9 +19,9 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
 
     The positions are root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3). The
     motion (F, 21, 3), in KIT units, is placed on the floor, and its root starts at x = z = 0 with a
-    heading along +z. The local positions are those of all joints except the root after each frame
-    has been moved and turned so that the root is at x = z = 0 and the heading is along +z. `Rifke`
-    defines the floor and the heading, with the peculiarities of the published code.
+    heading along +z. For the local positions, which exclude the root, each frame is moved and
+    turned so that the root is at x = z = 0 and the heading is along +z. `Rifke` defines the floor
+    and the heading, with the peculiarities of the published code.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -141,8 +141,8 @@ class PositionErrors(MotionMean):
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Returns the errors of a clip, keyed by name.
 
-        An "ape" error has one value per frame (F,). If all clips have equal weight, it is the mean
-        over frames.
+        An "ape" error contains one value per frame (F,) or, if all clips have equal weight, only
+        the mean over frames.
         """
         raise NotImplementedError
 
@@ -198,8 +198,8 @@ class FlamePositionErrors(PositionErrors):
 
     The positions to compare are `flame_parts`. The error of the trajectory is the sum of the
     distances along its two axes. The local error is the error of the bones. Variances of global
-    positions are averaged over joints before they are compared. Each clip has the same weight. In
-    FLAME's code, joint positions lack the orientation of the root and start from its translation.
+    positions are averaged over joints before they are compared. Each clip has the same weight.
+    FLAME's code computes joint positions from the translation of the root, without its orientation.
     In this implementation, `joints` are compared unchanged, and the first joint is the root.
 
     Args:
@@ -338,7 +338,7 @@ class DisplacementErrors(EditErrors):
 
 
 class KeptDrift(EditErrors):
-    """Distance, in meters, by which joints that an edit kept have moved in world coordinates.
+    """How far, in meters, an edit has moved kept joints in world coordinates.
 
     This metric was introduced in this project. `mean` is the distance averaged over the kept joints
     and frames of a motion, and then over motions. `largest` is the maximum over all of them. If

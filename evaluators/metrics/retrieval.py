@@ -148,8 +148,8 @@ class MultiPositiveRPrecision(CaptionMetric):
       the fraction of them that are among its R nearest motions.
     - `single_topK`: like `topK`, but only the text's own motion counts as correct. Except for ties,
       the values equal those of `MotionsForText`.
-    - `chance_topK`: the expected values for a random order. They show how much similar captions
-      raise all values.
+    - `chance_topK`: the expected values for a random order. They show how much all values rise
+      because of similar captions.
     - `positives`: the mean number R of correct motions.
 
     Args:
@@ -247,9 +247,9 @@ class TMRRetrieval(CaptionMetric):
     - `batches`: retrieval in batches of 32. An incomplete last batch is left out, and the medians
       of the batches are averaged.
 
-    For each protocol, the values are the recall (`t2m_top1` etc., in [0, 1]) and the median rank
-    (`t2m_median`, 1 = best) of the retrieval of motions by text. For the reverse direction, the
-    names begin with `m2t_`.
+    For each protocol, the values of text-to-motion retrieval are the recall (`t2m_top1` etc., in
+    [0, 1]) and the median rank (`t2m_median`, 1 = best). For the reverse direction, the names begin
+    with `m2t_`.
 
     TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
     HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the

@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class that declares properties of a metric and its values for samples and resamples.
+    """Base class for the properties of a metric, and its values for single samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
@@ -60,7 +60,7 @@ class Declared:
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns what the metric measures on motions independently of their conditions, keyed by name.
+        """Returns those measurements on motions that do not depend on conditions, keyed by name.
 
         Each reading is an array with N rows. Metrics computed from features need no readings.
         """
@@ -402,5 +402,5 @@ class TwoSets(SampleMetric):
         return self.value(*generated, *real) if generated and real else self.nothing
 
     def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
-        """Computes the value for samples (N,) and real motions (M,) drawn with replacement."""
+        """Computes the value for drawn samples (N,) and drawn real motions (M,), both indices."""
         return self.value(*self._taken(drawn, "generated"), *self._taken(real_drawn, "real"))

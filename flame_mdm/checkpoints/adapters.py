@@ -55,8 +55,8 @@ Paths = str | Path | Sequence[str | Path]  # one file or several files
 class About(TypedDict):
     """Description of an adapter.
 
-    `rows` are the rows of the word table that the adapter changes, one per word. `base` is the hash
-    of the base model's weights.
+    `rows` lists the rows that the adapter changes in the word table, one per word. `base` is the
+    hash of the base model's weights.
     """
 
     name: str
@@ -103,7 +103,7 @@ def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable
 
 
 def attach(model: MotionGenerator, about: About) -> None:
-    """Freezes a model and attaches changes, initially 0, to its weights.
+    """Freezes a model and attaches zero-initialized, trainable updates to its weights.
 
     Raises `UserError` if the model's denoiser has no transformer.
     """

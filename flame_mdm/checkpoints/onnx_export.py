@@ -438,7 +438,7 @@ def traced(graph: Graph) -> torch.export.ExportedProgram:
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
     """Writes a graph.
 
-    Raises `UserError` if its outputs for one or two motions differ from PyTorch's.
+    Raises `UserError` if the graph's outputs for one or two motions differ from PyTorch's.
     """
     import onnxruntime
 

@@ -72,7 +72,8 @@ def import_mdm(state: Mapping[str, Tensor], args: Options, *, time_token: bool =
         state: weights from `released_state`, whose shapes determine the sizes of the network.
         args: options of the authors' code.
         time_token: whether the decoder's input token contains only the time, as in the authors'
-            code since February 2025. The released model with an input token is older than that.
+            code since February 2025. The released model with an input token is older than this
+            change.
     """
     network, stack, layer = NETWORKS[args.arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")

@@ -133,7 +133,7 @@ def faults(value: Any, schema: Mapping[str, Any], name: str = "") -> list[str]:
     """Returns the dotted names of the values that a JSON schema rejects.
 
     If an item of a list is rejected, the name of the list is returned. The schema contains types,
-    bounds for numbers and for the number of items, patterns for entire strings, and required keys.
+    bounds for numbers and for list lengths, patterns for entire strings, and required keys.
     Objects may contain keys that are not in the schema.
     """
     kind = schema["type"]
@@ -294,9 +294,9 @@ class Sampler:
 
         For an unconditional model, the prompt is "". `sample` is the sample index, which
         distinguishes several motions for the same prompt. `seconds` is 3 by default, or the model's
-        maximum if this is lower. For a model that continues frames, the maximum is 600. Raises
-        `ValueError` for an invalid length or an unknown action, or if the result contains NaN or
-        infinity.
+        maximum if this is lower. For a model that continues frames, the maximum is 600 seconds.
+        Raises `ValueError` for an invalid length or an unknown action, or if the result contains
+        NaN or infinity.
 
         `text` is the sentence that selects the noise, if it differs from the caption `prompt`:
         `flame_mdm.generate` draws noise for the sentence exactly as the user typed it.

@@ -111,7 +111,7 @@ class _KeyCheck(pickle._Unpickler):
         super().__init__(file, encoding="bytes")
 
     def passes(self) -> bool:
-        """Returns whether the pickle was read to its end, that is, contains no refused object."""
+        """Reads the pickle, and returns whether it contains no refused object."""
         try:
             self.load()
         except _Refused:

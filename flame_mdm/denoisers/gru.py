@@ -23,8 +23,8 @@ class MDMGRU(Denoiser):
         dropout: probability of dropout after the positional encoding.
         project_condition: whether to project the condition before it is added to the time
             embedding.
-        recur_over_batch: whether to recur from sample to sample instead of from frame to frame, as
-            MDM's released code does because its axes are swapped. This option is only for
+        recur_over_batch: whether to recur from sample to sample instead of from frame to frame.
+            MDM's released code does this because its axes are swapped. This option is only for
             reproduction, because results then depend on the order of the samples in the batch.
 
     Example:

@@ -222,9 +222,9 @@ class GaussianDiffusion(Process):
         """See `Process.sample`. The denoiser is called once per step.
 
         Noise draws are numbered in the order in which they are used. `options.num_inference_steps`
-        is either a number of steps from 2 to T, selected according to `options.spacing`, or a list
-        of steps in increasing order. The sampler "consistency" takes 1 to T steps, selected by
-        `grid`. An edit with mode "x0" reproduces the kept part exactly.
+        is either the number of steps, from 2 to T, or a list of steps in increasing order. For a
+        number, `options.spacing` determines which steps are used. The sampler "consistency" takes 1
+        to T steps, selected by `grid`. An edit with mode "x0" reproduces the kept part exactly.
         """
         sampler, steps = self.find_sampler(options), self._steps(options)
         if edit is not None:

@@ -140,9 +140,9 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` in which joints are at the requested world positions.
+    """Changes motions as little as possible, so that joints reach the requested world positions.
 
-    Each Gauss-Newton step applies the smallest change of the normalized features that reaches the
+    Each Gauss-Newton step changes the normalized features as little as possible to reach the
     positions. A Gaussian-process prior keeps the change smooth in time. In frames with a requested
     position, bone lengths are also constrained: they must equal their medians over the motion.
     Neighboring frames receive only part of the change, which would shorten turning bones, so their
@@ -153,8 +153,8 @@ def reach(
         to_joints: function that converts normalized features (F, D) to joint positions (F, J, 3) in
             meters.
         positions: the positions to reach.
-        bones: (3, N) int64: frame, parent and child of the bones whose length the change could
-            affect. All bones are listed for each frame.
+        bones: (3, N) int64: a frame, and the parent and child of a bone. All bones are listed for
+            each frame in which the change could affect their lengths.
         free: (B, F, D) bool, True = this feature may change.
         smoothness: standard deviation of the Gaussian process, in frames.
 

@@ -99,7 +99,7 @@ class ListedCard(ClosedSchema):
     data: Data
 
     def cited(self, folder: Path) -> CitedCard:
-        """Returns the card as results cite it, with the path of its page in `folder`."""
+        """Returns a reference to the card, with the path of its page in `folder`."""
         return CitedCard(folder / f"{self.name}.html", self.motions, self.split, self.data)
 
 
@@ -203,7 +203,7 @@ def _section(card: AuditCard) -> dict[str, object]:
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
-    """Returns one row per perturbation, with a cell per metric and card, and each metric's curves."""
+    """Returns one row per perturbation, with cells (one per metric and card) and curves."""
     by_name = [
         {perturbation.name: perturbation for perturbation in card.perturbations} for card in cards
     ]

@@ -94,8 +94,8 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip with several captions is written with the first one that no earlier clip uses, so that
-    captions are unique where possible.
+    A clip with several captions is written with its first caption that no earlier clip uses, so
+    that captions are unique where possible.
 
     Args:
         folder: the folder to write.

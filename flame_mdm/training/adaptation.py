@@ -54,7 +54,7 @@ OF_BASE = (
 
 
 class AdaptationTask(GeneratorTask):
-    """Continues to train a model on the user's clips and on clips of its original training data."""
+    """Continues to train a model on the user's clips and clips from its original training data."""
 
     def pretrain(self) -> None:
         """Does nothing, because the text encoder is already trained."""
@@ -86,7 +86,7 @@ def adapt(
 ) -> Path:
     """Teaches a text-conditioned model the motions in a folder. Resumes an interrupted run.
 
-    The model is trained on the user's clips and on clips of its original training data, so that
+    The model is trained on the user's clips and on clips from its original training data, so that
     it does not forget what it has learned. Prompts request the new motions with "in NAME style".
     For a guide, see `docs/own-motion.md`.
 

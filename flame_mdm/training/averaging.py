@@ -68,7 +68,10 @@ class MovingAverage(WeightAveraging):
         )
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Copies the initial weights, which pretraining or a teacher may have set, before the first step."""
+        """Before the first step, copies the initial weights.
+
+        Pretraining or a teacher may have set these weights.
+        """
         if self.from_initial_weights and not self.begun:
             self._copy_weights()
             self.begun = True

@@ -468,7 +468,7 @@ class SampleMotions(Callback):
     def _measure_real(self, clips: Clips, task: LightningModule) -> Values:
         """Computes all metrics for up to `REAL` training clips.
 
-        Uses only clips that are labeled with every attribute that all prompts request.
+        A clip is used only if it is labeled with the attributes that all prompts have in common.
         """
         assert isinstance(task, GeneratorTask)
         names = [set(requested) for _, requested in self.prompts]

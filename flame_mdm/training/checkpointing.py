@@ -1,8 +1,8 @@
 """Writes checkpoints atomically, and resumes from them.
 
-A run directory may come from an untrusted source. Therefore, reading a checkpoint never runs code
-and takes no more memory than the size of the file, and only files in the checkpoint folder are
-removed, even if the state of a callback names other files.
+A run directory may come from an untrusted source. Therefore, reading a checkpoint never runs code,
+and takes no more memory than the size of the file. Only files in the checkpoint folder are removed,
+even if the state of a callback names other files.
 """
 
 import math

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Distillation: trains models that sample in one to four steps, using a teacher that takes more."""
+"""Distillation: a teacher with many steps trains models that sample in one to four steps."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -131,7 +131,7 @@ class DistillationTask(GeneratorTask):
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`.
 
-        Validation, which passes `u`, uses the grid of times from the end of training.
+        Validation, which passes `u`, always uses the grid of times with which training ends.
         """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None

@@ -47,7 +47,7 @@ def only_run(folder: Path) -> Iterator[None]:
 
 
 class BadLoss(Callback):
-    """Stops training when a loss is not finite or explodes, before a checkpoint is written.
+    """Stops training if a loss is not finite or explodes, before any checkpoint is written.
 
     A loss explodes if it exceeds `factor` times the median loss of the previous log interval. The
     first bad batch is described in `bad_batch.json` in the run directory, with the step and, for

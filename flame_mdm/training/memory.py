@@ -1,4 +1,4 @@
-"""Computes the memory that training a recipe requires, without allocating the network."""
+"""Computes how much memory a recipe needs for training, without allocating the network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ FLOAT = 4
 
 @dataclass(frozen=True)
 class TrainingMemory:
-    """Memory that training in float32 requires, in bytes per process.
+    """Memory needed for training in float32, in bytes per process.
 
     The text encoder and the data are not included. Frozen encoders run before training, and data
     sets that are too large stay on disk.
@@ -47,7 +47,7 @@ class TrainingMemory:
 
 
 def training_memory(config: Config) -> TrainingMemory:
-    """Returns the memory that training a recipe requires.
+    """Returns how much memory a recipe needs for training.
 
     The network is built and run on torch's device "meta", whose tensors have no values.
     """

@@ -24,8 +24,8 @@ STEP_HOOKS = (
 class NoProfiler(PassThroughProfiler):
     """Profiler that measures nothing.
 
-    Lightning's equivalent enters a generator for each of the roughly 100 parts of a step that it
-    measures.
+    Lightning's equivalent measures about 100 parts of each step, and enters a generator for each
+    part.
     """
 
     nothing: AbstractContextManager[Any] = nullcontext()

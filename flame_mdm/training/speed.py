@@ -29,8 +29,8 @@ MOST_SHAPES = 64
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     """Prepares the task and the data for `speed=fast` before training. Returns the trainer's precision.
 
-    On CUDA, training uses bfloat16 if the device supports it and, in runs of at least
-    `COMPILED_FROM` steps, a compiled denoiser.
+    On CUDA, training uses bfloat16 if the device supports it. In runs of at least `COMPILED_FROM`
+    steps, it also uses a compiled denoiser.
 
     On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights) and,
     if the CPU has instructions for bfloat16 products, bfloat16. Compilation made no difference on

@@ -43,12 +43,12 @@ def recipes_page() -> str:
     page = f"""# Recipes
 
 {HEAD}
-Every table row that these papers report for their own model has a recipe, such as `make train EXP=humanml3d/mdm`: FLAME
-(Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023, arXiv:2209.14916) and Motion Flow Matching (Hu
-et al., 2023, arXiv:2312.08895). Recipes that mention no table do not correspond to a row in any paper. Their files list
-the deviations from the paper. "As in humanml3d/mdm" means that all deviations listed for that recipe also apply. Three
-deviations apply to all recipes: a batch contains motions of about the same length, every sample in a batch has the same
-weight, and checkpoints are selected on validation clips.
+This project reproduces three papers: FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
+arXiv:2209.14916) and Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895). Every table row that a paper reports for
+its own model has a recipe, such as `make train EXP=humanml3d/mdm`. Recipes that mention no table do not correspond to a
+row in any paper. Their files list the deviations from the paper. "As in humanml3d/mdm" means that all deviations listed
+for that recipe also apply. Three deviations apply to all recipes: a batch contains motions of about the same length,
+every sample in a batch has the same weight, and checkpoints are selected on validation clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
@@ -322,7 +322,7 @@ SIZES: dict[str, tuple[str, list[str]]] = {
 MEMORY = """# Memory for training
 
 {head}
-This table is computed from the recipes. Sizes are in GiB per process, for float32, the recipe's batch size and its
+This table is computed from the recipes. Sizes are in GiB per process, for float32 and for the recipe's batch size and
 longest motions. The state consists of the weights, their gradients, Adam's two states and, if the recipe averages
 weights, the averaged weights. Its size does not depend on the batch size. Activations are the tensors that the forward
 pass keeps for the backward pass. Their size grows with `data.batch_size`, and on a GPU, `speed=fast` halves it. Frozen

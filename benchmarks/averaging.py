@@ -70,7 +70,7 @@ def measure(settings: Settings) -> Section:
     return section(
         "Averaged weights",
         f"""The table shows how long one update of the exponential moving average of all weights takes. Values are
-        medians of {rounds} alternating updates. The framework updates all weights in one call.""",
+        medians over {rounds} updates. The framework updates all weights in one call.""",
         f"Updating the averaged weights is {faster['quickstart']:.1f} times as fast as with Lightning's callback for "
         f"the quickstart, and {faster['full size']:.1f} times as fast at full size.",
         {"updates": rows},

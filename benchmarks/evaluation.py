@@ -166,8 +166,8 @@ def measure(settings: Settings) -> Section:
         f"""`{PROTOCOL}` runs without networks on {motions:,} motions with HumanML3D's lengths, in
         {protocol.replications} replications, {repeated} of which measure multimodality. The time is spent on
         reading and decoding motions, and on metrics. The process has {torch.get_num_threads()} threads, and values
-        are medians of {rounds} alternating rounds. To time FID alone, {motions:,} features of width {WIDTH} are passed
-        to the metric in batches of {BATCH}, and values are medians of 10 alternating rounds.""",
+        are medians over {rounds} rounds. To time FID alone, {motions:,} features of width {WIDTH} are passed
+        to the metric in batches of {BATCH}, and values are medians over 10 rounds.""",
         f"An evaluation of HumanML3D's size takes {total / 60:.1f} minutes, not counting the networks. torchmetrics "
         f"takes {distances[0]['ratio']:.1f} times as long as the framework to compute FID.",
         {"protocol": table, "FID alone": distances},

@@ -127,7 +127,7 @@ def measure(settings: Settings) -> Section:
     return section(
         "HumanML3D's features",
         f"""Joint positions are converted to 263 features and back, with {FRAMES} frames per clip on one core. CPU
-        times are medians of {rounds} alternating rounds, and ratios are relative to a NumPy loop over frames and
+        times are medians over {rounds} rounds, and ratios are relative to a NumPy loop over frames and
         joints.""",
         f"Features of {CLIPS} clips are computed {fast / slow:.0f} times as fast as in a loop over frames and joints.",
         {"features": rows},

@@ -266,7 +266,7 @@ def measure(settings: Settings) -> Section:
         optimizer and gradient clipping on batches in memory. It logs nothing and has no averaged weights, loggers or
         checkpoints. The complete framework cuts and gathers its batches, checks losses, averages weights, shows its
         progress and logs every {log_interval()} steps. Each run takes {steps} steps on one thread, and the mean thread
-        time per step is measured. Values are medians of {rounds} alternating runs. For the second table, the parts of
+        time per step is measured. Values are medians over {rounds} runs. For the second table, the parts of
         the framework's step are timed one by one, without Lightning.""",
         f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms, which is {whole:.2f} times as long as "
         f"in bare Lightning with the same network. Without averaged weights, it takes {without:.2f} times as long.",

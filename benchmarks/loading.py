@@ -104,7 +104,7 @@ def measure(settings: Settings) -> Section:
         {lengths:.0f} frames on average and are padded to {frames:.0f} frames. Resident batches (`data.resident=true`)
         are gathered from memory. The loader collates clips in the training process or in workers. A training step of
         the small MDM encoder takes {1000 * wait:.0f} ms on one core. The target is {GOAL:,} clips per second per
-        worker. Values are medians of {rounds} alternating rounds of {count} batches.""",
+        worker. Values are medians over {rounds} rounds of {count} batches each.""",
         f"A resident batch is ready {load / gather:.1f} times as fast as a batch from the loader, and takes "
         f"{gather / wait:.1%} of the time of a small training step.",
         {"batches": rows},

@@ -101,7 +101,7 @@ def measure(settings: Settings) -> Section:
         "Two processes",
         f"""The same batches of {CLIPS} clips are processed by one process, and by two processes with {CLIPS // 2} clips
         each (DDP, gloo). Each process has one thread, and the machine has {cores} cores. With one core per process,
-        the ideal ratio is 0.5. Values are medians of {rounds} alternating runs of {steps} steps.""",
+        the ideal ratio is 0.5. Values are medians over {rounds} runs of {steps} steps each.""",
         f"For the same batch, two processes take {two / one:.2f} times as long as one process.",
         {"steps": ratios({"one": one, "two": two}, "one", "processes")},
     )

@@ -42,11 +42,11 @@ ON_REQUEST = ("quality",)  # requires trained models
 HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
-a ratio of measurements that alternate in one run, on an idle machine unless the section states otherwise. The absolute
-figures next to each ratio hold only for that machine. `make bench ONLY=host,steps` repeats only these sections, and
-`make bench DEVICE=cuda` adds the sections that are measured on a GPU. If `MDM_REPO` is the path of a clone of the
-authors' code, their training step is also measured. A section that names a commit has not been measured since that
-commit. [Speed of training](../speed.md) explains which options to choose.
+a ratio of times that were measured in turns in one run. The machine was idle unless the section states otherwise. The
+absolute figures next to each ratio hold only for that machine. `make bench ONLY=host,steps` repeats only these two
+sections, and `make bench DEVICE=cuda` adds the sections that are measured on a GPU. If `MDM_REPO` is the path of a
+clone of the authors' code, their training step is also measured. A section that names a commit has not been measured
+again since that commit. [Speed of training](../speed.md) explains which options to choose.
 """
 
 

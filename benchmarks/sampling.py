@@ -225,7 +225,7 @@ def measure(settings: Settings) -> Section:
         {GUIDANCE}, so a network call processes two rows per motion. Latency and throughput are measured with the
         ancestral sampler and include the time for drawing noise. "Distilled" refers to the sampler for distilled
         models, without guidance. The samplers are compared with {BATCH} motions per batch. The loops are timed without
-        a network, for a single motion. Values are medians of {size.rounds} alternating rounds.""",
+        a network, for a single motion. Values are medians over {size.rounds} rounds.""",
         f"With 10 steps, sampling one motion takes {1000 * ten['1']:.0f} ms, and batches of 64 yield "
         f"{64 / ten['64']:.0f} motions per second.",
         {

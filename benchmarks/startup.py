@@ -102,7 +102,7 @@ def measure(settings: Settings) -> Section:
         "Startup of the commands",
         f"""Times are measured from the start of a process to its end, with one thread. The work is minimal (one
         training step, one motion, one replication of eight motions), so that the times consist mainly of imports.
-        Values are medians of {rounds} alternating runs, and ratios are relative to the time for importing torch.""",
+        Values are medians over {rounds} runs, and ratios are relative to the time for importing torch.""",
         f"`--help` takes {answered:.1f} s, and `{commands[0]}` with minimal work takes {started:.1f} times as "
         "long as importing torch.",
         {"commands": rows},

@@ -275,8 +275,8 @@ def measure(settings: Settings) -> Section:
         are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
         the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips in
         float32, padded to 196 frames as in the published code. On each of {BATCHES} batches, all implementations
-        alternate for a warm-up round and {ROUNDS} timed rounds. The small networks are trained on 32 clips per batch
-        without a text encoder, and both speeds alternate for 15 rounds. The quickstart is trained by the complete
+        take turns in one warm-up round and {ROUNDS} timed rounds. The small networks are trained on 32 clips per batch
+        without a text encoder, and the two speeds take turns for 15 rounds. The quickstart is trained by the complete
         framework, with its text encoder.""",
         summary(full),
         tables,

@@ -44,7 +44,7 @@ def measure(settings: Settings) -> Section:
     return section(
         "Text encoding",
         f"""A batch of {size} captions is encoded by sentence-BERT (MiniLM, with tokens), or read from the cache of
-        frozen encoders. Values are medians of {rounds} alternating rounds.""",
+        frozen encoders. Values are medians over {rounds} rounds.""",
         f"Reading a batch of cached captions is {times['encoded'] / times['cached']:.0f} times as fast as encoding it.",
         {"captions": ratios(times, "cached", "captions", "ms")},
     )

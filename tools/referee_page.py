@@ -123,12 +123,12 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns a table for the constructed claims about the duration, the start and the end, as lines."""
     lines = [
         "",
-        "Captions hardly ever state a duration or describe the start or the end of a motion, so claims about them were",
-        "constructed. If the captions of a recording only state that the person walks, runs or stands still, clips of",
-        "two, three and four seconds are cut from the recording. Falsified claims state twice or half the duration. In",
-        "recordings of walks, the person is assumed to be standing upright at the start and at the end. The claims",
-        "that the person is lying at the start or at the end are therefore false. The other tables do not contain the",
-        "constructed claims.",
+        "Captions hardly ever state a duration or describe the start or the end of a motion, so claims about these",
+        "were constructed. If the captions of a recording only state that the person walks, runs or stands still,",
+        "clips of two, three and four seconds are cut from the recording. Falsified claims state twice or half the",
+        "duration. In recordings of walks, the person is assumed to be standing upright at the start and at the end.",
+        "The claims that the person is lying at the start or at the end are therefore false. The other tables do not",
+        "contain the constructed claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",

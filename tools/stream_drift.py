@@ -65,8 +65,9 @@ can be compared. Unless stated otherwise, the motions are not cleaned up.
 
 {periods}
 
-FID is computed with the package's motion-CLIP between two-second windows of the streams and of synthetic motions that
-the model has not seen. For comparison, a second set of such motions has an FID of {real_fid}.
+FID compares two-second windows of the streams with two-second windows of synthetic motions that the model has not
+seen. It is computed with the package's motion-CLIP. For comparison, a second set of such motions has an FID of
+{real_fid}.
 The jitter is {first} m/s³ in the first minute and {last} m/s³ in the last minute, which is {ratio} times as much.
 In 99.9 % of the frames, no toe is more than {low} cm below the floor,
 and the lowest toe in any frame is {lowest} cm below it. With `cleanup=true`, the lowest toe

@@ -12,10 +12,9 @@ are counted. In rows called "crossed", the counts of both halves are added; each
 thresholds from the other half. Procedural motions are not used for calibration and have separate
 rows.
 
-Each claim in a caption counts as true for its motion. Falsified claims, which
-state the other side, direction or speed, one repetition more or less, the reverse order, another
-duration, or the other end of the motion, count as false. A wrong caption counts as an error by the
-referee.
+Each claim in a caption counts as true for its motion. Falsified claims count as false. They state
+the other side, direction or speed, one repetition more or less, the reverse order, another
+duration, or the other end of the motion. A wrong caption counts as an error by the referee.
 
 Captions hardly ever state durations. If the captions of a recording only state that the body walks,
 runs or stands still, clips of two, three and four seconds are therefore cut from the recording, so

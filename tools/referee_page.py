@@ -20,8 +20,8 @@ this folder.
 ## Right verdicts on real motions
 
 The thresholds were set on one half of the recordings, and these figures were measured on the other half. Each claim in
-the caption of a motion counts as true. Falsified claims, which state the other side, direction or speed, one repetition
-more or less, the reverse order, another duration, or the other end of the motion, count as false. If a caption
+the caption of a motion counts as true. Falsified claims count as false. They state the other side, direction or speed,
+one repetition more or less, the reverse order, another duration, or the other end of the motion. If a caption
 is wrong, this also counts as an error of the referee. We corrected patterns and measurements after we had seen errors
 on both halves, so expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as
 kicking with both legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the

@@ -473,7 +473,7 @@ def test_the_command_prints_verdicts_marks_the_evidence_and_exits_with_3(
     (shown,) = Page(tmp_path / "runs/judge/raise.html").motions
     assert shown["marks"][0][2] == "yes: raise hand: left"
     assert main(["judge", "raise.npz", "page.html", "text=raises the right hand"]) == 3
-    assert "raise: 0 claims are true, 2 are false" in capsys.readouterr().out
+    assert "raise: in 1 motions, 0 claims are true, 2 are false" in capsys.readouterr().out
 
 
 def test_a_folder_is_judged_by_the_texts_in_its_files(tmp_path, capsys, monkeypatch):

@@ -307,7 +307,7 @@ class Call(nn.Module):
 
         Args:
             x_t: (B, F, D), noisy motion.
-            t: (B,), times in units of the denoiser's table.
+            t: (B,), times, as row indices into the denoiser's sinusoidal table.
             lengths: (B,), number of frames of each motion.
             condition: (B, S) tokens of texts, (B,) action indices, or None for an unconditional
                 model.

@@ -38,7 +38,7 @@ def read_released(
         raise
     except ImportError as error:
         raise UserError(
-            f"{path}: {error}. The file contains objects of this package. Install the package"
+            f"{path}: {error}. The file contains objects from this package, so install it first"
         ) from error
     except Exception as error:  # torch raises many kinds of errors for damaged files
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))

@@ -72,8 +72,8 @@ def main(settings: JudgeSettings) -> None:
 
     answers = Counter(verdict.answer for _, judgment in judged for verdict in judgment.verdicts)
     say(
-        f"{name}: {answers['yes']} claims are true, {answers['no']} are false, and "
-        f"{answers['cannot tell']} cannot be decided, in {len(judged)} motions"
+        f"{name}: in {len(judged)} motions, {answers['yes']} claims are true, {answers['no']} are "
+        f"false, and {answers['cannot tell']} cannot be decided"
     )
     judged.sort(key=lambda pair: pair[1].true - pair[1].decided)
     shown = judged[: settings.clips]

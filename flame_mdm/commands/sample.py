@@ -290,7 +290,8 @@ def _sample_set(settings: SampleSettings, source: str) -> None:
     facts = {"set": Path(source).stem, "seed": settings.seed, "checkpoint": loaded.model.sha256}
     write_set(folder, clips, content, facts, loaded.body)
     say(
-        f"{len(clips.clips)} clips, each with root motion and in place: {folder / 'player.html'}, set.png, set.json"
+        f"{len(clips.clips)} clips, each in two versions (with root motion and in place): "
+        f"{folder / 'player.html'}, set.png, set.json"
     )
 
 

@@ -77,7 +77,7 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
             composed.append(word)
             continue
         if word.startswith("-"):
-            raise UserError(f"unknown option {word}. Available: --help, and keys as key=value")
+            raise UserError(f"unknown option {word}. Available: --help and key=value pairs")
         if not separator:
             raise UserError(f"unexpected word '{word}'. Write key=value, and quote text: key='a b'")
         if not key:

@@ -53,7 +53,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in SWEEP]:
         raise UserError(
-            f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value"
+            f"unknown option {unknown[0]}. Available: --help, --multirun, and key=value pairs"
         )
     overrides, base = composition.prepare_overrides(
         recipe, [word for word in words if word not in flags]

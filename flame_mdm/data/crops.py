@@ -200,7 +200,7 @@ class Clips(Dataset[Sample]):
 
     @cached_property
     def evaluated(self) -> np.ndarray:
-        """For each clip, the index of its caption in evaluation, derived from the clip's id."""
+        """Index of the caption used in evaluation for each clip, derived from the clip's id."""
         draws = (
             key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions))
             for clip in self.clips

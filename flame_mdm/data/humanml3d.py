@@ -280,8 +280,8 @@ def _read_joints(path: Path) -> np.ndarray:
         or joints.shape[2] != 3
     ):
         raise UserError(
-            f"{path}: expected numbers of shape (frames, 22 or more joints, 3), but found shape "
-            f"{joints.shape} and type {joints.dtype}"
+            f"{path}: expected a numeric array of shape (frames, 22 or more joints, 3), but found "
+            f"shape {joints.shape} and type {joints.dtype}"
         )
     return joints[:, :22]
 

@@ -27,7 +27,7 @@ class Material:
 
     Attributes:
         name: the name of the material.
-        color: red, green and blue from 0 to 1, in the color space of screens.
+        color: red, green and blue from 0 to 1, in sRGB.
         image: content of a PNG or JPEG file, whose colors are multiplied by `color`. Empty = no
             image.
     """
@@ -63,8 +63,8 @@ class Skin:
         weights: (V, K), weights of these joints; each row adds up to 1.
         binds: (len(ordered), 4, 4), matrices from the coordinates of the mesh to the coordinates
             of each joint.
-        colors: (V, 3), colors of the vertices from 0 to 255, in the color space of screens; (0, 3)
-            if only the materials have colors.
+        colors: (V, 3), vertex colors in sRGB, from 0 to 255; (0, 3) if only the materials have
+            colors.
         uvs: (V, 2), positions of the vertices in the images, from the lower left corner; (0, 2) if
             there are no images.
     """

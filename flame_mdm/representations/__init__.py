@@ -103,15 +103,16 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, D) in the data's units to joint positions (..., F, J, 3).
+        """Decodes features (..., F, D) to joint positions (..., F, J, 3).
 
-        The positions are in meters, with y up. The decoding is differentiable.
+        The features are in the data's units. The positions are in meters, with y up. The decoding
+        is differentiable.
         """
 
     def rotations6d(self, features: Tensor) -> Tensor:
-        """Extracts the 6D rotations (..., F, N, 6) from features (..., F, D) in the data's units.
+        """Extracts the 6D rotations (..., F, N, 6) from features (..., F, D).
 
-        By default, features contain no rotations (N = 0).
+        The features are in the data's units. By default, they contain no rotations (N = 0).
         """
         return features.new_zeros(*features.shape[:-1], 0, 6)
 
@@ -153,7 +154,7 @@ class Representation(nn.Module, ABC):
         return features
 
     def normalize(self, features: Tensor) -> Tensor:
-        """Normalizes features (..., D) in the data's units."""
+        """Normalizes features (..., D) that are given in the data's units."""
         return (features - self.mean) / self.std
 
     def denormalize(self, x: Tensor) -> Tensor:

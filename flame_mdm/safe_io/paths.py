@@ -45,7 +45,7 @@ def check_within(path: str | Path, root: str | Path) -> None:
 
 
 def check_tree(folder: Path) -> None:
-    """Checks a folder that comes from someone else, before libraries write to it.
+    """Checks a folder from another person before libraries write to it.
 
     Libraries open files in place, so they could change files outside the folder. Raises `UserError`
     if the folder contains a pipe, a device, a link that leads out of the folder, or a file with a

@@ -223,7 +223,7 @@ def _original(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the lengths, in frames, of the parts whose durations the text does not state.
+    """Returns the length, in frames, of each part without a stated duration.
 
     The parts must add up to the length of the motion.
     """

@@ -19,7 +19,8 @@ class MovingAverage(WeightAveraging):
     on CUDA, waits for the device. Buffers are not averaged.
 
     Args:
-        decay: factor from 0 to 1 in average = decay * average + (1 - decay) * weights.
+        decay: the factor, from 0 to 1, in the update
+            `average = decay * average + (1 - decay) * weights`.
         update_every_n_steps: number of steps between updates of the average.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
             them. The first update always copies.

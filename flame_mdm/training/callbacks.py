@@ -322,11 +322,11 @@ class Progress(Callback):
 
 
 def are_same(motions: Sequence[Motion]) -> bool:
-    """Returns whether motions differ by less than `SAME`, as if the network ignored its input.
+    """Returns whether the motions differ by less than `SAME`.
 
-    If the learning rate is too high, the network may learn to return the same pose for all prompts
-    and noise. Its loss is finite and even decreases slightly, so the curves do not reveal the
-    failure.
+    If so, the network probably ignores its input. If the learning rate is too high, the network may
+    learn to return the same pose for all prompts and noise. Its loss is finite and even decreases
+    slightly, so the curves do not reveal the failure.
     """
     if len(motions) < 2:
         return False

@@ -24,8 +24,7 @@ STEP_HOOKS = (
 class NoProfiler(PassThroughProfiler):
     """Profiler that measures nothing.
 
-    Lightning's equivalent measures about 100 parts of each step, and enters a generator for each
-    part.
+    Lightning's equivalent enters a generator-based context manager about 100 times per step.
     """
 
     nothing: AbstractContextManager[Any] = nullcontext()

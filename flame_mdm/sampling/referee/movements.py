@@ -330,7 +330,7 @@ def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> R
 def use_hand(body: Body, claim: Claim) -> Reading:
     """Compares the mean speeds of the wrists relative to the chest.
 
-    Raised hands have more weight.
+    Raised hands are given more weight.
     """
     raised = body.joints[:, WRISTS, 1] - body.joints[:, [PELVIS], 1]
     weight = np.clip(raised / 0.3, 0.1, 1.0)

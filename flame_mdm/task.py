@@ -279,6 +279,9 @@ class GeneratorTask(Task):
         """Also stores the vocabulary of the training captions and passes it to the text encoder."""
         super().setup(stage)
         data = self.data
+        if self.generator.conditioned_on != "action":
+            # Some sources only know the names of their actions after all clips have been read
+            self.add_facts({"actions": list(data.store.info["actions"])})
         context = self.generator.denoiser.context_frames
         shortest = int(data.crop.draw(data.crop.min_frames, lambda count: 0)[1])
         if context >= shortest:

@@ -219,7 +219,7 @@ def test_the_summary_of_a_picture_says_why_it_has_no_body(tmp_path):
     summary = posed().save(tmp_path / "a.gif")
     assert summary.endswith("animated GIF with at most 50 frames per second")
     summary = posed(scale=3.0).save(tmp_path / "a.gif")
-    assert "per second; without a body: the bone that ends in left_knee is" in summary
+    assert "per second; without a body: the bone that ends at left_knee is" in summary
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,7 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio, monkeypatch
             DemoRequest(text="a man walks forward, then jumps moonily", split=False),
             "a man walks forward, then jumps moonily",
             [],
-            ["never seen in training: moonily. Did you mean 'a person jumps forward'?"],
+            ["never seen in training: moonily. Did you mean 'a man slowly walks forward'?"],
         ),
         (
             DemoRequest(text="a person walks @1 | waves"),

@@ -105,11 +105,17 @@ class PositionGuide:
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate, changed to reach the positions and keep the poses."""
-        imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
-        return reach(
+        """Returns the clean estimate, changed to reach the positions and keep the poses.
+
+        Frames after the motion, which some models receive as padding, are not changed.
+        """
+        frames = self.keep.shape[1]
+        motion, padding = x0_hat[:, :frames], x0_hat[:, frames:]
+        imposed, free = torch.where(self.keep, self.poses, motion), ~self.keep.expand_as(motion)
+        reached = reach(
             imposed, self.to_joints, self.positions, self.bones, free, SMOOTHNESS * self.fps
         )
+        return torch.cat([reached, padding], dim=1)
 
 
 @dataclass(frozen=True)

@@ -50,16 +50,13 @@ def fit(folder: Path, config: Config) -> None:
             "run with run.name=..."
         )
         return
+    seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
     data: MotionDataModule = instantiate(
         config["data"], representation=representation, seed=config["seed"]
     )
-    if not (data.folder / "store.json").exists() and not rank_zero_only.rank:
-        # Some sources only know the names of their actions after all clips have been read
-        data.prepare_data()
     if resumed:
         _check_same_data(resumed, data)
-    seed_everything(config["seed"], verbose=False)
     task: Task = get_class(config["task"]["_target_"]).build(
         config, representation, actions=data.actions
     )

@@ -505,6 +505,15 @@ def test_poses_leave_the_root_free_and_bones_are_kept_where_a_joint_is_led(model
     assert smoothness == [pytest.approx(6)]
 
 
+def test_a_short_motion_reaches_its_targets_if_the_model_receives_padding():
+    model = flame_mdm.load("quickstart")
+    model.denoiser.mask_padding = False
+    target = {"root": [{"time": 0.5, "position": [0.3, 0.4]}]}
+    (motion,) = flame_mdm.generate(model, "a person walks forward", seconds=1, targets=target)
+    assert len(motion.joints) == 20
+    np.testing.assert_allclose(motion.joints[10, 0, [0, 2]], [0.3, 0.4], atol=0.02)
+
+
 def test_bad_targets_give_one_clear_line(model, tmp_path, subtests):
     for content, message in (
         ([], r"the file is \[\], not a mapping; see docs/targets.md"),

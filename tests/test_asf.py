@@ -87,6 +87,15 @@ def test_joints_in_closed_form_and_missing_skeletons_and_rates(files):
         asf.read(files / "07_01.amc", 120)
 
 
+def test_rotations_are_applied_in_the_order_of_the_axes_however_the_freedoms_are_listed(files):
+    expected = asf.read(files / "07_01.amc", 120).positions()
+    (files / "07.asf").write_text(SKELETON.replace("dof rx rz", "dof rz rx"))
+    (files / "07_01.amc").write_text(
+        MOTION.replace("arm 90 0", "arm 0 90").replace("arm 40 50", "arm 50 40")
+    )
+    np.testing.assert_allclose(asf.read(files / "07_01.amc", 120).positions(), expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

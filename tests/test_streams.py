@@ -616,6 +616,15 @@ def test_a_condition_ends_in_the_frame_before_the_next_one():
     assert [schedule.at(frame) for frame in (4, 5)] == ["a person walks", "a person jumps"]
 
 
+@pytest.mark.parametrize(("frame", "left"), [(0, 1), (5, 1), (6, 2), (9, 2), (10, 3)])
+def test_changes_are_dropped_from_a_frame_on_but_the_first_condition_stays(frame: int, left: int):
+    schedule = Schedule("a person walks")
+    schedule.add(5, "a person jumps")
+    schedule.add(9, "a person waves")
+    schedule.drop(frame)
+    assert [begin for begin, _ in schedule.changes] == [0, 5, 9][:left]
+
+
 # Waypoints -----------------------------------------------------------------------------------------------------------
 
 

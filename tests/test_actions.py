@@ -277,6 +277,15 @@ def test_smpls_offsets_come_from_its_file_without_running_code(
     assert not (tmp_path / "run").exists()
 
 
+def test_uestcs_training_and_validation_clips_have_a_minimum_length(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(uestc, "MIN_FRAMES", 120)
+    store = data_of(UESTC(str(write_uestc(tmp_path / "uestc"))), tmp_path).store
+    lengths = {split: {c.length for c in store.clips if c.split == split} for split in SPLITS}
+    assert min(lengths["train"] | lengths["val"]) >= 120
+    assert lengths["val"]
+    assert min(lengths["test"]) < 120
+
+
 @pytest.mark.slow
 def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_path: Path, capsys):
     raw = ["data=humanact12", f"data_root={tmp_path}"]

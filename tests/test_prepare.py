@@ -127,10 +127,12 @@ def test_still_clips_duplicates_and_short_clips_are_listed(tmp_path: Path):
         "b": walk,
         "c": np.tile(walk[:1], (40, 1, 1)),
         "d": walk[5:20],
+        # 1.5 cm from the first frame, but less than 1 cm from the mean
+        "e": walk[:1] + np.linspace([[0.0, 0, 0]], [[0.015, 0, 0]], 40),
     }.items():
         np.savez(folder / f"{name}.npz", joints=motion, fps=20)
     (folder / "captions.csv").write_text(
-        "id,text,split\na,walk,train\nb,walk,test\nc,stand,train\nd,walk,val\n"
+        "id,text,split\na,walk,train\nb,walk,test\nc,stand,train\nd,walk,val\ne,stand,train\n"
     )
     report = verified(tmp_path / "data", "data=folder", f"source={folder}")
     anomalies = [report[key] for key in ("still", "duplicates", "duplicates_across_splits")]

@@ -421,3 +421,13 @@ def test_times_of_distillation_are_evenly_spaced_and_end_one_interval_before_the
     assert GaussianDiffusion(1000).grid(3) == [999, 666, 332]
     assert GaussianDiffusion(10).grid(20) == list(range(9, -1, -1))
     assert FlowMatching().grid(4) == [0, 0.25, 0.5, 0.75]
+
+
+def test_the_large_variance_of_fewer_steps_is_that_of_the_longer_steps():
+    process = GaussianDiffusion(50, variance="fixed_large")
+    steps = [4, 14, 24, 34, 44]
+    x = torch.zeros(1, 3, 2, dtype=torch.float64)
+    variance = process.log_variance(x, x, 3, process.schedule.respace(steps))
+    kept = process.schedule.tables["alphas_cumprod"]
+    expected = math.log(1 - float(kept[34] / kept[24]))
+    assert float(torch.as_tensor(variance).reshape(-1)[0]) == pytest.approx(expected, rel=1e-6)

@@ -9,12 +9,13 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from support.fixtures import ROOT
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from flame_mdm.batch import Condition, length_mask
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.flame import FLAME, cosine_first_sinusoid
+from flame_mdm.denoisers.layers import TransformerLayer
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
 from flame_mdm.errors import UserError
@@ -336,3 +337,15 @@ def test_bad_options_are_named(subtests) -> None:
     ):
         with subtests.test(message=message), pytest.raises(UserError, match=message):
             build()
+
+
+def test_dropout_covers_every_sublayer_of_a_transformer_layer():
+    torch.manual_seed(0)
+    layer = TransformerLayer(8, 16, 2, 1.0, nn.GELU, cross_attention=True).train()
+    x, memory = torch.randn(2, 3, 8), torch.randn(2, 4, 8)
+    # With a dropout of 1, nothing of a sublayer is added, so only the layer norms remain.
+    expected = x
+    for norm in (layer.self_norm, layer.cross_norm, layer.feed_forward_norm):
+        assert norm is not None
+        expected = norm(expected)
+    torch.testing.assert_close(layer(x, None, memory, None), expected)

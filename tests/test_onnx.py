@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import patch
 
@@ -202,6 +203,17 @@ def test_the_runner_states_the_shortest_and_the_longest_motion() -> None:
     with pytest.raises(ValueError, match=r"give 0\.1 to 600 seconds"):
         sampler_without_graphs(**start).generate(seconds=600.1)
     assert len(sampler_without_graphs(**start).generate(seconds=4.5)) == 90
+
+
+def test_the_root_of_a_model_in_other_units_moves_in_radians_and_meters() -> None:
+    representation = SimpleNamespace(
+        mean=torch.tensor([1.0, 320.0, 640.0, 9.0]),
+        std=torch.tensor([2.0, 64.0, 6.4, 9.0]),
+        turn_unit=0.5,
+        units_per_metre=640.0,
+    )
+    units = onnx.root_units(cast(Any, representation))
+    np.testing.assert_allclose(units, [[0.5, 1.0], [0.5, 0.1], [1.0, 0.01]], rtol=1e-6)
 
 
 def test_an_export_compares_the_same_inputs_each_time_and_leaves_the_random_state(

@@ -19,7 +19,17 @@ from wandb import Run
 from flame_mdm.__main__ import main
 from flame_mdm.records import Result, Value
 from flame_mdm.reporting.page import filled, interval, number, page, short
-from flame_mdm.reporting.plots import Histogram, Panel, _linear_axis, _log_axis, _tick, chart, svg
+from flame_mdm.reporting.plots import (
+    Histogram,
+    Panel,
+    Series,
+    _drawn,
+    _linear_axis,
+    _log_axis,
+    _tick,
+    chart,
+    svg,
+)
 from flame_mdm.reporting.report import charted, write_report
 from flame_mdm.runs import read_history, read_run
 from flame_mdm.schemas import check_shape
@@ -371,6 +381,16 @@ def test_losses_that_span_a_factor_of_fifteen_have_a_logarithmic_axis(
     line = points(chart("x", {"a": {0: 1.0, 5: (1 + most) / 2, 10: most}}))
     middle = (line[0][1] + line[2][1]) / 2
     assert (abs(line[1][1] - middle) > 5) == logarithmic
+
+
+@pytest.mark.parametrize(("level", "direction"), [(0.5, 1), (6.0, -1)])
+def test_the_axis_reaches_levels_below_and_above_all_points(level: float, direction: int):
+    panel = _drawn(Panel([Series("a", [(0, 2.0), (1, 3.0)])], levels=[level]))
+    assert panel is not None
+    of_points = [float(y) for *_, dots in panel["lines"] for _, y in dots]
+    (of_level,) = (float(y) for y in panel["levels"])
+    # y points down on the page
+    assert min(direction * (of_level - y) for y in of_points) > 10
 
 
 def test_bars_of_a_histogram_are_as_high_as_their_counts():

@@ -232,7 +232,7 @@ class _Measure:
         return values
 
     def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns the values for N individual motions or pairs, keyed by metric."""
+        """Returns the values (N,) for N individual motions or pairs, keyed by metric."""
         values = {}
         for name, metric in self.metrics.items():
             rows = self._rows(name, metric, inputs, texts)

@@ -92,7 +92,7 @@ class ExtractorTask(Task, Generic[Network]):
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:
         """Adds a batch to the validation metrics.
 
-        If there are fewer clips than ranks, each rank has all clips, so only those of rank 0 count.
+        If there are fewer clips than ranks, each rank has all clips, so only rank 0's clips count.
         """
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
             return

@@ -28,7 +28,7 @@ def heading_of(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def tilt_of(smooth: np.ndarray) -> np.ndarray:
-    """Returns the angle between the trunk and the vertical in each frame, in degrees."""
+    """Returns the angles (F,) between the trunk and the vertical, in degrees."""
     trunk = smooth[:, NECK] - smooth[:, PELVIS]
     return np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1]))
 

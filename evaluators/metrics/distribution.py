@@ -38,7 +38,7 @@ class FrechetMotionDistance(TwoSets):
 
     Covariances have N - 1 in the denominator, as in the authors' code. The authors' code computes
     means in float32 and uses scipy's `sqrtm` for the product; if `sqrtm` fails, 1e-6 is added to
-    the diagonals. The values differ from those of the authors' code by a relative error of 1e-8.
+    the diagonals. The values agree with the authors' code up to a relative error of 1e-8.
 
     Lower is better. The value is biased upward, especially for few samples, so compare only values
     for the same number of samples. `update` takes `generated` (B, E) with `keys` (B,), and `real`

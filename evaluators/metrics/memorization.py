@@ -59,8 +59,8 @@ class TrainingMotions:
 
         Returns:
             (B, 2), or (B, 1) without features. The first column is the root mean square distance,
-            in meters, between the motion's joints and those of the best window of the same length.
-            It is computed from every fourth frame, and is infinite if no training motion is long
+            in meters, between the joints of the motion and of the best window of the same length. It
+            is computed from every fourth frame, and is infinite if no training motion is long
             enough. The second column is the distance between the features.
         """
         squares = self.poses.square().sum(-1)
@@ -102,8 +102,8 @@ class NearestTraining(SampleMetric):
     """Distance to the nearest training motion, and the share of copies.
 
     This metric was introduced in this project. A motion counts as a copy if its joints are
-    unusually close to a training motion: closer than those of 99 % of the held-out real motions
-    (all but the share `CLOSE`). By this definition, about 1 % of real motions are copies, whereas
+    unusually close to a training motion: closer than the joints of 99 % of the held-out real
+    motions (all but the share `CLOSE`). By this definition, about 1 % of real motions are copies, whereas
     all motions are copies if a model repeats the training set.
 
     The values `joints`, in meters, and `features` are the medians of the distances. `copies` is

@@ -147,7 +147,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     - `proper`: R-precision as in information retrieval. A text with R correct motions contributes
       the fraction of them that are among its R nearest motions.
     - `single_topK`: like `topK`, but only the text's own motion counts as correct. Except for ties,
-      the values equal those of `MotionsForText`.
+      the values equal the values of `MotionsForText`.
     - `chance_topK`: the expected values for a random order. They show how much all values rise
       because of similar captions.
     - `positives`: the mean number R of correct motions.

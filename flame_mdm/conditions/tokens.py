@@ -103,8 +103,8 @@ class LearnedTokens(ConditionEncoder):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains the encoder with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
-        The pooled vectors of captions for the same clip are pulled together, and those of captions
-        for different clips are pushed apart. Each training step compares two captions from each of
+        Pooled vectors are pulled together if their captions belong to the same clip, and are pushed
+        apart if the captions belong to different clips. Each training step compares two captions from each of
         `PAIRS` clips. Without this training, a small model learns many words slowly, because it
         learns them only from the motion loss. Clips that have only one caption are not used.
         """

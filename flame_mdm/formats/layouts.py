@@ -515,6 +515,6 @@ def _bone(joints: np.ndarray, start: str, end: str) -> float:
 
 
 def _lengths(joints: np.ndarray, start: str, end: str) -> np.ndarray:
-    """Returns the distance between two of SMPL's joints in each frame."""
+    """Returns the distances (F,) between two of SMPL's joints."""
     first, last = (joints[:, SMPL22.joints.index(name)].astype(float) for name in (start, end))
     return np.linalg.norm(first - last, axis=1)

@@ -229,7 +229,7 @@ def _scaled(vectors: Tensor) -> Tensor:
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the shortest rotation that turns the direction of `a` (..., 3) to that of `b`.
+    """Returns the shortest rotation that turns the direction of `a` (..., 3) into `b`'s direction.
 
     The quaternions (..., 4) have w >= 0. For opposite directions, the result is a half turn about
     a perpendicular axis. If a vector is 0, the result is the identity.

@@ -105,7 +105,7 @@ class PositionGuide:
         return steer(clean, x_t, self.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate, changed to reach the positions and keep the poses.
+        """Returns the clean estimate (B, F, D), changed to reach the positions and keep the poses.
 
         Frames after the motion, which some models receive as padding, are not changed.
         """
@@ -282,7 +282,7 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
 def _pose(
     representation: Representation, entry: PoseTarget, folder: Path, where: str
 ) -> tuple[np.ndarray, Tensor]:
-    """Returns the joint positions (J, 3) and the features of a pose; its root is at x = z = 0."""
+    """Returns the joint positions (J, 3) and features (D,) of a pose whose root is at x = z = 0."""
     motion = read_motion(
         representation, folder / entry.file if Path(entry.file).suffix else entry.file
     )

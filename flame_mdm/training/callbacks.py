@@ -400,7 +400,7 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Writes samples of the final model, and prints their metrics and those of real motions."""
+        """Writes samples of the final model, and prints the metrics of these and of real motions."""
         # The last validation may already have written the samples of this step.
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)

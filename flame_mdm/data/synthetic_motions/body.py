@@ -2,8 +2,8 @@
 
 The upper body is computed from joint angles with forward kinematics. Two-bone inverse kinematics
 makes the legs follow planned footprints, so that a foot on the ground does not move at all. Hands
-that reach for something also use inverse kinematics. The bone lengths are similar to those of
-HumanML3D's reference skeleton (Guo et al. 2022).
+that reach for something also use inverse kinematics. The bone lengths are similar to the
+bone lengths of HumanML3D's reference skeleton (Guo et al. 2022).
 """
 
 from collections.abc import Sequence

@@ -311,7 +311,7 @@ def strike(body: Body, claim: Claim) -> Reading:
 
 
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
-    """Compares the movement of a limb with that of its counterpart on the other side.
+    """Compares the movements of a limb and its counterpart on the other side.
 
     The score is the binary logarithm of the ratio of their movements.
     """

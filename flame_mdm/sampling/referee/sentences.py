@@ -68,7 +68,7 @@ DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Clause:
-    """A clause, and whether its events happen after those of the previous clause."""
+    """A clause, and whether its events happen after the events of the previous clause."""
 
     text: str
     is_later: bool

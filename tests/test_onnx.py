@@ -40,6 +40,7 @@ from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import rotation
 from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.motion_request import USUAL_SECONDS
 from flame_mdm.seeds import key, seeded_noise
 
 SIZES = {
@@ -189,6 +190,7 @@ def sampler_without_graphs(**content: Any) -> runner.Sampler:
     (None, 60), (1.24, 25), (1.26, 25), (1.28, 26), (0.1, 2), (10.0, 200)
 ])  # fmt: skip
 def test_the_runner_rounds_seconds_to_frames(seconds: float | None, frames: int) -> None:
+    assert runner.USUAL_SECONDS == USUAL_SECONDS, "the package has the same default"
     assert len(sampler_without_graphs().generate(seconds=seconds)) == frames
     padded = sampler_without_graphs(padded_frames=200, max_frames=200)
     assert len(padded.generate(seconds=seconds)) == frames

@@ -6,7 +6,6 @@ generates motions with it. The onnxruntime wheels come from the package index.
 
 from __future__ import annotations
 
-import json
 import platform
 import re
 import shutil
@@ -24,7 +23,6 @@ from flame_mdm.formats import names, posture, rig
 from flame_mdm.formats.characters import known_skeletons
 from flame_mdm.representations import skeleton
 from flame_mdm.safe_io import atomic_write, read_package_yaml, write_json, write_text
-from flame_mdm.sampling.motion_request import USUAL_SECONDS
 
 SOURCE = Path(__file__).with_suffix("")
 PYTHON = "3.11"
@@ -104,11 +102,9 @@ def relative_imports(code: str) -> str:
 def write_language(folder: Path) -> None:
     """Writes the tables with which the extension interprets sentences."""
     for path in LANGUAGE.glob("*.yaml"):
-        text = json.dumps(read_package_yaml(path), ensure_ascii=False)
-        write_text(folder / f"{path.stem}.json", text)
+        write_json(folder / f"{path.stem}.json", read_package_yaml(path), indent=None)
     for name in ("word_vectors.npz", "word_vectors.md"):
         shutil.copy(LANGUAGE / name, folder)
-    write_json(folder / "constants.json", {"usual_seconds": USUAL_SECONDS})
 
 
 def fetch_wheels(folder: Path, target: str) -> None:

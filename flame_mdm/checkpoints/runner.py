@@ -47,6 +47,8 @@ NUMBERS = frozenset(
 MASK = (1 << 64) - 1
 # Maximum duration in seconds for a model that continues frames
 LONGEST = 600
+# Length of a motion in seconds by default, if the model's maximum is not lower
+USUAL_SECONDS = 3.0
 # The last graph exists only for SMPL's joints.
 GRAPHS = ("denoiser.onnx", "joints.onnx", "poses.onnx")
 # Maximum size of model.json in bytes
@@ -305,7 +307,7 @@ class Sampler:
         fps = content["fps"]
         longest = round(LONGEST * fps) if "start" in content else content["max_frames"]
         if seconds is None:
-            frames = min(round(3 * fps), longest)
+            frames = min(round(USUAL_SECONDS * fps), longest)
         else:
             frames = round(min(seconds * fps, longest + 1)) if seconds > 0 else 0
         if not 2 <= frames <= longest:

@@ -14,7 +14,7 @@ from mathutils import Matrix, Quaternion
 from .posture import complete, rotations_about, world_rotations
 from .reading import Reader
 from .rig import Rig, follow, matched, recognized, rest_pose
-from .runner import Sampler
+from .runner import USUAL_SECONDS, Sampler
 from .skeleton import SMPL22
 
 FOLDER = Path(__file__).parent
@@ -57,13 +57,6 @@ def reader() -> Reader:
     return Reader(sampler().content)
 
 
-def usual_seconds() -> float:
-    """Returns the length of a motion if the user states none and the sentence no count."""
-    content = sampler().content
-    constants = json.loads((FOLDER / "constants.json").read_text(encoding="utf-8"))
-    return min(constants["usual_seconds"], content["max_frames"] / content["fps"])
-
-
 def sample(sentence: str, seconds: float, seed: int, in_place: bool) -> Sampled:
     """Samples a motion.
 
@@ -81,9 +74,11 @@ def sample(sentence: str, seconds: float, seed: int, in_place: bool) -> Sampled:
     if len(reading.captions) > 1:
         warnings.append(f"several actions: only the first is sampled, '{reading.captions[0]}'")
     text = sentence if len(reading.captions) == 1 else reading.texts[0]
+    length = seconds or None
     counted = reading.seconds()[0] if reading.steps else None
-    usual = usual_seconds()
-    length = seconds or min(usual, usual if counted is None else counted)
+    if length is None and counted is not None:
+        content = model.content
+        length = min(counted, USUAL_SECONDS, content["max_frames"] / content["fps"])
     joints = model.decode(model.generate(reading.captions[0], length, seed, text=text))
     if in_place:
         joints[..., [0, 2]] -= joints[:, :1, [0, 2]] - joints[:1, :1, [0, 2]]

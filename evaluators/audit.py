@@ -50,10 +50,10 @@ AVAILABLE = OF_TEXTS | {"keys", "joints", "mask", "contacts", "generated", "real
 
 
 def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
-    """Measures perturbed motions from a split, with intervals from bootstrap resamples.
+    """Measures perturbed motions from a split, with bootstrap confidence intervals.
 
     See docs/audit.md. The folder `cache` stores metric inputs, so that an interrupted audit can be
-    continued. Raises `UserError` if data, protocol and extractor do not match.
+    resumed. Raises `UserError` if the data, protocol and extractor do not match.
     """
     data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")
@@ -178,9 +178,9 @@ def _named(metric: str, part: str) -> str:
 class _Measure:
     """Computes metrics from cached inputs, for all motions and for each bootstrap resample.
 
-    Each motion or pair is weighted by how often it is drawn, so the candidates for retrieval are
-    not resampled. FID is recomputed for each resample. Retrieval and diversity are averaged over
-    all pools and pairs that a protocol may draw.
+    A resample only changes weights: each motion or pair is weighted by how often it is drawn. The
+    candidates for retrieval are not resampled. FID is recomputed for each resample. Retrieval and
+    diversity are averaged over all pools and pairs that a protocol could draw.
     """
 
     def __init__(
@@ -206,7 +206,7 @@ class _Measure:
         self.real_texts, self.of_motions = texts, {}
 
     def __call__(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
-        """Returns each metric's values as (1 + R,): for all motions, and then for R resamples."""
+        """Returns each metric's values (1 + R,): for all motions, and then for R resamples."""
         values: dict[str, np.ndarray] = {}
         for name, metric in self.metrics.items():
             reused = self.of_motions.get(name) if inputs is self.inputs[BASE] else None
@@ -248,7 +248,7 @@ class _Measure:
     def facts_of(self, name: str) -> dict[str, Any]:
         """Returns the properties that a card lists for a value; see `AuditedMetric`.
 
-        They do not include whether a higher value is better.
+        The properties do not include whether a higher value is better.
         """
         metric, _, part = name.partition("/")
         declared = self.metrics[metric]
@@ -262,7 +262,7 @@ class _Measure:
 
     @property
     def truth(self) -> str | None:
-        """Name of the value that evaluates requested attributes exactly, or None if there is none."""
+        """Name of the value that checks requested attributes exactly, or None if there is none."""
         exact = {
             name: metric.exact for name, metric in self.metrics.items() if metric.exact is not None
         }
@@ -270,7 +270,7 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Values that rate motion-text pairs by their features: {name: 1, or -1 if lower is better}."""
+        """Values that rate pairs by their features, mapped to 1, or to -1 if lower is better."""
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):
@@ -281,7 +281,7 @@ class _Measure:
     def _rows(
         self, name: str, metric: SampleMetric, inputs: Inputs, texts: Sequence[Text]
     ) -> dict[str, Any] | None:
-        """Returns the inputs and readings of a metric in float64, or None if an input is missing."""
+        """Returns a metric's inputs and readings in float64, or None if an input is missing."""
         required = set(required_inputs(metric)) | (
             {"generated"} if "generated" in metric.states else set()
         )
@@ -337,7 +337,10 @@ def _interval(values: np.ndarray) -> list[float | None]:
 def _differences(
     values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]
 ) -> dict[str, list[float | None]]:
-    """Returns the value of each metric and its difference from real motions, with intervals."""
+    """Returns each metric's value and its difference from the value for real motions.
+
+    Each of the two comes with the half width of its 95 % interval.
+    """
     pairs = {
         name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()
     }
@@ -351,9 +354,9 @@ def _agreement(
 ) -> dict[str, dict[str, float | None]]:
     """Returns how well each metric that rates pairs agrees with the exact attributes.
 
-    "auc" is the probability that a pair with every requested attribute has a better score than a
-    pair that lacks one. It is computed from pairs with real motions and from pairs with the
-    strongest perturbations of the meaning. "correlation" is Spearman's rank correlation over these
+    "auc" is the probability that a pair with every requested attribute scores better than a pair
+    that lacks at least one. It is computed from pairs with real motions and pairs with the
+    strongest perturbations of meaning. "correlation" is Spearman's rank correlation over these
     perturbations at all grades. Returns {} if the exact attributes are unknown.
     """
     truth = measure.truth

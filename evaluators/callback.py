@@ -32,7 +32,7 @@ class Evaluate(Callback):
     extractor does not exist.
 
     Args:
-        protocol: a name in experiments/evaluation, or the path of a file.
+        protocol: the name of a protocol in experiments/evaluation, or the path of a protocol file.
         extractor: source of the protocol's extractor, as in `flame-mdm evaluate`: a file, a folder,
             a model in the package or a run directory. None = the extractor named in the protocol;
             "none" = skip metrics that need features.

@@ -33,7 +33,7 @@ def is_first() -> bool:
 
 
 def shared(value: T) -> T:
-    """Returns the value of rank 0 on every rank."""
+    """Returns rank 0's value on every rank."""
     box = [value]
     if world_size() > 1:
         dist.broadcast_object_list(box)

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Evaluations: measures real motions, generates and measures motions, and writes the result."""
+"""Runs evaluations: measures real motions, generates and measures motions, and writes results."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,8 +34,8 @@ SKIPPED = {"extractor": "extractor=none: metrics that need features were not com
 def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files from another system or a baseline, and writes the result file.
 
-    Real motions are measured first. If their values differ from the values that the protocol
-    expects, the data or the extractor is wrong, and nothing is generated. For a guide, see
+    Real motions are measured first. If their values differ from the expected values in the
+    protocol, the data or the extractor is wrong, and nothing is generated. For a guide, see
     `docs/evaluation.md`.
 
     Args:
@@ -109,7 +109,7 @@ class Evaluation:
             ground_truth: whether to measure real motions as well.
             force: whether to generate motions even if real motions do not have the expected values.
             resamples: number of bootstrap sets to draw from the motions of the first replication,
-                for intervals over motions.
+                for confidence intervals over motions.
         """
         real_sets, real = self._measure_real(source, ground_truth)
         unexpected = shared(self._unexpected(real.values))
@@ -161,7 +161,7 @@ class Evaluation:
 
     @cached_property
     def several(self) -> Evaluator | None:
-        """The evaluator for several motions per prompt, or None if the protocol has no multimodality."""
+        """Evaluator for several motions per prompt, or None if multimodality is not measured."""
         several = self.protocol.multimodality
         return several and replace(self.evaluator, metrics=several.metrics)
 
@@ -237,7 +237,7 @@ class Evaluation:
         return lines
 
     def _expected(self) -> dict[str, list[float]]:
-        """Returns, for each metric, the expected value of real motions and its tolerance.
+        """Returns, for each metric, the expected value for real motions and its tolerance.
 
         Returns {} unless the test split is evaluated.
         """
@@ -370,9 +370,9 @@ class Evaluation:
         features: list[np.ndarray],
         captions: list[str] | None = None,
     ) -> Motions:
-        """Combines motions with the conditions of their rows.
+        """Combines the features of motions with the conditions in `rows`.
 
-        If `captions` is not None, it replaces the captions of the rows.
+        If `captions` is not None, these captions replace the captions in `rows`.
         """
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None

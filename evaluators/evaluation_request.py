@@ -105,7 +105,10 @@ class EvaluationRequest(EvaluationKeys):
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-        """Creates a request from a mapping of keys to values. Sampler keys become `options`."""
+        """Creates a request from a mapping of keys to values.
+
+        Sampler keys are stored in `options`.
+        """
         kinds = (cls, SamplerOptions)
         keywords, options = (
             {key.name: config[key.name] for key in fields(kind) if key.name in config}

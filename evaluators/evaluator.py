@@ -73,7 +73,7 @@ An input is a tensor, or a list of N entries (such as joints).
 class Evaluator:
     """Computes metrics for motions, with one feature pass for all metrics.
 
-    If the features are the same, all values are bit-identical for any batch size and order. Several
+    Given the same features, all values are bit-identical for any batch size and order. Several
     processes share the feature pass: each one receives whole batches, so that features do not
     depend on the number of processes. The first process computes the metrics.
 
@@ -205,13 +205,13 @@ class Evaluator:
     def score(
         self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
-        """Computes all metrics for generated motions and their paired real motions, in the same order.
+        """Computes all metrics for generated motions and their paired real motions.
 
-        Metrics that compare sets use `real`, a separate draw of real motions, because the distance
-        from a set to itself is 0. Returns the values, keyed by name (`metric` or `metric/part`),
-        and the reasons for missing values, keyed by metric. A value that cannot be computed is
-        None. Both mappings are empty in every process except the first. Raises `UserError` if the
-        motions lack an input that a metric requires.
+        Generated and paired motions are in the same order. Metrics that compare sets use `real`, a
+        separate draw of real motions, because the distance from a set to itself is 0. Returns the
+        values, keyed by name (`metric` or `metric/part`), and the reasons for missing values, keyed
+        by metric. A value that cannot be computed is None. Both mappings are empty in every process
+        except the first. Raises `UserError` if the motions lack an input that a metric requires.
         """
         if not is_first():
             return {}, {}
@@ -285,7 +285,7 @@ class Evaluator:
         return isinstance(self.declared[name.partition("/")[0]], TwoSets)
 
     def reads(self, name: str) -> bool:
-        """Returns whether any metric requires an input."""
+        """Returns whether any metric requires the input with this name."""
         return any(name in required_inputs(metric) for metric in self.declared.values())
 
     def check(
@@ -321,7 +321,7 @@ def keys_of(names: Sequence[str]) -> Tensor:
 
 
 def _chunk(generated: Rows, paired: Rows, part: slice) -> Rows:
-    """Returns the padded inputs of some motions and their paired real motions, with masks."""
+    """Returns padded inputs and masks for some motions and the real motions paired with them."""
     rows = {name: values[part] for name, values in generated.items()}
     rows |= {real: paired[name][part] for name, real in PAIRED.items() if name in paired}
     for joints, mask in (("joints", "mask"), ("real_joints", "real_mask")):

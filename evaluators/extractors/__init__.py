@@ -32,7 +32,7 @@ from flame_mdm.seeds import key
 
 
 class Extractor(ABC):
-    """A network that computes features of motions and, if it reads text, of captions."""
+    """A network that computes features of motions and, if it reads text, features of captions."""
 
     # Hash of the weights or files. Values computed with extractors that have different hashes are
     # not comparable.
@@ -62,7 +62,7 @@ class Extractor(ABC):
         return None
 
     def reference(self) -> Tensor | None:
-        """The network's own real motions as features (N, E), with which sets are compared.
+        """Features (N, E) of the network's own real motions, with which sets are compared.
 
         None = sets are compared with motions from the data set.
         """
@@ -130,7 +130,7 @@ class MotionCLIPExtractor(OwnExtractor[MotionCLIPTask]):
 
     @torch.no_grad()
     def fit(self, motions: Sequence[Motion]) -> list[float]:
-        """Returns how well motions fit their texts: the mean cosine over the parts of a motion.
+        """Returns how well motions fit their texts: the mean cosine over the parts of each motion.
 
         Because a motion-CLIP overrates motions that it has selected, evaluate such motions with
         another motion-CLIP.
@@ -153,7 +153,11 @@ class OwnT2MExtractor(OwnExtractor[T2MTask]):
     trained, recipes = T2MTask, "t2m"
 
     def reads(self, other: Representation) -> bool:
-        """Returns whether the network accepts the representation or its shared features."""
+        """Returns whether the network accepts motions in a representation.
+
+        A part of the network's own representation is accepted if it contains all features that the
+        network uses.
+        """
         trained = self.task.representation
         is_part = (other.part_of, other.fps) == (trained.name, trained.fps)
         reads_part = is_part and self.task.network.used <= other.features
@@ -358,7 +362,7 @@ class UnconstrainedExtractor(ClassifierExtractor):
         self.real = torch.from_numpy(read_unconstrained(self.path / self.FILES[1])).to(device)
 
     def reference(self) -> Tensor:
-        """The reference motions as features (N, 256)."""
+        """Features (N, 256) of the reference motions."""
         assert isinstance(self.network, Unconstrained)
         mask = torch.ones(self.real.shape[:2], dtype=torch.bool, device=self.real.device)
         pairs = zip(self.real.split(64), mask.split(64), strict=True)

@@ -1,7 +1,7 @@
 # pyright: standard
 """The CLIP-score evaluator of MARDM (Meng et al. 2025, "Rethinking Diffusion for Text-Driven Human Motion Generation").
 
-MARDM's other evaluator is the one in `evaluators.extractors.t2m`, with 67 features.
+MARDM's other evaluator, which reads 67 features, is in `evaluators.extractors.t2m`.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,10 @@ def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.Transfo
 
 
 class _MotionEncoder(nn.Module):
-    """A transformer with a learned first token, whose output is the embedding of the motion."""
+    """A transformer with a learned first token.
+
+    The output for this token is the embedding of the motion.
+    """
 
     def __init__(self, features: int, width: int, transformer: nn.TransformerEncoder):
         super().__init__()

@@ -47,10 +47,10 @@ class MotionCLIP(nn.Module):
         in_features: D, the number of features per frame of the motions.
         text_features: C, the number of features of the pooled condition.
         embedding_dim: E, the number of features in the joint space.
-        blind_features: how many features at the beginning of each frame are set to 0. FLAME's code
-            sets the first 3 features (the translation of the root) to 0, so that scores do not
+        blind_features: number of features that are set to 0 at the beginning of each frame. FLAME's
+            code sets the first 3 features (the translation of the root) to 0, so that scores do not
             depend on position and height.
-        roughness: whether absolute second differences over time are additional inputs, so that
+        roughness: whether the absolute second differences over time are added to the input, so that
             noise is easier to detect.
     """
 
@@ -115,7 +115,7 @@ def info_nce(
     meaning: Tensor | None = None,
     wrong_text: Tensor | None = None,
 ) -> Tensor:
-    """Contrastive loss over the pairs of all ranks: the mean cross-entropy of both directions.
+    """Contrastive loss over the pairs of all ranks: the mean cross-entropy in both directions.
 
     See Oord et al. 2018, eq. 4. The loss is symmetric, as in Radford et al. 2021. Each rank
     compares its own pairs (B, E) with the motions and texts of all ranks, and DDP averages
@@ -128,7 +128,8 @@ def info_nce(
         logit_scale: scalar tensor, logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
-        wrong_text: (B, K, E) features of texts, each of which is a negative for one motion only.
+        wrong_text: (B, K, E) features of K wrong texts for each motion, which are negatives for
+            this motion only.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)
@@ -156,7 +157,7 @@ def _of_all_processes(x: Tensor) -> Tensor:
 
 
 class PooledLoss(SampleMetric):
-    """InfoNCE in pools of 32 pairs, which are sorted by key.
+    """InfoNCE in pools of 32 pairs, after all pairs have been sorted by key.
 
     If the last pool is incomplete, its pairs are compared with the last 32 pairs.
     """

@@ -36,19 +36,20 @@ LENGTH = 10.0
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
-    """Trains a motion-CLIP whose distances have a known scale, with texts that differ in details.
+    """Trains a motion-CLIP on texts that differ in details, and gives its distances a known scale.
 
     - Texts: if two clips have the same captions or attributes, the motion of one clip is not a
       negative for the captions of the other. Near-miss captions (see `near_misses`) are additional
       negatives.
-    - Motions: half of them come with a noisy copy. The strength of the noise is drawn from [0, 1],
-      with small values more likely. The distance between the features of a motion and its copy,
-      both scaled to norm 1, is trained to equal this strength. Half of the copies have white noise
-      on the joints and are encoded again, like motions from files. The other half have noise on
-      normalized features, like generated motions.
+    - Motions: half of the motions are paired with a noisy copy. The strength of the noise is drawn
+      from [0, 1], with small values more likely. The distance between the features of a motion and
+      its copy, both scaled to norm 1, is trained to equal this strength. In half of the copies,
+      white noise is added to the joints, which are then encoded again, like motions from files. In
+      the other half, noise is added to the normalized features, like the noise in generated
+      motions.
 
-    All features are scaled to the same norm. Otherwise, their norms, which do not affect cosines,
-    would distort Euclidean distances.
+    All features are scaled to the same norm. Otherwise, differences between the norms would distort
+    Euclidean distances, although they do not affect cosines.
     """
 
     representation: HumanML

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Action classifiers with graph convolutions over skeleton and time (Yan et al. 2018, "ST-GCN")."""
+"""Action classifiers with spatial-temporal graph convolutions (Yan et al. 2018, "ST-GCN")."""
 
 from collections.abc import Sequence
 

@@ -205,7 +205,7 @@ class _MovementEncoder(nn.Module):
 
 
 class _Recurrent(nn.Module):
-    """A bidirectional GRU with a learned initial state and an embedding of its final states."""
+    """A bidirectional GRU with a learned initial state, whose final states are embedded."""
 
     def __init__(self, in_features: int, hidden: int, embedding: int):
         super().__init__()

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Trains Guo et al.'s evaluator (see `t2m`) on data that its released weights do not fit."""
+"""Trains Guo et al.'s evaluator (see `t2m`) on data that its released weights do not support."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,10 +63,10 @@ def matching_loss(
     """Computes the contrastive loss of Guo et al. 2022 over B pairs. Returns a scalar.
 
     The formula is eq. 4 of Hadsell et al. 2006, without its factor 1/2. Each text is compared with
-    its own motion and with a wrong motion. The wrong motion is the first one, going back from the
-    row of the text, that the text does not describe. It adds no loss if its distance is larger than
-    `margin`. The authors shift the motions by a random number of rows instead, which also pushes
-    matching pairs apart.
+    its own motion and with a wrong motion. To find a wrong motion, the rows before the text's row
+    are searched backward for the first motion that the text does not describe. The wrong motion
+    adds no loss if its distance from the text is larger than `margin`. The authors shift the
+    motions by a random number of rows instead, which also pushes matching pairs apart.
 
     Args:
         motion: (B, E) features of the motions.
@@ -116,7 +116,8 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
             not tagged; see `LearnedWords`.
         movement_steps: number of training steps for the movement encoder.
         sparsity: weight of the mean magnitude of movement vectors in the loss.
-        smoothness: weight of the mean magnitude of differences between successive movement vectors.
+        smoothness: weight of the mean magnitude of the differences between successive movement
+            vectors.
         margin: distance beyond which a wrong motion adds no loss.
     """
 
@@ -199,11 +200,14 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
-        """Returns the word vectors that were read from a file, (words, 300). `facts` maps words to rows."""
+        """Returns the word vectors (words, 300) that were read from a file.
+
+        `facts` maps words to rows.
+        """
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the word vectors of a checkpoint.
+        """Restores the word vectors from a checkpoint.
 
         Raises `UserError` if a resumed run reads different vectors.
         """
@@ -224,7 +228,7 @@ class T2MTask(ExtractorTask[T2MEvaluator]):
         return self.network.text(self.words(tokens))
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of a batch: first the reconstruction loss, later the matching loss."""
+        """Returns the loss of a batch: first the reconstruction loss, then the matching loss."""
         self.seed_step(batch_idx)
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:

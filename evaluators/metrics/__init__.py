@@ -29,12 +29,12 @@ real motions.
 
 A key is the `flame_mdm.seeds.key` of an id. If there are several samples per id, the key also
 depends on the sample index. Metrics that compare motions one by one (MID, position and displacement
-errors) require real motions in the order of the generated motions.
+errors) require real motions in the same order as the generated motions.
 
 `compute()` returns a number, or a dict that maps names to numbers. If there are no samples, it
 returns None. It raises `UserError` if a number would be meaningless, for example because there are
-too few samples. If the features are the same, values are bit-identical for any batch size, order
-and number of processes. Random draws depend only on `seed`.
+too few samples. Given the same features, values are bit-identical for any batch size, order and
+number of processes. Random draws depend only on `seed`.
 """
 
 from __future__ import annotations

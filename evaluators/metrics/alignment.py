@@ -21,7 +21,7 @@ def equally_weighted(values: Tensor) -> Tensor:
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, correct: Tensor) -> Tensor:
-    """Returns the rank of each query's correct candidate, as (N,), 0 = first.
+    """Returns the rank (N,) of each query's correct candidate; 0 = first.
 
     The rank is the number of candidates that are closer than the correct candidate, or equally
     close but earlier in the pool. `pools` (N, P) contains, for each query (N, E), the indices of
@@ -68,7 +68,7 @@ class RPrecision(SampleMetric):
         return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in TOP}
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
-        """Returns the rank of each query's correct candidate, as (N,), 0 = first."""
+        """Returns the rank (N,) of each query's correct candidate; 0 = first."""
         raise NotImplementedError
 
     def in_random_pools(self, distance: Tensor, correct: Tensor) -> dict[str, Tensor]:

@@ -1,9 +1,9 @@
 # pyright: standard
 """Attributes of a motion, read from its joints by geometric rules.
 
-The attributes are action, side, count, direction, speed and amount. The rules detect what a person
-would see in a clip of a few seconds that shows one action of the synthetic set. Each threshold is
-explained next to its rule. The joints are SMPL's 22 joints.
+The attributes are action, side, count, direction, speed and amount. The rules are made for clips of
+a few seconds that show one action of the synthetic set. They detect what a person would see. Each
+threshold is explained next to its rule. The joints are SMPL's 22 joints.
 """
 
 import json
@@ -190,7 +190,7 @@ def _lowered(
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Detects walking and running: the body moves more than 33 cm, and both ankles rise by 4 cm."""
+    """Detects walking and running: the body moves by over 33 cm, and both ankles rise by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
@@ -216,7 +216,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
     """Detects kicks.
 
     In a kick, a foot is more than 35 cm in front of the pelvis and more than 25 cm higher than when
-    standing.
+    the person stands.
     """
     out = smooth[:, ANKLES] - smooth[:, [PELVIS]]
     ahead = (out[..., [0, 2]] * forward[:, None]).sum(-1)
@@ -343,7 +343,7 @@ class AttributeAccuracy(Timed, MotionMean):
         return {"seen": np.array(seen)}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns, for each attribute, whether each motion shows the requested value and whether it counts.
+        """Returns whether motions show the requested value and whether they count, by attribute.
 
         A motion counts if a value of the attribute was requested.
         """
@@ -379,9 +379,9 @@ class AttributeAccuracy(Timed, MotionMean):
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     """Determines which side, left or right, a motion from the Bandai set shows.
 
-    For walk-turn-left and walk-turn-right, the side is read from the turn of the body, and for
-    walk-left and walk-right, from the direction of travel. For all other contents, it is the side
-    of the hand that rises higher above its shoulder. The side in the content's name is not used.
+    For walk-turn-left and walk-turn-right, the turn of the body determines the side; for walk-left
+    and walk-right, the direction of travel does. For all other contents, the hand that rises higher
+    above its shoulder determines the side. The side in the content's name is not used.
 
     Args:
         joints: (F, 22, 3) positions of SMPL's joints in meters, y up.

@@ -1,4 +1,4 @@
-"""Checks for individual actions: whether a motion shows the action, and with which side, count or direction.
+"""Checks whether a motion shows a given action, and with which side, count or direction.
 
 `evaluators.metrics.attributes` recognizes 22 actions. Rules cannot tell the other actions apart: a
 hand at the head for half a second may mean drinking, phoning or scratching. Therefore, a check only
@@ -79,7 +79,7 @@ class View:
         return ((joints - origin)[..., [0, 2]] * self.left[:, None]).sum(-1)
 
     def path(self) -> np.ndarray:
-        """Returns how far the pelvis is to the left of and in front of its starting point, (F, 2).
+        """Returns how far the pelvis is to the left and in front of its starting point, as (F, 2).
 
         The directions are relative to the heading in the first frame.
         """
@@ -141,7 +141,7 @@ def _knock(view: View) -> Shown:
 
 
 def _slash(view: View) -> Shown:
-    """Detects a hand that moves downward past the shoulder, and inward, within 0.5 seconds.
+    """Detects a hand that moves downward past the shoulder and inward within 0.5 seconds.
 
     The hand must move from 20 cm above the shoulder to below it, and 15 cm inward.
     """
@@ -218,7 +218,7 @@ def _dodge(view: View) -> Shown:
 
 
 def _strafe(view: View) -> Shown:
-    """Detects a path that leads mostly to one side, for more than 33 cm.
+    """Detects a path that leads mostly to one side, by more than 33 cm.
 
     The sideways distance must be at least twice the distance forward or backward.
     """
@@ -265,6 +265,6 @@ CHECKED: dict[str, Callable[[View], Shown]] = {
 
 
 def check(action: str, view: View) -> Shown:
-    """Returns the attributes of a motion if it shows an action (one of `CHECKED`), or else {}."""
+    """Returns a motion's attributes if it shows an action (one of `CHECKED`), and {} otherwise."""
     shown = CHECKED[action](view)
     return {"action": action, **shown} if shown else {}

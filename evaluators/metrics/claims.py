@@ -94,7 +94,7 @@ class ClaimAccuracy(Timed, MotionMean):
         return {name: torch.tensor(values, dtype=torch.float64) for name, values in flags.items()}
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the joints themselves, because the captions determine what is measured.
+        """Returns the joints themselves, because what is measured depends on the captions.
 
         "positions" (N, F, 3 J) are int16, in units of `STEP`, relative to the starting point on the
         floor. "frames" (N,) are the lengths of the motions.
@@ -112,7 +112,7 @@ class ClaimAccuracy(Timed, MotionMean):
         return {"positions": positions, "frames": frames}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Maps each value's name to the numbers of true and decided claims per motion, as (N, 2)."""
+        """Returns the numbers (N, 2) of true and decided claims in each motion, keyed by value."""
         pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for packed, frames, caption in zip(
             rows["positions"], rows["frames"], rows["captions"], strict=True

@@ -87,7 +87,7 @@ def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
 
 
 class KernelMotionDistance(TwoSets):
-    """Kernel distance of motion features, "KID" (Bińkowski et al. 2018).
+    """Kernel distance between sets of motion features, "KID" (Bińkowski et al. 2018).
 
     `mean` is the mean of `polynomial_mmd2` over random subsets; lower is better. `std` is the
     standard deviation over the subsets. `update` takes `generated` (B, E) with `keys` (B,), and
@@ -95,7 +95,7 @@ class KernelMotionDistance(TwoSets):
 
     Args:
         subsets: number of random subsets.
-        subset_size: number of samples drawn from each set for a subset. Each set must contain at
+        subset_size: number of samples drawn from each set for each subset. Each set must contain at
             least this number of samples.
         replace: whether to draw with replacement, as the code of MoDi and MDM does if there are
             more real motions than `subset_size`. Samples that are drawn twice increase the value.

@@ -36,9 +36,10 @@ class Diversity(SampleMetric):
     """Diversity: mean distance between random pairs of motions (Guo et al. 2020; MDM, eq. 6).
 
     The best value is the diversity of real motions. Published values for text-to-motion are
-    computed from 300 pairs, drawn as two sets without replacement. Those for action-to-motion and
-    unconstrained synthesis are computed from 200 pairs, drawn with replacement. In both cases, a
-    motion may be paired with itself. `update` takes `generated` (B, E) and `keys` (B,).
+    computed from 300 pairs, drawn as two sets without replacement. Published values for
+    action-to-motion and unconstrained synthesis are computed from 200 pairs, drawn with
+    replacement. In both cases, a motion may be paired with itself. `update` takes `generated`
+    (B, E) and `keys` (B,).
 
     Args:
         pairs: number of pairs.
@@ -197,7 +198,7 @@ class ActionMultimodality(SampleMetric):
 
 
 class JointVariance(SampleMetric):
-    """Variance of joint positions across the motions for a text, in square meters.
+    """Variance of joint positions across the motions for the same text, in square meters.
 
     For each text, the variance is computed over `samples` motions of equal length, with n - 1 in
     the denominator. It is summed over x, y and z, and averaged over joints, frames and texts. The

@@ -59,9 +59,10 @@ class TrainingMotions:
 
         Returns:
             (B, 2), or (B, 1) without features. The first column is the root mean square distance,
-            in meters, between the joints of the motion and of the best window of the same length. It
-            is computed from every fourth frame, and is infinite if no training motion is long
-            enough. The second column is the distance between the features.
+            in meters, between the joints of the motion and the joints of the best-matching training
+            window of the same length. This distance is computed from every fourth frame, and is
+            infinite if no training motion is long enough. The second column is the distance between
+            the features.
         """
         squares = self.poses.square().sum(-1)
         # Number of frames from each frame to the end of its motion

@@ -21,7 +21,7 @@ class FootSkating(Timed, JointMean):
     A toe joint touches the floor if it is below 5 cm in two adjacent frames. It slides if it moves
     more than 2.5 cm over the ground between these frames (Karunratanakul et al. 2023, "Guided
     Motion Diffusion"). This limit applies to 20 frames per second; at other frame rates, the limit
-    corresponds to the same speed, 0.5 m/s. The code released with the paper also requires that the
+    is scaled to the same speed, 0.5 m/s. The code released with the paper also requires that the
     mean speed over five frames exceeds the limit, and it averages the ratios of the motions. This
     metric follows the paper: only two frames are considered, and every frame transition has the
     same weight. Lower is better.

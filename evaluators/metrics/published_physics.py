@@ -60,7 +60,10 @@ class PublishedPhysics(Timed, JointMean):
         return self.required_fps in (None, self.fps)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the sum and number of each motion's values as (N, 2), keyed by name, or {} if undefined."""
+        """Returns the sum and count (N, 2) of each motion's values, keyed by name.
+
+        Returns {} if the values are undefined.
+        """
         return super().readings(motions) if self.defined else {}
 
 
@@ -138,7 +141,7 @@ def mbench_contact(feet: Tensor) -> Tensor:
 
 
 def _speed(points: Tensor) -> Tensor:
-    """Returns how far points (F, ..., 3) move until the next frame, in meters, as (F, ...).
+    """Returns the distances (F, ...), in meters, that points (F, ..., 3) move until the next frame.
 
     The last distance is repeated. For a single frame, the result is empty.
     """
@@ -152,10 +155,10 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
     `feet` (F, 2, 3) contains the positions of the two feet, and `contact` (F, 2) bool states
     whether each foot is in contact.
 
-    Returns the numbers of frames of three kinds. In the first kind, the feet on the ground do not
-    move in accordance with the body. In the second kind, a foot in the air moves much less than the
-    body; these frames have half the weight in the score. In the third kind, both feet swing to and
-    fro in the air.
+    Returns three numbers of frames, one for each kind. In the first kind, the movement of the feet
+    on the ground does not match the movement of the body. In the second kind, a foot in the air
+    moves much less than the body; these frames have half the weight in the score. In the third
+    kind, both feet swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)
@@ -252,7 +255,7 @@ class KimodoQuality(PublishedPhysics):
         return {"contacts": motions["contacts"][i][None]} if "contacts" in motions else {}
 
     def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
-        """Computes the values from the joints (F, J, 3) and any contacts (F, 4) of a motion."""
+        """Computes a motion's values from its joints (F, J, 3) and, if known, contacts (F, 4)."""
         if len(motion) < 2:
             return {}
         feet = motion[:, self.feet]
@@ -281,7 +284,7 @@ class KimodoConstraints(MotionMean):
     - `root2d_err`: horizontal distance of the root from the real root, in frames in which the root
       is kept.
     - `root2d_err_p95`: 95th percentile of `root2d_err` over motions.
-    - `root2d_acc`: fraction of these frames in which the distance is at most 10 cm.
+    - `root2d_acc`: fraction of the frames with a kept root in which the distance is at most 10 cm.
     - `fullbody_keyframe`: distance of all joints from the real joints, in frames in which all
       joints are kept.
     - `end_effector`: distance of the kept joints from the real joints, in all other frames.
@@ -469,7 +472,7 @@ class TransitionJerk(SampleMetric):
 
 
 def transition_jerk(window: Tensor) -> Tensor:
-    """Computes the jerk in each frame from positions (F, J, 3), as (F - 3,) in meters per frame^3."""
+    """Computes the jerk (F - 3,) in each frame, in meters per frame^3, from positions (F, J, 3)."""
     return window.double().diff(n=3, dim=0).abs().sum(-1).amax(-1)
 
 

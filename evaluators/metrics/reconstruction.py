@@ -21,7 +21,7 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
     motion (F, 21, 3), in KIT units, is placed on the floor, and its root starts at x = z = 0 with a
     heading along +z. For the local positions, which exclude the root, each frame is moved and
     turned so that the root is at x = z = 0 and the heading is along +z. `Rifke` defines the floor
-    and the heading, with the peculiarities of the published code.
+    and the heading, including the peculiarities of the published code.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -185,7 +185,7 @@ class TemosPositionErrors(PositionErrors):
         return {part: x / 1000 for part, x in temos_parts(joints * self.units_per_meter).items()}
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the APE of each frame, as (F,), and the AVE of the clip, keyed by name."""
+        """Returns the APE (F,) of each frame and the AVE of the clip, keyed by name."""
         distances = {part: (a[part] - b[part]).norm(dim=-1) for part in PARTS}
         position = {f"ape_{part}": x if x.ndim == 1 else x.mean(1) for part, x in distances.items()}
         return position | {
@@ -285,7 +285,7 @@ class EditErrors(MotionMean):
 
 
 class DisplacementErrors(EditErrors):
-    """ADE and FDE: mean joint distance, in meters, in all predicted frames and in the last one.
+    """ADE and FDE: mean joint distance, in meters, over all predicted frames and in the last one.
 
     As is usual in motion prediction (Yuan and Kitani 2020), distances are averaged over the joints
     and frames of a clip, and then over clips. Parts that an edit kept are ignored. MFM (Table 3)
@@ -341,9 +341,9 @@ class KeptDrift(EditErrors):
     """How far, in meters, an edit has moved kept joints in world coordinates.
 
     This metric was introduced in this project. `mean` is the distance averaged over the kept joints
-    and frames of a motion, and then over motions. `largest` is the maximum over all of them. If
-    features are relative to the root, an edit can keep steps and poses exactly and still move a
-    kept ending, because the ending begins where the new part ends.
+    and frames of a motion, and then over motions. `largest` is the maximum over all kept joints,
+    frames and motions. If features are relative to the root, an edit can keep steps and poses
+    exactly and still move a kept ending, because the ending begins where the new part ends.
 
     Example:
         >>> metric, real = KeptDrift(), torch.zeros(1, 5, 22, 3)

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Retrieval with several correct answers: equal and similar captions, and the protocols of TMR."""
+"""Retrieval metrics that account for equal and similar captions, and the protocols of TMR."""
 
 import functools
 import json
@@ -38,7 +38,7 @@ def _encoder(config: str) -> ConditionEncoder:
 def embedding(config: str, caption: str) -> Tensor:
     """Encodes a caption as a vector (C,) of norm 1.
 
-    `config` is the mapping of an encoder in JSON. The caption is encoded alone, not in a batch.
+    `config` is the encoder's configuration in JSON. The caption is encoded alone, not in a batch.
     """
     empty = torch.zeros(1, 1, 1)
     with torch.no_grad():
@@ -82,7 +82,7 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 
 
 def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
-    """Returns the rank of each query's best correct candidate, as (N,), 0 = first.
+    """Returns the rank (N,) of each query's best correct candidate; 0 = first.
 
     Candidates with the same value in `similarity` (N, M) share their mean rank.
     """
@@ -91,7 +91,7 @@ def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
 
 
 class CaptionMetric(SampleMetric):
-    """Base class for metrics in which several motions may have the same caption.
+    """Base class for metrics that allow several motions with the same caption.
 
     Captions are the same if they differ only in case, punctuation and spaces or, with an
     `encoder`, if the cosine of their embeddings exceeds `SAME`.
@@ -254,7 +254,8 @@ class TMRRetrieval(CaptionMetric):
     TMR's caption encoder is all-mpnet-base-v2. TMR lists its dissimilar motions and batches for
     HumanML3D and KIT. In this implementation, batches are drawn at random. Without `ids`, the
     dissimilar subset starts with the first motion by key. Then, the motion whose caption is least
-    similar to the captions chosen so far is added repeatedly until the subset is complete.
+    similar to the captions chosen so far is added, and this is repeated until the subset is
+    complete.
 
     Args:
         encoder: mapping with the `_target_` of a text encoder; None = captions are compared as

@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class for the properties of a metric, and its values for single samples and resamples.
+    """Base class for a metric's declared properties and its values for samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.
@@ -55,19 +55,19 @@ class Declared:
     def direction_of(self, name: str) -> bool | None:
         """Returns whether higher is better for the value with this name.
 
-        None = neither direction is better, or the best value is the value of real motions.
+        None = neither direction is better, or the value for real motions is the best value.
         """
         return self.directions.get(name, self.higher_is_better)
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns those measurements on motions that do not depend on conditions, keyed by name.
+        """Returns the condition-independent measurements of motions, keyed by name.
 
         Each reading is an array with N rows. Metrics computed from features need no readings.
         """
         return {}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the value and the weight of each sample as (N, 2), keyed by the name of the value.
+        """Returns each sample's value and weight (N, 2), keyed by the name of the value.
 
         The metric is the weighted mean. If it uses random pools, the values are averaged over all
         possible draws. Returns {} if the metric has no values for individual samples. `rows`
@@ -167,7 +167,8 @@ class SampleMetric(Declared, Metric):
         """Computes the value for samples drawn with replacement (bootstrap).
 
         Args:
-            drawn: (N,) indices of the drawn samples, in the order in which they were added.
+            drawn: (N,) indices of the drawn samples, counted in the order in which the samples were
+                added.
             real_drawn: (M,) indices of the drawn real motions, if the metric compares two sets.
         """
         return self.value(*self._taken(drawn, *self.states))
@@ -269,7 +270,7 @@ class Timed(SampleMetric):
 
 
 class MotionMean(SampleMetric):
-    """Base class for means over the values of motions.
+    """Base class for metrics that average values over motions.
 
     A motion contributes one value, one value per frame, or any other number of values.
     """
@@ -312,7 +313,7 @@ class MotionMean(SampleMetric):
         return dict(zip(self.parts or self.names, means, strict=True)) if self.names else means[0]
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the sum and number of each motion's values as (N, 2), keyed by name."""
+        """Returns the sum and count (N, 2) of each motion's values, keyed by name."""
         names = self.parts or self.names or [""]
         return {name: torch.as_tensor(rows[name]) for name in names if name in rows}
 
@@ -343,7 +344,7 @@ class JointMean(MotionMean):
         raise NotImplementedError
 
     def readings(self, motions: Rows) -> dict[str, np.ndarray]:
-        """Returns the sum and number of each motion's values as (N, 2), keyed by name."""
+        """Returns the sum and count (N, 2) of each motion's values, keyed by name."""
         self.reset()
         for i, joints in enumerate(motions["joints"]):
             mask = torch.ones(1, len(joints), dtype=torch.bool)

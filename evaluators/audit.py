@@ -145,7 +145,7 @@ def _measured(
 
 
 def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Motions) -> Inputs:
-    """Returns the metric inputs for motions, from the cache or from a feature pass."""
+    """Returns the metric inputs for motions, read from the cache or computed in a feature pass."""
     if path.exists():
         return read_npz(path)
     extracted = evaluator.extract(MotionsOf(ids, make()))

@@ -22,7 +22,7 @@ from flame_mdm.training.loggers import log_table
 class Evaluate(Callback):
     """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
-    Checkpoints can be selected by these values. Dashboards show each value with its unit as
+    These values can be used to select checkpoints. Dashboards show each value with its unit as
     val/<protocol>/<metric> (<unit>), next to the value for real motions (.../real). With several
     replications, .../ci is the half width of the 95 % interval.
 

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Divides the work of an evaluation among the ranks of a process group.
+"""Divides evaluation work among the ranks of a process group.
 
 Without a process group, everything runs in one process.
 """

@@ -15,8 +15,8 @@ Joints = np.ndarray
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
     """Encodes motions as float32 features (F, D), one row per frame, at their original height.
 
-    The encoder of a representation requires an additional frame and places the lowest joint on the
-    floor, which would hide floating and sinking. This function adds the frame and restores the
+    The encoder of a representation requires an additional frame. It also places the lowest joint on
+    the floor, which would hide floating and sinking. This function adds the frame and restores the
     height.
     """
     longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]

@@ -218,7 +218,7 @@ class Evaluation:
         return self.evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Returns a line for each value of the real test motions that differs from its expected value."""
+        """Returns a line for each value that is not the value expected for real test motions."""
         if not values or self.protocol.resized_samples or self.protocol.cuts_motions:
             return []
         lines = []
@@ -254,7 +254,10 @@ class Evaluation:
         }
 
     def _conditions(self) -> list[str]:
-        """Returns notes on limitations: repeated clips and unchecked values of real motions."""
+        """Returns notes on limitations.
+
+        The notes cover repeated clips and values for real motions that were not checked.
+        """
         lines = []
         clips = len(self.protocol.selected(self.clips))
         drawn = {

@@ -197,7 +197,10 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 
 
 class ReleasedExtractor(Extractor, Generic[Network]):
-    """A network with its authors' released weights, loaded from a file or from a folder with `FILES`."""
+    """A network with the weights that its authors released.
+
+    The weights are loaded from a file or from a folder with `FILES`.
+    """
 
     FILES: tuple[str, ...] = ()
     network: Network
@@ -305,7 +308,7 @@ class ClassifierExtractor(ReleasedExtractor[ActionGRU | UESTC | Unconstrained]):
 
     `random_start` is a legacy option that follows Guo et al. 2020 and all later work: the initial
     state of the humanact12 GRU is drawn from a normal distribution, separately for features and
-    scores. In this implementation, the draw is a function of the motion.
+    scores. In this implementation, the draw depends only on the motion.
     """
 
     def __init__(

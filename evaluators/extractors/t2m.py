@@ -59,7 +59,7 @@ class Words(NamedTuple):
 
 
 class WordVectors:
-    """Word vectors (N, 300), such as GloVe's, and the row of each word."""
+    """Word vectors (N, 300), such as GloVe's, and a mapping from words to rows."""
 
     def __init__(self, rows: dict[str, int], vectors: Tensor):
         self.rows, self.vectors = rows, vectors

@@ -86,7 +86,7 @@ class ExtractorTask(Task, Generic[Network]):
         return self.network(x, mask)
 
     def seed_step(self, batch_idx: int) -> None:
-        """Makes the random draws of a training step a function of (seed, batch number, rank)."""
+        """Seeds a training step, so that its draws depend only on (seed, batch number, rank)."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
 
     def update_samples(self, batch: MotionBatch, **inputs: Tensor) -> None:

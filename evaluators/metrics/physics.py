@@ -112,7 +112,7 @@ class Jitter(Timed, JointMean):
     unit = "m/s^3"
 
     def measure(self, motion: Tensor) -> Tensor:
-        """Returns the jerk of a motion (F, J, 3), averaged over its joints, as (F - 3,) in m/s^3."""
+        """Returns the jerk (F - 3,) of a motion (F, J, 3) in m/s^3, averaged over the joints."""
         return motion.double().diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 

@@ -403,5 +403,5 @@ class TwoSets(SampleMetric):
         return self.value(*generated, *real) if generated and real else self.nothing
 
     def drawn_value(self, drawn: Tensor, real_drawn: Tensor) -> Value:
-        """Computes the value for drawn samples (N,) and drawn real motions (M,), both indices."""
+        """Computes the value from the indices of drawn samples (N,) and drawn real motions (M,)."""
         return self.value(*self._taken(drawn, "generated"), *self._taken(real_drawn, "real"))

@@ -14,8 +14,8 @@ class ActionGRU(nn.Module):
 
     The class is predicted from the state at the last real frame. The features and accuracies in all
     published HumanAct12 tables were computed with the released weights. The authors draw the
-    initial state from a normal distribution on every call, whereas here the initial `state`
-    (layers, B, hidden) is zero by default.
+    initial state from a normal distribution on every call. In this implementation, the initial
+    `state` (layers, B, hidden) is zero by default.
     """
 
     features = 30

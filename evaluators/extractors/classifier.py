@@ -1,5 +1,5 @@
 # pyright: standard
-"""Training of action classifiers, for evaluations on data sets without a released classifier."""
+"""Trains action classifiers for evaluations on data sets without a released classifier."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -120,7 +120,7 @@ def info_nce(
     See Oord et al. 2018, eq. 4. The loss is symmetric, as in Radford et al. 2021. Each rank
     compares its own pairs (B, E) with the motions and texts of all ranks, and DDP averages
     gradients over ranks. If all ranks have the same number of pairs, the averaged loss and gradient
-    are the same as on a single rank with all pairs.
+    equal the loss and gradient on a single rank with all pairs.
 
     Args:
         motion: (B, E) features of the motions on this rank.

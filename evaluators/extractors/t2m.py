@@ -2,8 +2,7 @@
 """The evaluator for HumanML3D and KIT-ML.
 
 Source: Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text". The authors'
-code returns embeddings in descending order of length, whereas this code keeps the order of the
-input.
+code returns embeddings in descending order of length. This code keeps the order of the input.
 """
 
 import itertools

@@ -149,7 +149,7 @@ class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32 motions?
 
     This is the definition in the code of Guo et al. 2022, which was used for the tables of MDM and
-    MFM. Test pairs in random order are split into pools of 32, which may contain equal captions. In
+    MFM. Test pairs are shuffled and split into pools of 32, which may contain equal captions. In
     each pool, the motions are ranked by their Euclidean distance from each text.
 
     The authors' code drops an incomplete last pool. In this implementation, the last 32 motions are
@@ -210,7 +210,7 @@ class MultimodalDistance(SampleMetric):
     """MM-Dist (MFM, eq. 10), the mean Euclidean distance between motions and their texts.
 
     Guo et al. 2022 call it "matching score". Their code computes in float32 and drops an incomplete
-    last batch, whereas in this implementation, every motion counts. Lower is better. `update` takes
+    last batch. In this implementation, every motion counts. Lower is better. `update` takes
     `generated` (B, E), `text` (B, E) and `keys` (B,).
 
     Args:
@@ -308,8 +308,8 @@ class MutualInformationDivergence(SampleMetric):
     `real` (B, E) and `keys` (B,), where row i of `real` is the real motion for text i.
 
     Args:
-        eps: value added to the diagonals of covariances before they are inverted: 5e-4 in FLAME and
-            0 in the authors' release.
+        eps: value added to the diagonals of the covariance matrices before inversion: 5e-4 in FLAME
+            and 0 in the authors' release.
 
     Example:
         >>> metric, text = MutualInformationDivergence(), torch.randn(64, 2)

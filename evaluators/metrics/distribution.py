@@ -170,7 +170,7 @@ class PrecisionRecall(TwoSets):
     is the fraction of real motions in the manifold of the generated motions; see
     `manifold_coverage`. Higher is better. Distances between neighbors shrink as the number of
     samples grows, so both sets are truncated to the size of the smaller set, in the order of the
-    keys. The authors' code truncates them in the order of the files.
+    keys. The authors' code truncates the sets in the order of the files.
 
     `update` takes `generated` (B, E) with `keys` (B,), and `real` (R, E) with `real_keys` (R,).
 

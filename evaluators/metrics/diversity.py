@@ -158,9 +158,8 @@ class ActionMultimodality(SampleMetric):
     """Multimodality as in Guo et al. 2020 (MDM, eq. 7): mean distance between 20 random pairs per class.
 
     As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors
-    divide the sum by the total number of classes, whereas this implementation divides it by the
-    number of classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys`
-    (B,).
+    divide the sum by the total number of classes. This implementation divides it by the number of
+    classes with motions. `update` takes `generated` (B, E), `labels` (B,) and `keys` (B,).
 
     Args:
         pairs: number of pairs per class.

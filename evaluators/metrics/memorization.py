@@ -104,8 +104,8 @@ class NearestTraining(SampleMetric):
 
     This metric was introduced in this project. A motion counts as a copy if its joints are
     unusually close to a training motion: closer than the joints of 99 % of the held-out real
-    motions (all but the share `CLOSE`). By this definition, about 1 % of real motions are copies, whereas
-    all motions are copies if a model repeats the training set.
+    motions (all but the share `CLOSE`). By this definition, about 1 % of real motions are copies.
+    If a model repeats the training set, all of its motions are copies.
 
     The values `joints`, in meters, and `features` are the medians of the distances. `copies` is
     the share of copies, in [0, 1]. `update` takes `nearest` (B, 1 or 2) and `real_nearest` (B, 1 or

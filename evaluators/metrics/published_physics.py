@@ -47,7 +47,10 @@ class PublishedPhysics(Timed, JointMean):
         self.feet = list(feet)
 
     def value(self, sums: Tensor, counts: Tensor) -> dict[str, float | None]:
-        """Returns the means, keyed by name. Raises `UserError` if they are undefined at the frame rate."""
+        """Returns the means, keyed by name.
+
+        Raises `UserError` if the means are undefined at the frame rate of the motions.
+        """
         if not self.defined:
             raise self.error(
                 f"only defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}"
@@ -74,8 +77,8 @@ class MBenchQuality(PublishedPhysics):
       mean for positions relative to the root.
     - `dynamic_degree`: mean norm of the first difference of the joint positions, plus the same mean
       for relative positions. A higher value means more motion.
-    - `ground_penetration`: mean depth of the toes that are deeper than 5 mm below the floor, or 0
-      if there are none.
+    - `ground_penetration`: mean depth of the toes that are more than 5 mm below the floor, or 0 if
+      there are no such toes.
     - `foot_sliding`: mean horizontal distance that a toe in contact moves per frame.
     - `foot_floating`: number of frames in which the body moves without the support of a foot,
       divided by the total number of frames. The value can exceed 1.
@@ -188,8 +191,8 @@ class KimodoQuality(PublishedPhysics):
     """Foot skating of Kimodo (7330e7e), in m/s, from joints and from predicted contacts.
 
     - `skate_from_height`: mean speed of toes at heights below 5 cm.
-    - `skate_ratio`: fraction of the toes' frame-to-frame movements that are faster than 0.2 m/s,
-      among movements that begin and end at heights below 5 cm.
+    - `skate_ratio`: among the toes' frame-to-frame movements that begin and end at heights below
+      5 cm, the fraction that is faster than 0.2 m/s.
     - `low`: mean fraction of the toes' movements that begin at a height below 5 cm. If this
       fraction is 0, the first two values are also 0.
     - `skate_from_contacts`, `skate_max`: mean and maximum speeds of heels and toes in contact.

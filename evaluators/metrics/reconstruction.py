@@ -324,7 +324,7 @@ class DisplacementErrors(EditErrors):
                 was generated.
 
         Raises:
-            UserError: If a motion contains NaN or infinity, or has no generated frame.
+            UserError: If a motion contains NaN or infinity, or has no generated frames.
         """
         self.compare(joints, mask, real_joints, real_mask, keys, kept)
 

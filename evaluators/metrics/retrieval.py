@@ -93,7 +93,7 @@ def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
 class CaptionMetric(SampleMetric):
     """Base class for metrics that allow several motions with the same caption.
 
-    Captions are the same if they differ only in case, punctuation and spaces or, with an
+    Captions count as the same if they differ only in case, punctuation and spaces or, with an
     `encoder`, if the cosine of their embeddings exceeds `SAME`.
 
     Args:

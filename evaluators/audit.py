@@ -270,7 +270,10 @@ class _Measure:
 
     @property
     def judges(self) -> dict[str, int]:
-        """Values that rate pairs by their features, mapped to 1, or to -1 if lower is better."""
+        """Values that rate motion-text pairs by their features.
+
+        The names of the values are mapped to 1, or to -1 if lower is better.
+        """
         names = {}
         for name, metric in self.metrics.items():
             if "text" in required_inputs(metric):

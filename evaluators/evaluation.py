@@ -218,7 +218,7 @@ class Evaluation:
         return self.evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Returns a line for each value that is not the value expected for real test motions."""
+        """Returns a line for each unexpected value of the real test motions."""
         if not values or self.protocol.resized_samples or self.protocol.cuts_motions:
             return []
         lines = []

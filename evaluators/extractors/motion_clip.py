@@ -128,7 +128,7 @@ def info_nce(
         logit_scale: scalar tensor, logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
-        wrong_text: (B, K, E) features of K wrong texts for each motion, which are negatives for
+        wrong_text: (B, K, E) features of K wrong texts for each motion. The texts are negatives for
             this motion only.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)

@@ -130,7 +130,7 @@ class LearnedWords(nn.Module):
 
 
 class T2MEvaluator(nn.Module):
-    """Embeds motions and captions in a joint space, for the metrics of HumanML3D and KIT.
+    """Embeds motions and captions in a joint space to compute the metrics of HumanML3D and KIT.
 
     The metrics are R-precision, MM-Dist, FID and diversity. Features are in the data's units and
     are normalized with the `mean` and `std` (D,) of the released weights. After normalization,

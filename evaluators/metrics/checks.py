@@ -79,7 +79,7 @@ class View:
         return ((joints - origin)[..., [0, 2]] * self.left[:, None]).sum(-1)
 
     def path(self) -> np.ndarray:
-        """Returns how far the pelvis is to the left and in front of its starting point, as (F, 2).
+        """Returns the pelvis's distances (F, 2) from its starting point, to the left and forward.
 
         The directions are relative to the heading in the first frame.
         """

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Near misses: captions in a data set that are wrong for a clip in exactly one attribute."""
+"""Finds near misses in a data set: captions that are wrong for a clip in exactly one attribute."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
     A caption of another clip is a near miss if both clips show the same action but differ in
     exactly one of the attributes (side, style, count, ...) that they both have. For example,
-    "walks backward" is a near miss of a slow walk forward.
+    "walks backward" is a near miss for a clip of a slow forward walk.
     """
     stated = [_stated(clip) for clip in clips]
     captions: dict[_Stated, set[str]] = {}
@@ -32,7 +32,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip, with placeholders in the action.
+    """Returns the attributes of a clip. Their values in the action are replaced with placeholders.
 
     For example, "wave-left-hand" becomes "wave-{side}-hand".
     """

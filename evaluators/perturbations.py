@@ -2,8 +2,8 @@
 """Graded perturbations of real motions for audits: changes that a metric should detect or ignore.
 
 Each function takes joint positions (F, J, 3) in meters, y up, and keeps the number of frames unless
-its docstring states otherwise. All random draws come from a generator that is passed as an
-argument, so that the grades of a perturbation share their draws.
+its docstring states otherwise. Random draws come from a generator that is passed as an argument, so
+that all grades of a perturbation can use the same draws.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
 
 
 def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Joints:
-    """Moves each joint back and forth in a random direction, as a 1 Hz sine with the given amplitude."""
+    """Moves each joint back and forth in a random direction.
+
+    The movement is a 1 Hz sine with the given amplitude.
+    """
     along = draws.standard_normal(joints.shape[1:])
     phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
     sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
@@ -62,7 +65,7 @@ def lift(joints: Joints, centimeters: float) -> Joints:
 
 
 def resize(joints: Joints, percent: float) -> Joints:
-    """Lengthens all bones by a percentage, without changing the floor or the root's path on it."""
+    """Lengthens all bones by a percentage, but keeps the floor and the root's path on it."""
     ground = joints[:, :1] * GROUND
     return ground + (1 + percent / 100) * (joints - ground)
 
@@ -77,7 +80,7 @@ def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False)
 
 
 def draw_in(joints: Joints, centimeters: float) -> Joints:
-    """Moves the wrists toward the axis of the trunk, but not past it, and the elbows half as far."""
+    """Moves the wrists toward (but not past) the axis of the trunk, and the elbows half as far."""
     names = next(
         skeleton.joints for skeleton in SKELETONS.values() if len(skeleton) == joints.shape[1]
     )
@@ -96,7 +99,7 @@ def draw_in(joints: Joints, centimeters: float) -> Joints:
 def freeze(joints: Joints, percent: float) -> Joints:
     """Freezes a motion by holding one of its frames until the end.
 
-    `percent` is the share of the duration over which the frame is held.
+    `percent` is the share of the duration for which the frame is held.
     """
     moving = max(1, round(len(joints) * (1 - percent / 100)))
     return joints[np.minimum(np.arange(len(joints)), moving - 1)]
@@ -113,7 +116,7 @@ def play(joints: Joints, factor: float, fps: float) -> Joints:
 def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
     """Resamples a motion linearly to another frame rate and back.
 
-    Frames after the last resampled frame are copies of it.
+    If the resampled motion is shorter than the original, its last frame is repeated.
     """
     back = resample(resample(joints, fps, rate), rate, fps)
     return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
@@ -149,7 +152,8 @@ def drop_repetition(joints: Joints, count: int) -> Joints:
 def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
     """Replaces the second half with the second half of another motion.
 
-    It starts at the position where the first half ends. Poses are blended over `BLEND` seconds.
+    The new half starts at the position where the first half ends. Poses are blended over `BLEND`
+    seconds.
     """
     half = len(joints) // 2
     rest = other[len(other) // 2 :]
@@ -175,7 +179,7 @@ Motions = Callable[[], list[np.ndarray]]
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A perturbation of a set of motions, and its grades."""
+    """A graded perturbation of a set of motions."""
 
     name: str
     group: str  # kind of perturbation: joints, meaning, set or plumbing
@@ -186,20 +190,23 @@ class Perturbation:
     grades: Sequence[float] = (1,)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation (or one per kind) with all possible grades.
+        """Returns this perturbation, or one per kind of error, with the grades that are possible.
 
         Returns [] if no grade is possible.
         """
         return [self]
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns the sets of motions from which `apply` takes motions, keyed by name."""
+        """Returns functions that compute the sets of motions for `apply`, keyed by name."""
         return {}
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions and texts at a grade. Pair i replaces real motion i and texts[i]."""
+        """Returns the motions and texts for a grade.
+
+        The i-th motion and text replace real motion i and texts[i].
+        """
         raise NotImplementedError
 
     def order(self, scene: Scene) -> np.ndarray:
@@ -216,9 +223,9 @@ class ChangedJoints(Perturbation):
 
     Attributes:
         change: function of joints (F, J, 3), the grade, and the options in `takes`.
-        takes: names of the options of `change`: "draws" (a generator) and "fps" (frames per
-            second).
-        sign: 1 or -1, by which the grade is multiplied.
+        takes: names of the options that `change` accepts: "draws" (a generator) and "fps" (frames
+            per second).
+        sign: factor by which the grade is multiplied, 1 or -1.
     """
 
     change: Callable[..., Joints] = lambda joints, grade: joints
@@ -226,7 +233,7 @@ class ChangedJoints(Perturbation):
     sign: int = 1
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns the changed motions of each grade, keyed by name."""
+        """Returns the changed motions for each grade, keyed by the name of the set."""
         return {self._set(grade): partial(self._motions, scene, grade) for grade in self.grades}
 
     def _set(self, grade: float) -> str:
@@ -246,7 +253,7 @@ class ChangedJoints(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the changed motions of a grade, with the same texts."""
+        """Returns the changed motions for a grade, and the unchanged texts."""
         return sets[self._set(grade)], texts
 
 
@@ -257,19 +264,19 @@ class ChangedSet(Perturbation):
     make: Callable[[Scene], list[np.ndarray]] = lambda scene: scene.features
 
     def motions(self, scene: Scene) -> dict[str, Motions]:
-        """Returns the new motions, keyed by name."""
+        """Returns the new motions, keyed by the name of the perturbation."""
         return {self.name: partial(self.make, scene)}
 
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the new motions, with the same texts."""
+        """Returns the new motions, and the unchanged texts."""
         return sets[self.name], texts
 
 
 @dataclass(frozen=True)
 class ReplacedShare(ChangedSet):
-    """Replaces a share of the motions, in percent."""
+    """Replaces a percentage of the motions."""
 
     unit: str = "% of motions"
     grades: Sequence[float] = SHARES
@@ -277,7 +284,7 @@ class ReplacedShare(ChangedSet):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the motions after replacing this share (in percent), with the same texts."""
+        """Returns the motions with this share (in percent) replaced, and the unchanged texts."""
         count = round(len(scene) * grade / 100)
         replaced = np.isin(np.arange(len(scene)), self.order(scene)[:count])
         base, other = sets[BASE], sets[self.name]
@@ -296,16 +303,16 @@ class DroppedRepetition(ReplacedShare):
 
 @dataclass(frozen=True)
 class ReplacedCaptions(Perturbation):
-    """Replaces a share of the captions, in percent, with wrong captions.
+    """Replaces a percentage of the captions with wrong captions.
 
-    `name` is the kind of wrong captions in `Scene.wrong`.
+    `name` is the kind of wrong caption, a key of `Scene.wrong`.
     """
 
     unit: str = "% of captions"
     grades: Sequence[float] = (1, 2, 5, 10, 20, 50, 100)
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns a perturbation for each kind of wrong captions.
+        """Returns a perturbation for each kind of wrong caption.
 
         At the largest grade, every caption for which there is a wrong caption of this kind is
         replaced.
@@ -321,7 +328,7 @@ class ReplacedCaptions(Perturbation):
     def apply(
         self, scene: Scene, grade: float, sets: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, Sequence[Text]]:
-        """Returns the same motions, and texts after replacing this share of them (in percent)."""
+        """Returns the unchanged motions, and the texts with this share (in percent) replaced."""
         wrong, replaced = scene.wrong[self.name], list(texts)
         for i in [i for i in self.order(scene) if wrong[i]][: round(len(scene) * grade / 100)]:
             replaced[i] = wrong[i] or texts[i]
@@ -330,9 +337,10 @@ class ReplacedCaptions(Perturbation):
 
 @dataclass(frozen=True)
 class DroppedActions(Perturbation):
-    """Drops a share of the actions, in percent.
+    """Drops a percentage of the actions.
 
-    Motions of these actions are replaced by repeating the remaining motions and their texts.
+    Motions that show these actions are replaced with copies of the remaining motions and their
+    texts.
     """
 
     unit: str = "% of actions"
@@ -362,7 +370,7 @@ class FewerMotions(Perturbation):
     unit: str = "motions"
 
     def offered(self, scene: Scene, captioned: bool) -> Sequence[Perturbation]:
-        """Returns the perturbation with the grades below the number of motions."""
+        """Returns the perturbation with the grades that are smaller than the number of motions."""
         grades = [grade for grade in self.grades if grade < len(scene)]
         return [replace(self, grades=grades)] if grades else []
 
@@ -374,7 +382,7 @@ class FewerMotions(Perturbation):
 
 
 def base_motions(scene: Scene) -> list[np.ndarray]:
-    """Returns the real motions after decoding and encoding them like perturbed motions."""
+    """Returns the real motions, decoded and encoded in the same way as perturbed motions."""
     return encode(scene.representation, scene.joints)
 
 
@@ -439,7 +447,7 @@ def _through(other: HumanML, scene: Scene) -> list[np.ndarray]:
 
 
 def through_others(representation: HumanML) -> list[Perturbation]:
-    """Returns a perturbation for each other representation with this skeleton and frame rate."""
+    """Returns a perturbation for every other representation with this skeleton and frame rate."""
     files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
     others: list[HumanML] = [instantiate(read_package_yaml(path)) for path in files]
     about, skeleton, fps = (
@@ -457,7 +465,7 @@ def through_others(representation: HumanML) -> list[Perturbation]:
 def perturbations_of(scene: Scene, captioned: bool) -> list[Perturbation]:
     """Returns all perturbations that the motions and captions allow.
 
-    Near misses are also listed by attribute.
+    Near misses are also included separately for each attribute.
     """
     listed = [*PERTURBATIONS, *through_others(scene.representation)]
     return [
@@ -501,7 +509,7 @@ PERTURBATIONS: list[Perturbation] = [
     ChangedJoints("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), crop),
 ]
 # fmt: on
-"""All perturbations except those that depend on the data.
+"""All perturbations that do not depend on the data.
 
-These are near misses by attribute, and other representations.
+Near misses by attribute and other representations depend on the data.
 """

@@ -37,7 +37,7 @@ class Plan:
         clips, representation: the evaluated split of `data`, and the representation on its
             device.
         skeleton: source of the bone lengths if joints are computed from SMPL's rotations.
-            None = the data has joint positions.
+            None = the data contains joint positions.
         protocol, changed: the protocol with the requested numbers of motions and replications, and
             the options that were changed.
         path: path of the result file.
@@ -102,8 +102,8 @@ class Plan:
         """Returns the folder for motions generated from a checkpoint with these options.
 
         The folder is in the checkpoint's run directory or, if there is none, next to the
-        checkpoint. Motions of models in this package or on the hub go to runs/NAME in the working
-        directory.
+        checkpoint. Motions from models in this package or on the hub are stored under runs/NAME in
+        the working directory.
         """
         if not Path(str(request.ckpt)).exists():
             run = Path("runs") / str(request.ckpt)
@@ -122,7 +122,7 @@ class Plan:
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
-    """Returns the prepared data with the representation of its store.
+    """Returns the prepared data, in the representation in which it is stored.
 
     Raises `UserError` if no data set is specified, if the data set is not prepared, or if the model
     generates a different representation.
@@ -151,7 +151,7 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
 
 
 def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton | None:
-    """Sets the bones of a representation of SMPL's rotations, using SMPL's model file.
+    """Sets the bones of a representation with SMPL's rotations to the bones in SMPL's model file.
 
     Without this file, the stand-in bones are kept.
     """

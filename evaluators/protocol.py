@@ -66,7 +66,7 @@ class DrawnClip:
         }
 
     def tokens(self, caption: str) -> list[str] | None:
-        """Returns the "word/PART" tokens of a caption of the clip, if the data has tokens."""
+        """Returns the "word/PART" tokens of one of the clip's captions, or None without tokens."""
         tagged = self.clip.attributes.get("tokens")
         return (
             tagged[self.clip.captions.index(caption)]
@@ -159,7 +159,7 @@ class Protocol(ClosedSchema):
     ) -> tuple[Protocol, dict[str, Any]]:
         """Returns the protocol with different numbers of motions, and the options that changed.
 
-        `clips` is the number of clips in the split. A quick evaluation has few motions and
+        `clips` is the number of clips in the split. A quick evaluation uses few motions and
         replications. `batch_size` affects only protocols that measure time.
         """
         defaults = (
@@ -196,8 +196,8 @@ class Protocol(ClosedSchema):
         """Opens the extractor at `path`. If `path` is None, the protocol's extractor is opened.
 
         Returns None if the protocol needs no extractor, or if `path` is "none". Raises `UserError`
-        or `FileNotFoundError` if the extractor is missing, or if it is for a different
-        representation or data set.
+        or `FileNotFoundError` if the extractor is missing, or if it does not match the
+        representation or the data set.
         """
         if self.extractor is None or path == "none":
             return None
@@ -215,7 +215,7 @@ class Protocol(ClosedSchema):
 
     @property
     def cuts_motions(self) -> bool:
-        """Whether the context frames that the model receives are cut off before measuring."""
+        """Whether the model's context frames are cut off before motions are measured."""
         return self.context_frames > 0 and self.context == "drawn"
 
     @property
@@ -235,7 +235,7 @@ class Protocol(ClosedSchema):
         """Returns the motions of one replication.
 
         Clips, captions and crops are drawn separately for each `purpose`. Raises `UserError` if the
-        split has no suitable clip.
+        split contains no suitable clip.
         """
         drawn = () if purpose == "generated" else (purpose,)
         entries = sorted(
@@ -272,9 +272,9 @@ class Protocol(ClosedSchema):
         return rows
 
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
-        """Returns the motions for one replication of multimodality.
+        """Returns the motions for one replication of the multimodality evaluation.
 
-        Several motions are generated for each of the first prompts.
+        Several motions are generated for each of the first `Multimodality.prompts` prompts.
         """
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]
@@ -300,7 +300,7 @@ class Protocol(ClosedSchema):
         """Checks that the clips and the model fit the protocol.
 
         Raises `UserError` if there are no clips, if a caption or label is missing, or if the model
-        has a different condition.
+        uses a different condition.
         """
         rows, condition, fault = self.rows(clips, 0, 0), self.condition, ""
         drawn = {
@@ -361,8 +361,8 @@ def _protocols(path: Path) -> dict[str, Config]:
 def load_protocol(name: str, representation: Representation) -> Protocol:
     """Loads a protocol (see `protocol_config`) for motions of a representation.
 
-    The file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
-    ${representation.parents}.
+    The file may use the placeholders ${representation.fps}, ${representation.feet},
+    ${representation.toes} and ${representation.parents}.
     """
     skeleton = representation.skeleton
     feet, parents = list(skeleton.feet), list(skeleton.parents)
@@ -398,7 +398,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
 
 
 def _value_names(metrics: Mapping[str, SampleMetric]) -> list[str]:
-    """Returns the names of all values of the metrics: `metric` or `metric/part`."""
+    """Returns the names of all values that the metrics compute: `metric` or `metric/part`."""
     parts = [(name, part) for name, metric in metrics.items() for part in metric.names or [""]]
     return [f"{name}/{part}" if part else name for name, part in parts]
 

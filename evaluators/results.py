@@ -47,7 +47,7 @@ class Scores:
 class Outcome:
     """Scores of one part of an evaluation.
 
-    The parts are real motions, generated motions, and several motions per prompt.
+    The parts evaluate real motions, generated motions, and several generated motions per prompt.
     """
 
     # Scores by replication
@@ -156,7 +156,7 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
 
 
 def _extractor_path(request: EvaluationRequest, plan: Plan) -> str:
-    """Returns the extractor named in the request or, if there is none, the path in the protocol."""
+    """Returns the extractor's path from the request or, if none is set there, from the protocol."""
     return request.extractor or str((plan.protocol.extractor or {}).get("path", ""))
 
 
@@ -188,9 +188,9 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
 
 
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
-    """Returns the reasons why the values are not valid.
+    """Returns the reasons why the values are invalid.
 
-    They are not valid if evaluated clips may be in the training data of the model or of the
+    Values are invalid if evaluated clips may be in the training data of the model or of the
     extractor.
     """
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
@@ -207,7 +207,7 @@ def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
 
 
 def show(result: Result, path: Path) -> None:
-    """Prints the values, intervals and warnings of a result, and the path of its file."""
+    """Prints a result's values, intervals and warnings, and the path of its file."""
     protocol, data, values = result.protocol, result.data, result.values or {}
     mark = " QUICK RUN, NOT FOR PUBLICATION" if result.quick else ""
     say(f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{mark}")
@@ -252,7 +252,7 @@ def show(result: Result, path: Path) -> None:
 
 
 def _intervals(values: Mapping[str, Value | None]) -> str:
-    """Returns an explanation of the intervals for the end of a line, or "" if there are none."""
+    """Returns an explanation of the intervals to append to a line, or "" without intervals."""
     shown = [value for value in values.values() if value and value.half is not None]
     if not shown:
         return ""
@@ -264,7 +264,7 @@ def _intervals(values: Mapping[str, Value | None]) -> str:
 def _cell(value: Value | None, usual: str) -> str:
     """Formats a value, followed by its interval if it has one.
 
-    The numbers of motions are added if they differ from the numbers for most values.
+    The numbers of motions are appended if they differ from `usual`, the numbers for most values.
     """
     if value is None or value.mean is None:
         return "-"

@@ -28,7 +28,7 @@ class Text(NamedTuple):
 
 
 def text_of(row: DrawnClip, caption: str) -> Text:
-    """Returns a caption of a drawn clip, with its tagged words and attributes."""
+    """Returns a caption of a drawn clip, with its tagged words and the requested attributes."""
     return Text(caption, row.tokens(caption), row.requested)
 
 
@@ -63,12 +63,12 @@ class Scene:
         return [row.clip.action or 0 for row in self.rows]
 
     def draws(self, *parts: str | int) -> np.random.Generator:
-        """Returns a random generator whose state is a function of the seed and the parts."""
+        """Returns a random generator whose state depends only on the seed and the parts."""
         return np.random.default_rng(key("audit", self.seed, *parts))
 
     @cached_property
     def wrong(self) -> dict[str, list[Text | None]]:
-        """For each kind of error, a wrong text per motion, or None for motions without one.
+        """Wrong texts, keyed by kind of error: one per motion, or None if the motion has none.
 
         The kinds are `RANDOM` and `NEAR`. If there are near misses in several attributes, there is
         also a kind "near misses: ATTRIBUTE" for each of these attributes.

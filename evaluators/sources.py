@@ -53,7 +53,7 @@ class Source(Interface):
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions for the rows on every rank.
 
-        `name` states the replication and the purpose.
+        `name` identifies the replication and the purpose.
         """
         ...
 
@@ -196,9 +196,9 @@ class Generator:
         return self.model.representation.normalize(features)
 
     def _edit(self, rows: Sequence[DrawnClip], parts: Mapping[str, Any]) -> Edit:
-        """Returns the edit: the real motions for the rows, and the parts of them to keep.
+        """Returns an edit with the real motions for the rows and the parts of the motions to keep.
 
-        The padding is also kept, as zeros.
+        The padding is also marked as kept, so that it remains zero.
         """
         representation, longest = self.model.representation, max(len(row.frames) for row in rows)
         real, keep = [], []
@@ -219,8 +219,8 @@ class SampleFolder:
     - `lengths` (N,): numbers of frames.
     - `features` (sum of lengths, D) in the data's units, or `joints` (sum of lengths, J, 3) in
       meters, y up, at the data's frame rate.
-    - `captions` (N,): required only if the motions were generated for captions other than those
-      that the protocol draws.
+    - `captions` (N,): required only if the motions were generated for captions other than the
+      captions that the protocol draws.
 
     Raises `UserError` if the folder contains no such files, or if a file is damaged, lists a clip
     that is not in the split, or lists a clip twice.
@@ -237,7 +237,7 @@ class SampleFolder:
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions for the rows from one file.
 
-        Raises `UserError` if the file lists other clips.
+        Raises `UserError` if the file lists clips that do not occur in the rows.
         """
         path = self.files[replication]
         content = read_samples(path)
@@ -280,8 +280,8 @@ class Baseline:
 
     - "real": other windows of the same clips.
     - "shuffled": motions of clips with other captions or labels.
-    - "noisy": motions with Gaussian noise; `NOISE` is its standard deviation in normalized
-      features.
+    - "noisy": motions with added Gaussian noise, whose standard deviation in normalized features is
+      `NOISE`.
     - "static": motions in which the first frame is held until the end.
 
     Raises `UserError` if the kind is unknown, or if there are no captions or labels to shuffle.
@@ -305,7 +305,7 @@ class Baseline:
         return Samples(rows, self.make(rows, replication))
 
     def _real(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
-        """Returns a random window of each row's clip, as long as the motion of the row."""
+        """Returns, for each row, a random window of its clip, as long as the row's motion."""
         moved = []
         for row in rows:
             generator = np.random.default_rng(key("baseline", self.seed, replication, row.id))
@@ -319,10 +319,10 @@ class Baseline:
         return real_motions(self.clips, moved)
 
     def _shuffled(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
-        """Gives each row the motion of a row with a different caption or label.
+        """Gives each row the motion of another row with a different caption or label.
 
-        The rows are grouped by caption or label, with the groups in random order, and rotated by
-        the size of the largest group.
+        The rows are grouped by caption or label, the groups are put in random order, and the
+        motions are rotated by the size of the largest group.
         """
         names = [row.text if self.condition == "text" else str(row.clip.action) for row in rows]
         turn = {name: key("shuffle", self.seed, replication, name) for name in names}

@@ -73,8 +73,8 @@ class Condition:
         tokens: (B, S, C), one vector per word piece, or S = 0 if the encoder returns no tokens.
         token_mask: (B, S) bool, True = real token. If the null condition has no mask (None),
             samples that receive the null condition keep their own masks.
-        null: the null condition ("no condition"), with batch size 1, or None if the encoder has
-            none.
+        null: the null condition ("no condition"), with batch size 1, or None if the encoder has no
+            null condition.
         prefix: (B, P, D), normalized features of the P clean frames before the motion, or None if
             no frames precede it.
         target: (B, 8, 4), where the motion should end (see `flame_mdm.conditions.target`), or None
@@ -138,7 +138,7 @@ class Condition:
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
 
     def select(self, rows: Tensor) -> Condition:
-        """Returns the conditions of the samples with the indices `rows`, (N,) int64."""
+        """Returns the conditions of the samples at the indices `rows`, (N,) int64."""
 
         def selected(x: Tensor | None) -> Tensor | None:
             return None if x is None else x[rows]
@@ -190,8 +190,8 @@ class Edit:
             motion.
         resample: for "x_t", how many times each sampling step is repeated. Noise is added again
             before each repetition (RePaint, algorithm 1).
-        guide: for "x0", a guide toward a goal, which changes the clean estimate at each sampling
-            step before the kept features are imposed. None = no goal.
+        guide: for "x0", a guide that moves the clean estimate toward a goal at each sampling step,
+            before the kept features are imposed. None = no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`,
             noised to the level of the first of these steps (SDEdit). MDM's code sets the number of
             skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. If `strength`
@@ -280,7 +280,7 @@ def sent(x: Tensor, device: torch.device) -> Tensor:
 class Constant:
     """Constant numbers, stored as one tensor per device.
 
-    They are not registered as a module's buffer, so they do not change when a model is cast or is
+    They are not registered as buffers of a module, so they do not change when a model is cast or is
     built on the meta device.
 
     Example:

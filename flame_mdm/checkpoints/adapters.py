@@ -1,14 +1,14 @@
 """Adapters: small changes to a model's weights, learned from a few clips.
 
-A weight W of shape (out, in) in an attention or feed-forward layer becomes W + strength * up down,
-where `up` has shape (out, rank) and `down` has shape (rank, in) (Hu et al. 2021, arXiv:2106.09685).
-In a learned text encoder, a vector is added to the row of each new word. During training,
-`torch.nn.utils.parametrize` computes the changed weights. They therefore also affect code that
-reads a weight without calling its layer, such as cross-attention.
+In an attention or feed-forward layer, a weight W of shape (out, in) becomes
+W + strength * (up @ down), where `up` has shape (out, rank) and `down` has shape (rank, in)
+(Hu et al. 2021, arXiv:2106.09685). In a learned text encoder, a vector is added to the row of each
+new word. During training, `torch.nn.utils.parametrize` computes the changed weights. The changes
+therefore also affect code that reads a weight without calling its layer, such as cross-attention.
 
-All layers are trained, but a style keeps only the changes in the second half of the layers. Changes
-in the first half would bias the model toward the few actions in the clips, and it would no longer
-follow the requested action.
+All layers are trained, but an adapter for a style keeps only the changes in the second half of the
+layers. Changes in the first half would bias the model toward the few actions in the clips, and the
+model would no longer follow the requested action.
 
 An adapter file (.safetensors) stores the change to the weight NAME as NAME.up and NAME.down, or as
 NAME.vectors. Its metadata contains `About` as JSON.
@@ -55,7 +55,7 @@ Paths = str | Path | Sequence[str | Path]  # one file or several files
 class About(TypedDict):
     """Description of an adapter.
 
-    `rows` lists the rows that the adapter changes in the word table, one per word. `base` is the
+    `rows` lists the rows of the word table that the adapter changes, one per word. `base` is the
     hash of the base model's weights.
     """
 
@@ -96,7 +96,7 @@ def changed(
 
 
 def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
-    """Returns one of the two table rows of each word, preferably one that no vocabulary word uses."""
+    """Returns one of each word's two table rows, preferably one that no vocabulary word uses."""
     used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
     pairs = (hashed(word, encoder.buckets) for word in words)
     return [second if first in used and second not in used else first for first, second in pairs]
@@ -105,7 +105,7 @@ def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable
 def attach(model: MotionGenerator, about: About) -> None:
     """Freezes a model and attaches zero-initialized, trainable updates to its weights.
 
-    Raises `UserError` if the model's denoiser has no transformer.
+    Raises `UserError` if the model's denoiser contains no transformer layers.
     """
     model.requires_grad_(False)
     layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]
@@ -125,7 +125,7 @@ def attach(model: MotionGenerator, about: About) -> None:
 
 
 def copy_weights(model: MotionGenerator, base: str | Path) -> None:
-    """Copies the weights of a base model into a model, with or without attached changes.
+    """Copies the weights of a base model into a model, which may already have attached changes.
 
     `base` is a path or name, as in `find`.
     """
@@ -141,12 +141,12 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
 
 
 def copy_matching_weights(model: MotionGenerator, source: str | Path) -> tuple[int, int]:
-    """Copies those trained weights of another model that match in name and shape.
+    """Copies trained weights from another model if their names and shapes match.
 
     The statistics of the features are not copied, since they belong to the data.
 
     Args:
-        model: model that receives the weights. Its other weights are left unchanged.
+        model: model that receives the weights. Weights without a match are left unchanged.
         source: a path or name, as in `find`.
 
     Returns:

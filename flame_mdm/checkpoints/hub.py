@@ -35,7 +35,7 @@ OTHERS = "not overwritten because push did not write it. Choose another folder w
 
 
 def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes the model in a checkpoint as a single .safetensors file and returns its path.
+    """Writes the model in a checkpoint as a single .safetensors file and returns the file's path.
 
     Args:
         source: the model, as in `flame_mdm.load`.

@@ -94,7 +94,7 @@ def load(
 def load_task(
     path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any
 ) -> Trained:
-    """Loads the task of a .ckpt or .safetensors file in evaluation mode.
+    """Loads the task from a .ckpt or .safetensors file and puts it in evaluation mode.
 
     The model has averaged weights if its recipe averages weights.
 
@@ -147,9 +147,9 @@ def check_device(device: str | torch.device) -> None:
 def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     """Builds the model of a checkpoint and loads its weights.
 
-    This project's networks are built on the meta device, so that a recipe cannot take more memory
-    than the weights in the file. Other classes, which the user must trust, are built as in
-    training.
+    This project's networks are built on the meta device, so that a recipe cannot allocate more
+    memory than the weights in the file need. Other classes, which the user must trust, are built as
+    in training.
     """
     config, state = checkpoint["config"], checkpoint["state_dict"]
     parts: Config = {name: config[name] for name in PARTS if name in config}

@@ -1,8 +1,8 @@
 """File formats of models: training checkpoints (.ckpt) and model files (.safetensors).
 
 A model file contains the (averaged) weights, including the statistics of the features, but no code.
-Its metadata has two keys. `flame_mdm` contains the recipe, the metadata of the data set and the
-origin of the weights as JSON. `sha256` is the hash of this JSON text and the weights.
+Its metadata contains two keys. `flame_mdm` contains the recipe, the metadata of the data set and
+the origin of the weights as JSON. `sha256` is the hash of this JSON text and the weights.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class _Metadata(TypedDict):
 def checked(path: Path, content: Any) -> dict[str, Any]:
     """Returns the content of a checkpoint or model file after checking it.
 
-    The content must include a recipe of plain values, metadata and weights.
+    The content must include metadata, weights, and a recipe that consists of plain values.
     """
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
@@ -213,7 +213,7 @@ def write_model_file(
 ) -> Path:
     """Writes a model file atomically and returns its path.
 
-    `out` is the .safetensors file, or a folder in which `FILE` is written.
+    `out` is the .safetensors file, or a folder in which `FILE` is created.
     """
     from safetensors.torch import save
 

@@ -1,4 +1,7 @@
-"""Export to ONNX: graphs for onnxruntime, with the sampling loop, the skeleton and the vocabulary as JSON."""
+"""Exports models to ONNX graphs for onnxruntime.
+
+The sampling loop, the skeleton and the vocabulary are written as JSON.
+"""
 
 import json
 import logging
@@ -147,7 +150,7 @@ def description(model: MotionGenerator) -> dict[str, Any]:
 def root_units(representation: HumanML) -> list[list[float]]:
     """Returns the mean and standard deviation of each of the first three features.
 
-    These features are the turn of the root in radians, and its movements to the left and forward in
+    These features are the root's turn in radians, and its movements to the left and forward in
     meters.
     """
     scale = representation.mean.new_ones(3)
@@ -177,7 +180,10 @@ class Probe:
         self.records: list[tuple[Tensor, int, list[float]]] = []
 
     def unit(self, number: int) -> Tensor:
-        """Returns the unit vector (1, 1, 2 * calls + 1) of a noise draw or a clean estimate."""
+        """Returns the unit vector that represents a noise draw or a clean estimate.
+
+        The vector has shape (1, 1, 2 * calls + 1).
+        """
         return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
 
     def noise(self, draw: int) -> Tensor:
@@ -212,7 +218,7 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
 
     The denoiser is called at time t and returns y. The clean estimate is `x0 = p x + q y`. The next
     noisy motion is `a x + b x0 + c x0' + d noise`, where `x0'` is the clean estimate of the
-    previous call. Raises `UserError` for samplers that do not have this form.
+    previous call. Raises `UserError` for samplers whose loop does not have this form.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
@@ -262,8 +268,8 @@ def _plan(process: Process, options: SamplerOptions, variance: float) -> list[li
 class Graph(NamedTuple):
     """A module to export.
 
-    `examples` maps the names of the inputs to example inputs, and `dimensions` names their axes of
-    variable length.
+    `examples` maps the names of the inputs to example inputs, and `dimensions` names their
+    variable-length axes.
     """
 
     name: str
@@ -278,10 +284,10 @@ class Call(nn.Module):
 
     The condition encoder is included, but a learned variance is not.
 
-    Inputs are x_t (B, F, D), the time t (B,) in the denoiser's units, lengths (B,) int64, and the
-    condition. The condition is either actions (B,) int64, or rows of the word table (B, S, 2)
-    int64 and `counts` (B,), the number of tokens of each caption. `ContinuingCall` also reads the
-    frames before the motion.
+    Inputs are x_t (B, F, D), the time t (B,) as a row index into the denoiser's sinusoidal table,
+    lengths (B,) int64, and the condition. The condition is either actions (B,) int64, or a pair of
+    tensors: indices (B, S, 2) int64 of rows in the word table, and `counts` (B,), the number of
+    tokens in each caption. `ContinuingCall` also reads the frames before the motion.
     """
 
     def __init__(self, model: MotionGenerator):
@@ -373,7 +379,7 @@ class Function(nn.Module):
 def graphs(model: MotionGenerator) -> list[Graph]:
     """Returns the graphs of a model: the guided denoiser, and the decoders to joints and rotations.
 
-    There is a decoder to rotations only for SMPL's skeleton.
+    The decoder to rotations exists only for SMPL's skeleton.
     """
     representation = model.representation
     encoder = model.condition
@@ -486,7 +492,10 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
 
 
 def _shrink(path: Path, half: bool) -> None:
-    """Removes the descriptions of the nodes. With `half`, also stores matrices in half precision and adds casts."""
+    """Removes the descriptions of the nodes from a graph.
+
+    With `half`, also stores matrices in half precision and adds casts.
+    """
     import onnx
     from onnx import numpy_helper
 

@@ -77,8 +77,8 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
     """Extracts the network's state dict from the content of a released file.
 
     The content is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with
-    `--use_ema`) or FLAME's Lightning checkpoint with "state_dict". `ema` selects averaged weights
-    if the file contains them, as in the authors' evaluation.
+    `--use_ema`) or FLAME's Lightning checkpoint with "state_dict". If `ema` is True and the file
+    contains averaged weights, these are extracted, as in the authors' evaluation.
     """
     prefixes = ("ema_model.model.", "net.") if ema else ("net.",)
     if "model_avg" in checkpoint:
@@ -100,7 +100,7 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def layer_names(
     state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]
 ) -> tuple[dict[str, str], int]:
-    """Returns a mapping from torch's layer prefixes to the project's, and the number of layers."""
+    """Returns a mapping from torch's to this project's layer prefixes, and the number of layers."""
     count = sum(
         key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state
     )

@@ -4,9 +4,9 @@
 
 python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
 
-For the same caption, length and seed, the motion is identical to that from `flame_mdm.generate`,
-which also understands sentences that differ from the captions of the training data. A model that
-continues frames starts from a standing person.
+For the same caption, length and seed, `flame_mdm.generate` returns an identical motion. It also
+understands sentences that differ from the captions of the training data. A model that continues
+frames starts from a standing person.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def read_file(path: Path, most: int) -> bytes:
 
 
 def first_line(error: Exception) -> str:
-    """Returns the first line of an error's message, or the type of an error without a message."""
+    """Returns the first line of an error's message, or the error's type if it has no message."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 
@@ -295,13 +295,13 @@ class Sampler:
         """Returns the normalized features (F, D) of one motion, for a text or an action.
 
         For an unconditional model, the prompt is "". `sample` is the sample index, which
-        distinguishes several motions for the same prompt. `seconds` is 3 by default, or the model's
-        maximum if this is lower. For a model that continues frames, the maximum is 600 seconds.
-        Raises `ValueError` for an invalid length or an unknown action, or if the result contains
-        NaN or infinity.
+        distinguishes several motions for the same prompt. The default of `seconds` is 3 or the
+        model's maximum, whichever is lower. For a model that continues frames, the maximum is 600
+        seconds. Raises `ValueError` for an invalid length or an unknown action, or if the result
+        contains NaN or infinity.
 
-        `text` is the sentence that selects the noise, if it differs from the caption `prompt`:
-        `flame_mdm.generate` draws noise for the sentence exactly as the user typed it.
+        `flame_mdm.generate` draws noise for the sentence exactly as the user typed it. If this
+        sentence differs from the caption `prompt`, pass it as `text` to obtain the same noise.
         """
         content = self.content
         fps = content["fps"]
@@ -336,7 +336,10 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Samples frames together and returns their normalized features (F, D). `number` seeds the noise."""
+        """Samples `frames` frames and returns their normalized features (F, D).
+
+        `number` seeds the noise.
+        """
         content = self.content
         x, draw = normal(number, frames, content["features"]), 1
         before = np.zeros_like(x)
@@ -364,8 +367,8 @@ class Sampler:
         """Returns the rest-pose offsets and local rotations, which exist only for SMPL's 22 joints.
 
         The offsets (22, 3) are the positions of the joints relative to their parents in the rest
-        pose, in which the arms are stretched out to the sides. Quaternions (F, 22, 4) are (w, x, y,
-        z); the quaternion of the root is in world coordinates.
+        pose, in which the arms are stretched out to the sides. Quaternions (F, 22, 4) are in (w, x,
+        y, z) order; the quaternion of the root is in world coordinates.
         """
         if self.poses is None:
             raise ValueError("rotations are computed only for SMPL's 22 joints")
@@ -527,7 +530,7 @@ def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Writes one motion as .npz, with joint positions `joints` (F, J, 3) in meters, and `fps`."""
+    """Writes one motion as .npz: its joint positions `joints` (F, J, 3) in meters, and `fps`."""
     positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
     options = dict(word.split("=", 1) for word in arguments if word not in positional)
     if len(positional) != 3:

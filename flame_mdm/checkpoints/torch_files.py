@@ -57,8 +57,8 @@ def check_keys(path: Path) -> None:
     """Raises `UserError` if many keys in a file could have the same hash.
 
     With `torch.load(weights_only=True)`, loading a dictionary with such keys takes quadratic time:
-    hours for a file of one megabyte. Strings are safe because their hashes are randomized, and
-    small integers because their hashes are distinct. If the pickle names an object that PyTorch
+    hours for a file of one megabyte. Strings are safe because their hashes are randomized. Small
+    integers are safe because their hashes are distinct. If the pickle names an object that PyTorch
     refuses, the check stops there without an error, because PyTorch stops at the same place and
     names the object.
     """

@@ -313,7 +313,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     def load(self) -> LoadedModel:
         """Loads the model and the body.
 
-        Raises a `UserError` that lists examples if no condition is requested.
+        If no condition is requested, raises a `UserError` that lists examples.
         """
         file = find(self.ckpt, self.which)  # reports a missing file before PyTorch is imported
         import torch

@@ -54,7 +54,7 @@ class AuditSettings(DataSettings):
 
 
 def main(settings: AuditSettings) -> None:
-    """Audits an extractor or metrics, or renders existing cards, and writes the cards."""
+    """Writes cards: audits an extractor or metrics, or renders existing cards again."""
     out = Path(settings.out)
     if settings.cards is not None:
         if len(settings.cards) > 2:

@@ -181,7 +181,8 @@ def _sampled(
         prompts: the prompts, each with the length of its motion in seconds. Either all lengths are
             numbers, or all of them are None (the default length). Lengths above the model's maximum
             are reduced to it.
-        seed: seed of the noise. If a prompt is listed twice, its motions have different noise.
+        seed: seed of the noise. If a prompt is listed twice, its motions are sampled from different
+            noise.
     """
     import torch
 

@@ -204,7 +204,7 @@ def main(settings: SampleSettings) -> None:
 def _sample(settings: SampleSettings, request: SamplingRequest, prompts: PromptFile | None) -> None:
     """Samples the motions for a request and writes them.
 
-    If the model cannot sample a prompt in a prompt file, this prompt is refused.
+    Prompts in a prompt file that the model cannot sample are refused.
     """
     loaded = settings.load()  # a missing file is reported before PyTorch is imported
     character = settings.read_character()

@@ -148,7 +148,7 @@ def shows_multimodality(evaluation: Evaluation, values: Set[str]) -> bool:
 
 
 def outdated(path: Path, evaluation: Evaluation, values: Set[str] = frozenset()) -> bool:
-    """Returns whether a result is outdated, so that its evaluation must be repeated.
+    """Returns whether a result is outdated and its evaluation must be repeated.
 
     A result is outdated if its checkpoint, extractor or motion files have changed, if SMPL's model
     file has become available, or if it lacks metrics that require several motions per prompt.

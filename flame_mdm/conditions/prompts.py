@@ -22,8 +22,8 @@ class ReadPrompt:
             may describe several actions.
         changes: one line per difference between the prompt and the sampled motion.
         fitting: for each part, a duration in seconds that suits the number of repetitions, or None
-            if the part does not specify this number. The tuple is empty if the captions do not
-            describe single actions.
+            if the part does not specify a number of repetitions. The tuple is empty if the captions
+            do not describe single actions.
     """
 
     parts: Sequence[tuple[str, float | None]]
@@ -87,8 +87,8 @@ def _with_actions(
 ) -> ReadPrompt:
     """Reads a prompt for a model whose captions describe single actions.
 
-    The prompt keeps its parts unless it is split. If a part names several actions, its words are
-    passed to the model unchanged.
+    The prompt keeps its parts unless it is split into one part per action. If a part names several
+    actions, its words are passed to the model unchanged.
     """
     readings: list[Reading]
     if splits:

@@ -94,7 +94,7 @@ class TargetConditions:
         self.drop_prob, self.weight, self.heading_modulo_pi = drop_prob, weight, heading_modulo_pi
 
     def locations(self, joints: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Returns the values (B, 8, 3) of all slots in the last frames of motions.
+        """Returns the values (B, 8, 3) of all slots in the last frame of each motion.
 
         Args:
             joints: (B, F, J, 3), positions in meters.
@@ -115,7 +115,7 @@ class TargetConditions:
 
         Args:
             joints: (B, F, J, 3), positions in meters.
-            u: (B,) uniform numbers in [0, 1), which select one of the choices.
+            u: (B,) uniform numbers in [0, 1), each of which selects one of the choices.
             lengths: (B,) int64, number of real frames per motion. Default: F.
         """
         choices = self.choices.on(joints.device)

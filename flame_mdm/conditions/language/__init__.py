@@ -1,1 +1,1 @@
-"""Parsing of English prompts, independent of any model: actions, attributes and order."""
+"""Parses English prompts into actions, attributes and order, independently of any model."""

@@ -39,10 +39,10 @@ A caption that states the value contains one of these parts.
 class Abilities:
     """Actions and attributes that a model knows.
 
-    Each of the model's captions names one action from a list.
+    The model must use captions that each name one action from a list.
 
     Args:
-        facts: facts about the model: "actions", "vocabulary" and, if known, "captions".
+        facts: the model's "actions", "vocabulary" and, if known, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):

@@ -64,7 +64,7 @@ class Reader:
         return {name: value for name, value in self.attributes.items() if name in self.entry.takes}
 
     def _word(self, position: int) -> str:
-        """Returns the word at a position in the clause, or "" if the position is outside it."""
+        """Returns the word at a position in the clause, or "" if there is no such position."""
         return self.tokens[self.numbers[position]].word if 0 <= position < len(self.numbers) else ""
 
     def _state(self, name: str, value: Value, *numbers: int) -> None:
@@ -123,7 +123,10 @@ class Reader:
         self._state("direction", self._around(value), number)
 
     def _around(self, value: str) -> str:
-        """Returns a direction. In a circle, left is counterclockwise and right is clockwise."""
+        """Returns a direction, combined with the direction that the clause states earlier.
+
+        In a circle, left is counterclockwise and right is clockwise.
+        """
         earlier = str(self.attributes.get("direction", ""))
         turns = {"left": "counterclockwise", "right": "clockwise"}
         if earlier == "circle":

@@ -52,7 +52,7 @@ class Clause:
         numbers: indices of the tokens in the clause.
         link: when the action happens relative to the previous clause, or "" if the sentence does
             not say.
-        is_first: whether the clause is the first one of its sentence.
+        is_first: whether the clause is the first one in its sentence.
         after_comma: whether a comma precedes the clause.
         matches: phrases in the clause that name actions.
     """
@@ -121,7 +121,7 @@ def _connector(tokens: Sequence[Token], number: int) -> tuple[str, ...]:
 
 
 def joined(clauses: Sequence[Clause]) -> list[Clause]:
-    """Merges clauses so that each one has an action.
+    """Merges clauses so that each one contains an action.
 
     A clause without an action is merged with the previous clause or, if it is the first clause,
     with the next one. A clause such as "then faster" is not merged, because it repeats the previous

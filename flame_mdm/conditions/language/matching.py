@@ -1,4 +1,4 @@
-"""Phrases that name actions in a sentence."""
+"""Phrases in a sentence that name actions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ class Match:
     Attributes:
         phrase: the phrase.
         used: indices of the tokens that form the phrase, in increasing order.
-        is_weak: whether the phrase counts as an action only if the sentence has no other action, as
-            is the case for "go".
+        is_weak: whether the phrase, such as "go", counts as an action only if the sentence contains
+            no other action.
     """
 
     phrase: Phrase
@@ -40,7 +40,7 @@ class Match:
 
 
 def find_phrases(tokens: Sequence[Token]) -> list[Match]:
-    """Finds the phrases that name actions in a sentence.
+    """Finds the phrases in a sentence that name actions.
 
     If several phrases begin at a word, the longest one is used. Phrases do not overlap.
     """
@@ -72,7 +72,7 @@ def _longest_at(tokens: Sequence[Token], start: int) -> tuple[tuple[int, ...], P
 
 
 def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[int, ...] | None:
-    """Returns the indices of the tokens that match a phrase at `start`, or None."""
+    """Returns the indices of the tokens that match a phrase at `start`, or None if none do."""
     if not words:
         return ()
     if words[0] == GAP:

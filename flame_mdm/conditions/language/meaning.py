@@ -17,7 +17,7 @@ NEIGHBORS = 5  # number of nearest listed words that decide whether a word names
 
 
 def nearest_actions(word: str) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to a word, best first.
+    """Returns the actions with their similarities to a word, most similar first.
 
     The result is empty if the vector table does not contain the word.
     """
@@ -26,7 +26,7 @@ def nearest_actions(word: str) -> list[tuple[str, float]]:
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to the mean of several words, best first."""
+    """Returns the actions with their similarities to a mean of words, most similar first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 
@@ -56,7 +56,8 @@ def similar_word(word: str, words: Sequence[str]) -> str | None:
 def is_thing(word: str) -> bool:
     """Returns whether a word names a thing.
 
-    This is the case if most of the listed words that are closest in meaning name things.
+    A word counts as a thing if most of the listed words closest to it in meaning are words for
+    things.
     """
     vector = word_table().vector(word)
     if vector is None:

@@ -41,7 +41,7 @@ def _stems(word: str) -> Iterator[str]:
 
 @cache
 def inflections(verb: str) -> tuple[str, ...]:
-    """Returns the forms of a verb or noun: wave, waves, waving and waved for "wave"."""
+    """Returns the forms of a verb or noun, such as wave, waves, waving and waved for "wave"."""
     irregular = [form for form, bases in _irregular().items() if verb in bases]
     sibilant = verb.endswith(("s", "sh", "ch", "x", "z"))
     stem = verb[:-1] if verb.endswith("e") and not verb.endswith("ee") else verb

@@ -1,4 +1,4 @@
-"""Parsing of sentences: the requested actions, their order and their attributes."""
+"""Parses sentences into the requested actions, their order and their attributes."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -123,7 +123,7 @@ class _Sentence:
     def rest(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Returns the words for things, and the words that are not understood.
 
-        The latter are returned as the user typed them.
+        Words that are not understood are returned as the user typed them.
         """
         objects, unknown = [], []
         for number, token in enumerate(self.tokens):
@@ -143,7 +143,7 @@ class _Sentence:
     def _choose(self, clause: Clause) -> None:
         """Reduces the matches of a clause to the phrases that name its actions.
 
-        If there are none, a word that is similar in meaning to an action is used.
+        If there are no such phrases, a word that is similar in meaning to an action is used.
         """
         strong = [match for match in clause.matches if not match.is_weak]
         if strong:

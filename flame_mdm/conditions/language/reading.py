@@ -28,7 +28,7 @@ class Reading:
         captions: the caption that the model reads for each step.
         texts: the words of the sentence that describe each step.
         changes: one line per difference between the sentence and the sampled motion.
-        ignored: the words that have no effect, and descriptions of attributes that have no effect.
+        ignored: words and descriptions of attributes that have no effect on the motion.
     """
 
     understanding: Understanding
@@ -64,10 +64,10 @@ class Reading:
 class Reader:
     """Reads sentences for a model.
 
-    Each of the model's captions names one action from a list.
+    The model must use captions that each name one action from a list.
 
     Args:
-        facts: facts about the model: "actions", "vocabulary" and, if known, "captions".
+        facts: the model's "actions", "vocabulary" and, if known, "captions".
     """
 
     def __init__(self, facts: Mapping[str, Any]):
@@ -75,7 +75,7 @@ class Reader:
 
     @staticmethod
     def fits(facts: Mapping[str, Any]) -> bool:
-        """Returns whether a model's captions describe single actions, judging by its facts."""
+        """Returns whether a model's facts show that its captions describe single actions."""
         return (
             bool(facts.get("verbs"))
             and bool(facts.get("actions"))
@@ -119,7 +119,7 @@ class Reader:
         """Returns the actions of a sentence as captions.
 
         Raises:
-            NotUnderstood: If the model does not know one of the actions.
+            NotUnderstood: If there is an action that the model does not know.
         """
         notes = _Notes(
             [f"'{typed}' is read as '{word}'" for typed, word in understood.corrected.items()]
@@ -201,8 +201,8 @@ class Reader:
     def _possible(self, step: Step, notes: "_Notes") -> list[Step]:
         """Returns steps that the model can sample in place of the given step.
 
-        If the model does not know simultaneous actions, the actions are sampled one after the
-        other.
+        If none of the model's captions describes simultaneous actions, the actions are sampled one
+        after the other.
         """
         distinct = tuple({mention.action: mention for mention in step}.values())
         if len(distinct) == 1 or self.abilities.is_simultaneous:
@@ -214,7 +214,7 @@ class Reader:
         return [(mention,) for mention in distinct]
 
     def _repeated(self, step: Step, notes: "_Notes") -> list[Step]:
-        """Returns steps that add up to the count of the given step.
+        """Returns steps whose counts add up to the count of the given step.
 
         For example, "kicks four times" becomes two steps of "kicks twice".
         """
@@ -264,7 +264,7 @@ class _Notes:
 def _joined(steps: Sequence[Step], names: Sequence[str]) -> list[Step]:
     """Merges pairs of successive steps that the model knows as a single action.
 
-    An example is "stretches both arms and leans to the left".
+    For example, "stretches both arms and leans to the left" becomes one step.
     """
     pairs = {
         entry.joins: entry.name
@@ -297,7 +297,7 @@ def _caption(step: Step, words: str, special: Set[str]) -> str:
     """Returns the caption for a step.
 
     If one of the step's words is in the model's vocabulary but not in the tables, the caption
-    consists of the words themselves.
+    consists of the step's own words.
     """
     return words if special & set(words.lower().split()) else caption(step)
 

@@ -1,4 +1,4 @@
-"""Correction of typos (one or two letters) in words for motions, attributes and subjects."""
+"""Corrects typos of one or two letters in words for motions, attributes and subjects."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Splitting of sentences into words, correction of typos, and detection of other languages."""
+"""Splits sentences into words, corrects typos, and detects other languages."""
 
 import re
 import unicodedata
@@ -63,8 +63,8 @@ def is_foreign(tokens: Sequence[Token]) -> bool:
 
     A sentence is foreign if most of its letters are not Latin. It is also foreign if fewer than
     half of its words are English and, in addition, one of its words has an accent or is typical of
-    another language. `phrases.yaml` lists typical words. Words that also occur in English do not
-    count as typical of another language.
+    another language. `phrases.yaml` lists the words that are typical of other languages. Words that
+    also occur in English do not count as typical of another language.
     """
     words = [token.word for token in tokens if token.is_word]
     letters = [char for word in words for char in word if char.isalpha()]
@@ -101,7 +101,7 @@ def is_english(word: str) -> bool:
 def corrected(tokens: Sequence[Token]) -> list[Token]:
     """Returns the tokens with typos corrected.
 
-    An unknown word is a typo if it is similar to only a few known words.
+    An unknown word counts as a typo if it is similar to only a few known words.
     """
     return [
         _corrected(token) if token.is_word and not is_known(token.word) else token

@@ -41,8 +41,8 @@ class WordTable:
     def mean(self, words: Sequence[str]) -> np.ndarray | None:
         """Returns the mean vector (D,) of words, scaled to norm 1, or None if no word is listed.
 
-        Frequent words have less weight, as in smooth inverse frequency (Arora et al. 2017). Word
-        frequencies are estimated with Zipf's law.
+        Frequent words are given less weight, as in smooth inverse frequency (Arora et al. 2017).
+        Word frequencies are estimated with Zipf's law.
         """
         rows = [row for word in words if (row := self.rank(word)) is not None]
         if not rows:

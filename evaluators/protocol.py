@@ -157,7 +157,7 @@ class Protocol(ClosedSchema):
         quick: bool = False,
         multimodality: bool = True,
     ) -> tuple[Protocol, dict[str, Any]]:
-        """Returns the protocol with different numbers of motions, and the options that changed.
+        """Returns the protocol with the requested numbers of motions, and the options that changed.
 
         `clips` is the number of clips in the split. A quick evaluation uses few motions and
         replications. `batch_size` affects only protocols that measure time.

@@ -51,7 +51,7 @@ class Source(Interface):
     """A source of motions for the rows of a protocol."""
 
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
-        """Returns the motions for the rows on every rank.
+        """On every rank, returns the motions for the rows.
 
         `name` identifies the replication and the purpose.
         """

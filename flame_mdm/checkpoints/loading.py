@@ -64,12 +64,12 @@ def load(
             in this package, such as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path
             takes precedence.
         device: device of the weights, such as "cuda".
-        which: the checkpoint of a run directory, "last" or "best". For files, this argument has
-            no effect.
+        which: the checkpoint in a run directory, "last" or "best". For files, this argument has no
+            effect.
         adapter: one or several files that `flame_mdm.adapt` wrote for this model. Default: no
             adapter.
         strength: strength of all adapters, or one number per adapter. 0 = the model without the
-            adapter; 1 = the model as it was adapted.
+            adapter; 1 = the adapted model.
 
     Returns:
         The model, to be passed to `flame_mdm.generate`, `edit` or `stream`.

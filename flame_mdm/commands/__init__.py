@@ -86,7 +86,7 @@ def body_name(key: str, body: str) -> None:
 
 
 def device_name(key: str, device: str) -> None:
-    """Raises `UserError` if `device` is not a name such as cpu or cuda:1."""
+    """Raises `UserError` if `device` is not a device name such as cpu or cuda:1."""
     if not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
         near = did_you_mean(device, ["cpu", "cuda"])
         raise UserError(f"{key}={device}: unknown.{near} Use cpu, cuda or cuda:NUMBER")

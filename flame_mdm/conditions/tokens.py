@@ -28,11 +28,11 @@ class LearnedTokens(ConditionEncoder):
 
     The null condition is one learned vector.
 
-    The vector of a word is the sum of two rows of a table, which are selected by the hash of the
-    word; see `vocabulary.hashed`. A word that does not occur in the training captions would have a
-    random vector. It is therefore replaced by another form that does occur (such as "walks" for
-    "walked"), or dropped. Samples with the same caption share the same dropout, because each
-    caption is encoded once. Linear layers skip the padding.
+    A word's vector is the sum of two table rows, which are selected by the word's hash; see
+    `vocabulary.hashed`. Since a word that does not occur in the training captions would have a
+    random vector, it is replaced by another form that does occur (such as "walks" for "walked"), or
+    dropped. Each caption is encoded only once, so samples with the same caption share the same
+    dropout mask. Linear layers skip the padding.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector. Therefore,
     all parameters receive gradients, regardless of whether a denoiser reads the pooled vector or
@@ -42,7 +42,7 @@ class LearnedTokens(ConditionEncoder):
         features: C, the width of the tokens and of the pooled vector.
         buckets: number of rows in the word table.
         max_words: maximum number of words per caption. Any further words are dropped.
-        heads: number of attention heads, which must divide `features`.
+        heads: number of attention heads, a divisor of `features`.
         dropout: probability of dropout in the transformer layer.
         pretrain_steps: number of training steps in `pretrain`.
 
@@ -94,7 +94,7 @@ class LearnedTokens(ConditionEncoder):
         self._rows: dict[str, np.ndarray] = {}  # rows (T, 2) of the captions encoded so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
-        """Returns the two table rows for the start token and for each word of a caption."""
+        """Returns the indices of the two table rows for the start token and for each word."""
         words = vocabulary.words(caption)
         if self.seen:
             words = [form for word in words if (form := vocabulary.known_form(word, self.seen))]
@@ -103,10 +103,11 @@ class LearnedTokens(ConditionEncoder):
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains the encoder with a contrastive loss (Gao et al. 2021, "SimCSE", equation 1).
 
-        Pooled vectors are pulled together if their captions belong to the same clip, and are pushed
-        apart if the captions belong to different clips. Each training step compares two captions from each of
-        `PAIRS` clips. Without this training, a small model learns many words slowly, because it
-        learns them only from the motion loss. Clips that have only one caption are not used.
+        Pooled vectors are pulled together if their captions belong to the same clip, and pushed
+        apart if the captions belong to different clips. Each training step compares two captions
+        from each of `PAIRS` clips. Without this training, a small model learns many words slowly,
+        because it learns them only from the motion loss. Clips that have only one caption are not
+        used.
         """
         groups, device = (
             [captions for captions in groups if len(set(captions)) > 1],
@@ -163,9 +164,9 @@ class LearnedTokens(ConditionEncoder):
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def encode(self, words: Tensor, counts: Tensor) -> Condition:
-        """Encodes captions that are given as `rows` (B, S, 2) and lengths (B,); see `forward`.
+        """Like `forward`, but takes captions as padded `rows` (B, S, 2) with lengths (B,).
 
-        This method has no branches, so that it can be exported as a graph.
+        This method has no branches, so it can be exported as a graph.
         """
         token_mask = length_mask(counts, words.shape[1])
         index = torch.arange(token_mask.numel(), device=words.device)
@@ -178,7 +179,7 @@ class LearnedTokens(ConditionEncoder):
         Only attention processes the padding.
 
         Args:
-            rows: (T, 2), rows of the table for all real tokens.
+            rows: (T, 2), indices of the two table rows for each real token.
             index: (T,), positions of the tokens in the flattened `token_mask`.
             token_mask: (N, S) bool, True = real token.
         """

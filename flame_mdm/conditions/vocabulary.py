@@ -63,11 +63,11 @@ def words(text: str) -> list[str]:
 def hashed(word: str, buckets: int) -> tuple[int, int]:
     """Returns the indices of a word's two rows in a table of `buckets` vectors.
 
-    The vector of the word is the sum of both rows.
+    The word's vector is the sum of the two rows.
 
-    The indices are two parts of the word's hash (Svenstrup et al. 2017, "Hash
-    embeddings"). The model cannot distinguish two words if both parts are equal. The hash (CRC-32)
-    is the same on every machine.
+    The indices are two parts of the word's hash (Svenstrup et al. 2017, "Hash embeddings"). The
+    model cannot distinguish two words for which both parts are equal. The hash (CRC-32) is the same
+    on every machine.
     """
     # Two hashes of the word with different prefixes would not be enough: CRC is linear, so both
     # hashes would collide for the same pairs of words.
@@ -99,7 +99,7 @@ def vocabulary(
 
 
 def known_form(word: str, seen: Collection[str]) -> str | None:
-    """Returns `word` itself if it is known, or a known form with another ending (walked, walks).
+    """Returns `word` if it is known, or else a known form ("walks" for "walked").
 
     Returns None if no form is known.
     """
@@ -192,7 +192,8 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 def _meant(word: str, vocabulary: Collection[str]) -> str | None:
     """Returns the known word that an unknown word probably stands for, or None if there is none.
 
-    The unknown word is a typo of the known word, or has a similar meaning.
+    A word that is not English is treated as a typo of a known word. For an English word, a known
+    word with a similar meaning is chosen.
     """
     if not is_known(word):
         similar = [other for other in vocabulary if other[:1] == word[0]]
@@ -202,15 +203,15 @@ def _meant(word: str, vocabulary: Collection[str]) -> str | None:
 
 
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:
-    """Splits a sentence with several actions.
+    """Splits a sentence that describes several actions into parts.
 
     For example, "walks, turns left and waves. Then she sits" has four parts.
 
     Text is split at sentence boundaries and at "then". With `verbs`, it is also split at each comma
-    that is followed by a verb. After such a comma, an "and" before a verb also splits the text.
-    Otherwise, "and" does not split the text: "raises both hands and waves" is one action. A part
-    without a verb is joined with a neighboring part. A style at the end, such as "in limp style",
-    is added to all parts. Adapters teach such styles.
+    that is followed by a verb. If the text contains such a comma, it is also split at each "and"
+    that is followed by a verb. Otherwise, "and" does not split the text: "raises both hands and
+    waves" is one action. A part without a verb is joined with a neighboring part. A style at the
+    end, such as "in limp style", is added to all parts. Adapters teach such styles.
 
     Args:
         text: the sentence.
@@ -245,7 +246,7 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
 @cache
 def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[str]]:
-    """Returns patterns for a comma and for an "and", each followed by a verb."""
+    """Returns two patterns: a comma before a verb, and an "and" before a verb."""
     finite = (
         "|".join(re.escape(verb) for verb in sorted(verbs) if not verb.endswith("ing")) or "(?!)"
     )
@@ -256,7 +257,7 @@ def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[st
 
 
 def plainest(captions: Iterable[str]) -> list[str]:
-    """Returns captions sorted from plain to elaborate.
+    """Returns the captions, sorted from plain to elaborate.
 
     Captions that begin with "a person" come first, and shorter captions come before longer ones.
     """

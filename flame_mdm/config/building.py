@@ -55,9 +55,9 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     """Checks that an untrusted configuration contains only plain values and no interpolations.
 
     Hydra and OmegaConf would resolve interpolations (`${...}`), which can run any code and read any
-    environment variable. Only the interpolation that the argument `but` contains is allowed, at the
-    start of a string. Raises a `UserError` that names the file `where` if the check fails or if the
-    content is too large, is nested too deeply or contains itself.
+    environment variable. Only the interpolation given as `but` is allowed, and only at the start of
+    a string. If the check fails, raises a `UserError` that names the file `where`. The check also
+    fails if the content is too large, is nested too deeply or contains itself.
     """
     count = 0
 
@@ -190,8 +190,8 @@ def trust(config: Config) -> None:
     """Checks that a checkpoint's configuration names only permitted classes and arguments.
 
     A class is permitted for a part if `MODULES` lists its module for this part, or if a file in the
-    part's folder of `experiments/` names the class. The environment variable FLAME_MDM_TRUST
-    permits additional packages, separated by commas. The check does not import the classes.
+    part's folder in `experiments/` names the class. The environment variable FLAME_MDM_TRUST lists
+    additional permitted packages, separated by commas. The check does not import the classes.
     """
     names = [name.strip() for name in os.environ.get("FLAME_MDM_TRUST", "").split(",")]
     added = [name for name in names if name]

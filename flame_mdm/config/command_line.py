@@ -202,7 +202,7 @@ def _help(kind: type[Any]) -> list[str]:
 
 
 def make_variables() -> list[str]:
-    """Converts the variables that were passed to make to command-line arguments.
+    """Returns the variables that were passed to `make`, as command-line arguments.
 
     `EXP` names the recipe, and other upper-case variables are keys. `make` lists the variables
     in MAKEFLAGS after ` -- `, the latest one first, with escaped spaces and doubled dollar signs.
@@ -221,7 +221,7 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code.
 
-    A signal in `signums` ends the action, which cleans up first. An error that the user can fix is
+    After a signal in `signums`, the action cleans up and ends. An error that the user can fix is
     printed on one line, and the exit code is 1; FLAME_MDM_TRACEBACK=1 prints the traceback first.
     Any other exception is a bug: the traceback is printed with a request to report it, and the exit
     code is `BUG`.
@@ -256,7 +256,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 def explanation(error: Exception) -> str | None:
     """Returns the line to print for an error that the user can fix, or None for a bug.
 
-    The user can fix a `UserError`, a file error or a lack of memory.
+    The user can fix the cause of a `UserError`, a file error or an out-of-memory error.
     """
     if isinstance(error, UserError):
         return first_line(error)

@@ -33,7 +33,8 @@ LAUNCH = "launch"  # folder in `experiments/` of the launchers, which start jobs
 def groups() -> list[str]:
     """Returns the names of the parts that can be replaced in a recipe.
 
-    They are the folders in `experiments/` whose files are options for a part rather than recipes.
+    These are the names of the folders in `experiments/` whose files are not recipes, but options
+    for a part.
     """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
@@ -87,9 +88,9 @@ def prepare_overrides(
 ) -> tuple[list[str], Config]:
     """Checks the overrides (except those in `first`) and prepares them for Hydra.
 
-    Keys that are missing from the recipe but accepted by a `_target_` get the prefix `++`. Also
-    returns the recipe in which groups have been replaced but individual keys have not yet been
-    overridden, or {} if there are no overrides.
+    Keys that are missing from the recipe but accepted by a `_target_` get the prefix `++`. Returns
+    the prepared overrides and the composed recipe. In this recipe, groups have been replaced, but
+    individual keys have not been overridden yet. The recipe is {} if there are no overrides.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -221,7 +222,7 @@ def resolve(source: ConfigSource, overrides: list[str], base: Config | None = No
 
 
 def compose_unchecked(source: ConfigSource, overrides: list[str]) -> Config:
-    """Composes a configuration with prepared overrides; raises Hydra's errors as `UserError`."""
+    """Composes a configuration with prepared overrides; re-raises Hydra's errors as `UserError`."""
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):

@@ -76,7 +76,7 @@ def _is_of_launcher(word: str) -> bool:
 
 
 def _alternatives(kind: type[Any], word: str) -> list[str]:
-    """Splits a word that lists several values into one word `key=value` per value."""
+    """Splits a word that lists several values into words `key=value` with one value each."""
     key, separator, _ = word.partition("=")
     if not separator or is_text(kind, key):
         return [word]

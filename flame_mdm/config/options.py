@@ -21,14 +21,14 @@ def option(default: Any, help: str, check: Check | None = None) -> Any:
 
 
 def required(help: str, check: Check | None = None) -> Any:
-    """Returns a dataclass field, like `option`, but without a default."""
+    """Returns the same dataclass field as `option`, but without a default."""
     return option(MISSING, help, check)
 
 
 def same_option(kind: type[Any], name: str, check: Check | None = None, **default: Any) -> Any:
-    """Returns a field with the help text of another dataclass's field.
+    """Returns a field that reuses the help text of a field in another dataclass.
 
-    Its default is the other field's default, unless `default` is given.
+    Unless `default` is given, the field also reuses the default.
     """
     original = next(entry for entry in fields(kind) if entry.name == name)
     return option(default.get("default", original.default), original.metadata["help"], check)

@@ -77,7 +77,7 @@ DERIVED = ("to_joints", "feet", "edges")  # arguments of these classes that reci
 
 
 def check_top_level(config: Config) -> None:
-    """Checks the keys outside mappings with a `_target_`.
+    """Checks the keys that are not in a mapping with a `_target_`.
 
     Raises `UserError` if one of these keys is unknown or has an invalid value.
     """
@@ -104,7 +104,7 @@ def check_top_level(config: Config) -> None:
 def check_kind(key: str, value: Any, annotation: str) -> None:
     """Raises `UserError` if a value does not match the annotation of its parameter.
 
-    An annotation that this check does not support accepts any value.
+    Any value is accepted if this check does not support the annotation.
     """
     required = []
     kinds = _alternatives(ast.parse(annotation or "Any", mode="eval").body)
@@ -134,7 +134,7 @@ def _alternatives(annotation: ast.expr) -> list[ast.expr]:
 
 
 def _mismatch(value: Any, kind: ast.expr) -> str:
-    """Returns what an annotation without unions requires, or "" if the value satisfies it."""
+    """Describes what an annotation without unions requires; "" = the value satisfies it."""
     name = _name(kind)
     if name in KINDS:
         types, description = KINDS[name]
@@ -175,7 +175,7 @@ def _mismatch(value: Any, kind: ast.expr) -> str:
 
 
 def _mismatch_of_items(items: Sequence[Any], kinds: Sequence[ast.expr]) -> str:
-    """Returns what a tuple annotation, such as `tuple[float, float]`, requires.
+    """Describes what a tuple annotation, such as `tuple[float, float]`, requires.
 
     Returns "" if the items satisfy the annotation.
     """
@@ -202,7 +202,7 @@ def _name(node: ast.expr) -> str:
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
-    """Checks the types of keys that have no signature.
+    """Checks the types of values that are not covered by a signature.
 
     Raises `UserError` if an override changes the type of a value in the recipe.
     """
@@ -266,7 +266,7 @@ def parameters(target: str) -> frozenset[str]:
 
 @functools.cache
 def _signature(target: str) -> dict[str, str]:
-    """Returns the annotations of a class's or function's arguments, keyed by name; "" = none."""
+    """Returns the annotation of each argument of a class or function; "" = no annotation."""
     module, _, name = target.rpartition(".")
     node = definition(module, name)
     if node is None:
@@ -284,7 +284,7 @@ def _signature(target: str) -> dict[str, str]:
 def definition(
     module: str, name: str, seen: frozenset[str] = frozenset()
 ) -> tuple[str, ast.AST] | None:
-    """Follows re-exports to the definition of `module.name`; returns its module and syntax tree."""
+    """Returns the module and syntax tree that define `module.name`, following re-exports."""
     tree = _tree(module)
     if tree is None or module in seen:
         return None
@@ -320,7 +320,7 @@ def _top_level(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def source_file(module: str) -> Path | None:
-    """Returns the source file of a module, or None if it has none or the name is invalid."""
+    """Returns the source file of a module; None if there is no file or the name is invalid."""
     # A name that contains a slash could refer to any file
     if not all(part.isidentifier() for part in module.split(".")):
         return None

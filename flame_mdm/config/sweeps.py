@@ -1,4 +1,4 @@
-"""Command line of `train`: recipes composed by Hydra, sweeps, and jobs of Hydra's launchers."""
+"""Command line of `train`: recipes composed by Hydra, sweeps, and jobs for Hydra's launchers."""
 
 import shutil
 import sys

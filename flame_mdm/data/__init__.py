@@ -195,7 +195,7 @@ class MotionSource(ABC):
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns the mean and std (D,) that are published with encoded features.
 
-        The result is None if they must be computed from the training clips.
+        Returns None if the mean and std must be computed from the training clips.
         """
         return None
 
@@ -219,7 +219,7 @@ class MotionSource(ABC):
 
 
 def advice_on_splits(source: MotionSource) -> str:
-    """Returns advice for users whose split contains no clips. The advice begins with a space.
+    """Returns advice on how to fill an empty split. The advice begins with a space.
 
     The advice is "" for published data sets, because their splits are fixed.
     """
@@ -250,7 +250,9 @@ def name_hash(name: str) -> int:
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Returns a split that depends only on the name, so adding names does not change other splits.
+    """Returns a split that depends only on the name.
+
+    Adding names therefore does not change the splits of other names.
 
     Args:
         name: name of a motion or of its source.
@@ -277,7 +279,7 @@ def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -
 
 
 def swap_sides(text: str) -> str:
-    """Swaps left and right, and clockwise and counterclockwise, in the text."""
+    """Swaps "left" with "right", and "clockwise" with "counterclockwise", in the text."""
     pairs = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
     pairs |= {"counterclockwise": "clockwise", "anticlockwise": "clockwise"}
 

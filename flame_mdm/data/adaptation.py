@@ -60,7 +60,7 @@ class Lesson(MotionSource):
         return Store(self.prior)
 
     def kept(self) -> list[Entry]:
-        """Returns at most `PRIOR` known clips per split."""
+        """Returns known clips from each split; `PRIOR` is the maximum number per split."""
         kept: list[Entry] = []
         for split, most in PRIOR.items():
             clips = [clip for clip in self.store.clips if clip.split == split]
@@ -90,7 +90,7 @@ class Lesson(MotionSource):
         return self.store.mean, self.store.std
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields the user's clips, with the style added to their captions, then the store's clips.
+        """Yields the user's clips with the style added to their captions, and then the known clips.
 
         Raises:
             UserError: If one of the user's motions cannot be read. The folder contains only a few
@@ -157,7 +157,7 @@ class LessonBatches(Sampler[list[Draw]]):
 
     Args:
         rows: for each stream, the indices of its clips in the data set.
-        streams: batches of indices into `rows`.
+        streams: for each stream, batches of indices into its `rows`.
     """
 
     def __init__(self, rows: list[np.ndarray], streams: list[TrainingBatches]):

@@ -87,9 +87,9 @@ def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`.
 
     Returns None if the path does not belong to a subset. A subset may have different names in index
-    files, archives and folders; they all result in the same key. Case is ignored, and spaces are
-    replaced by underscores, as in later releases. A file from the SMPL-X release has the same key
-    as the corresponding SMPL+H file.
+    files, archives and folders; all of these names result in the same key. Case is ignored, and
+    spaces are replaced by underscores, as in later releases. A file from the SMPL-X release has the
+    same key as the corresponding SMPL+H file.
     """
     whole = PurePosixPath(path).with_suffix("")
     for folder in whole.parents:
@@ -183,7 +183,7 @@ class Amass:
         function: Callable[[Argument, Recording], Result],
         workers: int = 0,
     ) -> Iterator[tuple[str, Result]]:
-        """Applies a function to recordings, using worker processes.
+        """Applies a function to recordings in worker processes.
 
         Yields pairs (key, result), sorted by key.
 

@@ -60,14 +60,13 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
 
 
 def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
-    """Returns `path` if it is a folder; otherwise, unpacks the archive and returns a folder.
+    """Returns `path` if it is a folder; otherwise, unpacks the archive and returns its folder.
 
-    The `members` of the archive are unpacked into a temporary folder, which is removed when
-    `owner` is garbage-collected. In this case, the result is the deepest folder that contains all
-    members.
+    The `members` of an archive are unpacked into a temporary folder, which is removed when `owner`
+    is garbage-collected. The function then returns the deepest folder that contains all members.
 
     Raises:
-        UserError: For the same reasons as `members`, and if a member would be unpacked outside
+        UserError: For the same reasons as in `members`, or if a member would be unpacked outside
             the folder.
     """
     if not path.is_file():
@@ -157,7 +156,7 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """Reader for the expanded content of a compressed file of `packed` bytes.
+    """Reader for the expanded content of a compressed file, which has `packed` bytes.
 
     It raises an error if the expanded size is implausible.
     """
@@ -166,7 +165,10 @@ class _Bounded:
         self.file, self.packed, self.total, self.ended = file, packed, 0, 0
 
     def read(self, size: int) -> bytes:
-        """Returns up to `size` bytes. Raises `EOFError` if a reader continues past the end."""
+        """Returns up to `size` bytes.
+
+        Raises `EOFError` if the caller keeps reading past the end.
+        """
         data = self.file.read(size)
         self.total += len(data)
         self.ended += not data

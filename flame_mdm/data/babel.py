@@ -1,4 +1,4 @@
-"""BABEL: timed action labels for AMASS's motions, cut into clips as in FLAME's code.
+"""BABEL: AMASS's motions with timed action labels, cut into clips as in FLAME's code.
 
 Sources: Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim
 et al. (FLAME), AAAI 2023, appendix "BABEL". `docs/babel.md` describes the data set.
@@ -56,21 +56,21 @@ class Window(NamedTuple):
 
 
 class Babel(MotionSource):
-    """Clips of `LENGTH` frames, as raw motions of the SMPL representations.
+    """Clips of `LENGTH` frames, given as raw motions for the SMPL representations.
 
     Motions are in AMASS's coordinates. As in FLAME's code, a label covers the frames floor(20
     start) to floor(20 end) - 1. If a label is longer than a clip, one clip begins every `STRIDE`
-    frames. If a label is shorter than a clip, the clip continues past the end of the label, and the
+    frames. If a label is shorter than a clip, the clip continues past the end of the label. The
     label is left out if the motion is too short for the clip.
 
-    Both splits use BABEL's entire train part for training, and 20 % of its val part for testing.
-    In the project's own split, these 20 % are drawn from the motions rather than the clips, so that
-    no motion is in both val and test. FLAME's split uses every fifth clip for testing, so clips in
-    val overlap with clips in test.
+    FLAME's split and the project's own split both use BABEL's entire train part for training, and
+    20 % of its val part for testing. In the project's own split, these 20 % are drawn from the
+    motions rather than the clips, so that no motion is in both val and test. FLAME's split uses
+    every fifth clip for testing, so clips in val overlap with clips in test.
 
     Args:
         path: folder of BABEL v1.0.
-        amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
+        amass: folder with AMASS's SMPL+H G release, either unpacked or as archives.
         published_split: whether to use FLAME's split.
         workers: number of processes; 0 = one per core.
     """
@@ -117,7 +117,7 @@ class Babel(MotionSource):
     def windows(self) -> list[Window]:
         """All clips in FLAME's order.
 
-        They follow from the labels and the lengths of the motions.
+        The clips are determined by the labels and the lengths of the motions.
         """
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
@@ -143,8 +143,8 @@ class Babel(MotionSource):
     def labels(self, part: str) -> list[Label]:
         """Returns the labels of a part ("train" or "val") in FLAME's order.
 
-        For each file, the labels in the annotators' words come first, followed by the categories.
-        Empty and duplicate labels (same text, motion, start and end) are dropped.
+        Within each file, the labels in the annotators' words come first, followed by the
+        categories. Empty and duplicate labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
@@ -185,7 +185,7 @@ class Babel(MotionSource):
 
 
 def _segment(label: dict[str, Any]) -> Segment:
-    """Returns those fields of a label that this module uses.
+    """Returns the fields of a label that this module uses.
 
     Raises `TypeError` if a field has the wrong type.
     """

@@ -169,7 +169,7 @@ class Bandai(MotionSource):
         }
 
     def count(self) -> int:
-        """Returns the number of takes and mirrored copies."""
+        """Returns the number of clips: takes and mirrored copies."""
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
 
     def counts(self) -> dict[str, int]:
@@ -287,7 +287,7 @@ def mirror(motion: np.ndarray) -> np.ndarray:
 
 
 def side_of(content: str) -> str:
-    """Returns the side that moves, or the side to which the body moves: left, right or both.
+    """Returns "left", "right" or "both": the side that moves or to which the body moves.
 
     The result is "" if the content has no side.
     """
@@ -309,7 +309,7 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: str = "t
     """Returns the split of a take. The split depends only on the take's name.
 
     In data set 2, neighboring takes are similar, so each block of five takes is kept in one split.
-    Data set 1 contains only one take of most combinations, so each combination is kept in one
+    Data set 1 contains only one take for most combinations, so each combination is kept in one
     split. The takes of walk-turn-left and walk-turn-right in normal style overlap in time, so all
     of them are used for training.
 

@@ -108,11 +108,12 @@ class CMU(MotionSource):
     """Captioned recordings of the CMU database, converted to SMPL's 22 joints.
 
     The clips are HumanML3D's clips, recordings with KIT-ML's captions, or motions with the user's
-    captions. HumanML3D's clips keep their names, splits and mirrored copies. Any other recording is
-    in the same split as the HumanML3D clips that are cut from it. If these clips are in several
-    splits, the test split has priority, followed by val. If HumanML3D contains no clip of the
-    recording, the subject determines the split. If there is a table `captions.csv`, only its
-    captions are used, and each recording or part of a recording in the table becomes one clip.
+    captions. HumanML3D's clips keep their names, splits and mirrored copies. A recording with
+    KIT-ML's captions is in the same split as the HumanML3D clips that are cut from it. If these
+    clips are in several splits, the test split has priority, followed by val. If HumanML3D contains
+    no clip of the recording, the subject determines the split. If there is a table `captions.csv`,
+    only its captions are used, and each recording or part of a recording in the table becomes one
+    clip.
 
     Args:
         path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any
@@ -185,7 +186,7 @@ class CMU(MotionSource):
     ) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
         """HumanML3D's clips from CMU recordings, with their captions and splits, keyed by name.
 
-        All of them are empty if the user provides captions.
+        All three are empty if the user provides captions.
         """
         if self.table:
             return [], {}, {}
@@ -359,7 +360,7 @@ class _Part:
 
 
 def _parts(table: Path) -> dict[str, _Part]:
-    """Returns the parts of recordings in a table, keyed by name.
+    """Returns the parts of recordings that a table lists, keyed by name.
 
     Rows for the same part contain captions for the same clip.
     """
@@ -476,8 +477,8 @@ def decide_rate(
 ) -> float:
     """Returns the frame rate of a recording with `frames` frames.
 
-    KIT-ML's `seconds` have the highest priority, followed by HumanML3D's `last` frame at 20 fps,
-    and by CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has the lowest
+    KIT-ML's `seconds` have the highest priority, followed by HumanML3D's `last` frame at 20 fps and
+    then by CMU's list of recordings at 60 fps (`is_sixty`). The `header` of the file has the lowest
     priority, because converted files specify 120 fps for nearly all recordings.
     """
     rates = RATES if header in (None, *RATES) else (*RATES, header)
@@ -493,11 +494,12 @@ def decide_rate(
 
 
 def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
-    """Converts a recording to the bones of CMU's own files, and also returns its `Layout` fields.
+    """Returns a recording with the bones of CMU's own files, together with its `Layout` fields.
 
-    Both conversions begin with a T-pose, which is removed. The joints `pelvis` and `face` are added
-    at the positions of SMPL's pelvis and head. In the Daz figure, `upperneck` is also added. Other
-    skeletons are returned unchanged, without fields.
+    Files of the MotionBuilder-friendly and Daz-friendly conversions begin with a T-pose, which is
+    removed. The joints `pelvis` and `face` are added at the positions of SMPL's pelvis and head. In
+    the Daz figure, `upperneck` is also added. Recordings with other skeletons are returned
+    unchanged and without fields.
     """
     is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
     # The MotionBuilder-friendly conversion lacks one bone of the trunk and one bone of each hand.

@@ -43,7 +43,7 @@ class Crop(ABC):
 
     @abstractmethod
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
-        """Draws the first frame and the number of frames of one or more samples.
+        """Draws the first frame and the number of frames for one or more samples.
 
         Without `below`, the result is deterministic. A sample may extend past the end of its clip.
         In this case, the last frame is repeated.
@@ -57,7 +57,7 @@ class Crop(ABC):
         """
 
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        """Returns the indices of the frames that are selected from a clip of `frames` frames.
+        """Returns the indices of the frames to use from a clip that has `frames` frames.
 
         Without a generator, the indices are deterministic.
         """
@@ -111,8 +111,9 @@ class Whole(Crop):
 class Fixed(Crop):
     """The rule for ACTOR's action data sets: every sample consists of `frames` frames.
 
-    Short clips repeat their last frame. Long clips are cropped to a window. As in ACTOR's code, the
-    window never starts at the last possible frame. Without a generator, the first window is used.
+    The last frame of a short clip is repeated. A long clip is cropped to a window. As in ACTOR's
+    code, the window never starts at the last possible frame. Without a generator, the first window
+    is used.
     """
 
     frames: int = 60
@@ -130,7 +131,7 @@ class Fixed(Crop):
 
 
 class Clips(Dataset[Sample]):
-    """Those clips of a split that are long enough for the crop rule.
+    """The clips of a split that are long enough for the crop rule.
 
     Each time a clip is drawn, it is cropped and then normalized. `advice` is added to the error
     message for a split without clips; see `flame_mdm.data.advice_on_splits`.
@@ -184,7 +185,7 @@ class Clips(Dataset[Sample]):
         """Draws the first frame, the number of frames and the caption index for each of B clips.
 
         The results depend only on the seed, the batch and the index of the clip. In evaluation
-        (batch -1), they are always the same.
+        (batch -1), the results are always the same.
 
         Args:
             indices: (B,) indices of the clips.

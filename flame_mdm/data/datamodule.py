@@ -37,9 +37,9 @@ Loader = DataLoader[Sample] | ResidentLoader
 class TrainingBatches(Sampler[list[Draw]]):
     """An endless stream of batches, each with clips of similar lengths.
 
-    Batch n depends only on n and the seed. Each pass over the data is shuffled and divided into
-    groups of `BUCKETS` batches. Each group is sorted by length to reduce padding. Process `rank` of
-    `world` takes every `world`-th batch.
+    Batch n depends only on n and the seed. For each pass over the data, the clips are shuffled and
+    divided into groups of `BUCKETS` batches. Each group is sorted by length to reduce padding.
+    Process `rank` of `world` takes every `world`-th batch.
     """
 
     BUCKETS = 16
@@ -94,7 +94,8 @@ class MotionDataModule(LightningDataModule):
         representation: representation that encodes the clips. It receives the statistics of the
             store.
         root: folder that contains all prepared data sets.
-        name: name of the data set. Its folder name in `root` begins with this name.
+        name: name of the data set. The name of the data set's folder in `root` begins with this
+            name.
         batch_size: clips per rank and step.
         num_workers: number of loading processes; 0 = load in the training process.
         crop: rule that determines the frames of a sample and the minimum length of a clip.
@@ -292,7 +293,7 @@ class MotionDataModule(LightningDataModule):
     def train_dataloader(self) -> Loader:
         """Returns an endless loader of training batches.
 
-        In resumed runs, it starts at the trainer's current step.
+        In resumed runs, the loader starts at the trainer's current step.
         """
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0

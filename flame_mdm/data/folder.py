@@ -61,7 +61,7 @@ class Note:
 class Folder(MotionSource):
     """Motions and captions in a folder.
 
-    Motions are positions of SMPL's 22 joints, or raw motions of the SMPL representation. If the
+    Motions are positions of SMPL's 22 joints, or raw motions for the SMPL representation. If the
     table does not specify splits, 85 % of the sources are used for training, 5 % for validation and
     10 % for testing, based on a hash of their names.
 
@@ -69,15 +69,15 @@ class Folder(MotionSource):
         path: the folder. Motions may be in subfolders.
         motion: "joints" for representations of joint positions; "smpl" for representations of
             SMPL's rotations. Rotations are read from AMASS files and derived from the bones of BVH
-            files. For all other files, they are fitted to the joints.
+            files. For all other files, the rotations are fitted to the joints.
         mirror: whether a mirrored copy follows each clip of the training split. This requires
             `motion="joints"`.
         exclude: paths of motions to leave out, relative to the folder and without extension.
         balance: requested number of training clips per action, including mirrored copies. If an
             action has fewer clips, its clips are repeated until there are about this many. Each
             clip occurs at most 16 times. 0 = clips are not repeated.
-        license: license of motions for which the table does not specify a license. This is a key in
-            `licenses.yaml`, or "" if the license is unknown.
+        license: license of the motions for which the table does not specify a license. The value is
+            a key in `licenses.yaml`, or "" if the license is unknown.
         prefixes: maps each word to a list of actions. The word is inserted before the captions of
             these actions. A model can then distinguish these motions from motions with the same
             action name in another data set.
@@ -152,7 +152,7 @@ class Folder(MotionSource):
         return sum(self.copies.values()) + images
 
     def licenses(self) -> set[str]:
-        """Returns the licenses in the table, including `license` if a row does not specify any."""
+        """Returns the licenses of all motions; `license` applies if the table specifies none."""
         return {note.license or self.license for note in self.notes.values()}
 
     @cached_property
@@ -223,8 +223,8 @@ class Folder(MotionSource):
     def findings(self) -> list[str]:
         """Returns findings about the motions that have been read so far.
 
-        They state the number of motions for each skeleton and, for example, which frames were left
-        out.
+        The findings state the number of motions for each skeleton and, for example, which frames
+        were left out.
         """
         skeletons = [
             f"{layout}: {len(motions)} motions" for layout, motions in self._uprights.items()
@@ -369,7 +369,7 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
 
 
 def _repeated(clip: Clip, copies: int) -> Iterator[Clip]:
-    """Yields a clip and its copies, which share the frames of the clip in the store."""
+    """Yields a clip and its copies, which share the clip's frames in the store."""
     yield clip
     for number in range(2, copies + 1):
         yield replace(clip, id=f"{clip.id}~{number}")

@@ -31,10 +31,10 @@ BLOCK = 10
 
 
 class HumanAct12(MotionSource):
-    """The clips in `humanact12poses.pkl`, as raw motions of the SMPL representations.
+    """The clips in `humanact12poses.pkl`, given as raw motions for the SMPL representations.
 
-    The file does not identify subjects or recordings. The project's own split (70 % train, 10 %
-    val, 20 % test of each action) keeps neighboring clips together. The published split uses all
+    The file does not identify subjects or recordings. The project's own split (70 % train, 10 % val
+    and 20 % test for each action) keeps neighboring clips together. The published split uses all
     clips for both training and testing, as in the papers.
     """
 

@@ -1,4 +1,4 @@
-"""HumanML3D: described motions from AMASS and HumanAct12, as features or SMPL parameters.
+"""HumanML3D: captioned motions from AMASS and HumanAct12, as features or SMPL parameters.
 
 Source: Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. See
 `docs/humanml3d.md`.
@@ -89,9 +89,9 @@ class HumanML3D(T2MFolder):
     Args:
         path: the folder, which must contain texts and splits.
         exclude: names of motions to leave out. Mirrored copies have names of their own.
-        amass: folder of AMASS's SMPL+H G release, as archives or unpacked. Missing motions are
-            created from it. This also requires `index.csv` and HumanAct12's joint positions
-            (`pose_data/humanact12.zip`) in `path` or next to it.
+        amass: folder with AMASS's SMPL+H G release, either unpacked or as archives. Missing motions
+            are created from this release. Creating them also requires `index.csv` and HumanAct12's
+            joint positions (`pose_data/humanact12.zip`) in `path` or next to it.
         body_models: folder with the extended SMPL+H model.
         bone_lengths: 22 bone lengths, in meters, of the skeleton to which all motions are
             retargeted.
@@ -158,7 +158,7 @@ class HumanML3D(T2MFolder):
         return {file.stem: file for file in folder.rglob("*.npy")}
 
     def _beside(self, *names: str) -> Path:
-        """Returns the path of the first name that exists in the folder or next to it.
+        """Returns the path of the first name for which a file exists in the folder or next to it.
 
         If none of them exists, returns the path that the first name would have in the folder.
         """
@@ -244,7 +244,7 @@ class HumanML3D(T2MFolder):
 def _from_amass(
     write: partial[None], bodies: dict[str, Body], rows: Sequence[IndexedClip], recording: Recording
 ) -> int:
-    """Writes the features of all clips of a recording, and returns the number of these clips.
+    """Writes the features of all clips in a recording, and returns the number of clips.
 
     As in the published code, every gender other than "male" is treated as female.
     """
@@ -258,7 +258,10 @@ def _from_amass(
 def _write_features(
     folder: Path, representation: HumanML, row: IndexedClip, joints: np.ndarray
 ) -> None:
-    """Writes the features of a clip and of its mirror image, first under temporary names."""
+    """Writes the features of a clip and of its mirror image.
+
+    Each file has a temporary name until it is complete.
+    """
     motion = torch.from_numpy(joints).double()
     with naming(f"clip {row.name} (data.source.exclude=[{row.name}] leaves it out)", ValueError):
         features = representation.encode_many([motion, representation.skeleton.mirror(motion)])
@@ -290,15 +293,15 @@ class HumanML3DSMPL(MotionSource):
     """FLAME's version of the data set (Kim et al., AAAI 2023): SMPL parameters of entire clips.
 
     There is one clip per caption. The clips of a motion are called NAME#0, NAME#1 and so on. As in
-    FLAME's code, there are no mirrored copies, length limits or cuts, and a caption that describes
-    only a part is used for the entire motion. In five subsets, HumanML3D dropped the first frames
-    of each recording. Unlike FLAME's code, this class accounts for the dropped frames, so that
-    motions and captions match.
+    FLAME's code, there are no mirrored copies, length limits or cuts. A caption that describes only
+    a part of a motion is used for the entire motion. In five subsets, HumanML3D dropped the first
+    frames of each recording. Unlike FLAME's code, this class accounts for the dropped frames, so
+    that motions and captions match.
 
     Args:
         path: folder of HumanML3D with texts, splits and `index.csv`. The folder does not have to
             contain motions.
-        amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
+        amass: folder with AMASS's SMPL+H G release, either unpacked or as archives.
         humanact12: path of FLAME's `humanact12_processed.pkl`. Without this file, the clips of
             HumanAct12 are left out.
         published_split: whether to also train on the validation clips, so that no clips are left

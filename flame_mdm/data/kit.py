@@ -32,7 +32,7 @@ class KIT(T2MFolder):
 
 
 class KITTemos(MotionSource):
-    """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and limits.
+    """Joint positions of the MMM model at 12.5 fps, with TEMOS's splits and length limits.
 
     The recordings have 100 frames per second, and every eighth frame is used. Source: Petrovich,
     Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions shorter than 10 frames
@@ -64,7 +64,7 @@ class KITTemos(MotionSource):
 
     @cached_property
     def ghosh_test(self) -> set[str]:
-        """The names in Ghosh et al.'s test split. The set is empty if their list is missing."""
+        """The names in Ghosh et al.'s test split. The set is empty if this list is missing."""
         file = self.splits / "ghosh-test"
         return set(read_text(file).split()) if file.is_file() else set()
 

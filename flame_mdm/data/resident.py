@@ -81,7 +81,7 @@ class ResidentLoader:
         clips: clips of the split.
         batches: for each batch, a list with the `Draw` of each clip.
         features: (N + 1, D), as returned by `resident_features`.
-        multiple: number of frames; each batch is padded to a multiple of it.
+        multiple: each batch is padded to a multiple of this number of frames.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class ResidentLoader:
             yield from self._gathered(planned)
 
     def _gathered(self, planned: list[list[Draw]]) -> Iterator[MotionBatch]:
-        """Draws the crops for several batches at once, and yields the batches."""
+        """Draws the crops for several batches at once and yields the batches."""
         rows = np.array([index for draws in planned for index, _ in draws])
         # All clips in a batch share the batch number of the first clip.
         numbers = [draws[0][1] for draws in planned for _ in draws]

@@ -71,8 +71,8 @@ class _Dictionary(dict[str, Any]):
 class _Unpickler(pickle._Unpickler):
     """Reads the pickle in a file of `size` bytes.
 
-    `opaque` contains prefixes of the names of globals. An object of such a global is replaced by
-    its state.
+    `opaque` contains prefixes. If the name of a global begins with one of them, the objects of this
+    global are replaced by their state.
     """
 
     stack: list[Any]

@@ -86,9 +86,8 @@ def vocabulary(
             None = no captions.
 
     Returns:
-        "vocabulary" contains all words of the captions, sorted. Unless `shared` is None,
-        "captions" contains up to `MAX_CAPTIONS` captions from `shared`, evenly spaced in sorted
-        order.
+        "vocabulary" contains all words in the captions, sorted. Unless `shared` is None, "captions"
+        contains up to `MAX_CAPTIONS` captions from `shared`, evenly spaced in sorted order.
     """
     facts = {"vocabulary": sorted({word for caption in set(captions) for word in words(caption)})}
     if shared is not None:
@@ -99,7 +98,7 @@ def vocabulary(
 
 
 def known_form(word: str, seen: Collection[str]) -> str | None:
-    """Returns `word` if it is known, or else a known form ("walks" for "walked").
+    """Returns `word` if it is known, or a known form with another ending ("walks" for "walked").
 
     Returns None if no form is known.
     """
@@ -124,8 +123,8 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
     Args:
         text: the prompt.
-        facts: facts about the model. For imported models, whose vocabulary is unknown, words are
-            not checked.
+        facts: facts about the model, including its vocabulary. For imported models, whose
+            vocabulary is unknown, words are not checked.
         max_words: maximum number of words that the model reads; None = no limit.
     """
     lines = []

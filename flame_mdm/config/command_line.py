@@ -221,10 +221,10 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code.
 
-    After a signal in `signums`, the action cleans up and ends. An error that the user can fix is
-    printed on one line, and the exit code is 1; FLAME_MDM_TRACEBACK=1 prints the traceback first.
-    Any other exception is a bug: the traceback is printed with a request to report it, and the exit
-    code is `BUG`.
+    If a signal in `signums` arrives, the action cleans up and ends. An error that the user can fix
+    is printed on one line, and the exit code is 1; FLAME_MDM_TRACEBACK=1 prints the traceback
+    first. Any other exception is a bug: the traceback is printed with a request to report it, and
+    the exit code is `BUG`.
     """
     try:
         with stoppable(signums):

@@ -33,8 +33,8 @@ LAUNCH = "launch"  # folder in `experiments/` of the launchers, which start jobs
 def groups() -> list[str]:
     """Returns the names of the parts that can be replaced in a recipe.
 
-    These are the names of the folders in `experiments/` whose files are not recipes, but options
-    for a part.
+    These are the names of the folders in `experiments/` that contain options for a part instead of
+    recipes.
     """
     folders = {name.partition("/")[0] for name in recipes()}
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
@@ -211,7 +211,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
 def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
     """Composes a configuration with prepared overrides.
 
-    If `base` is given, the values must have the same types as the values in `base`.
+    If `base` is given, the values must have the same types as in `base`.
     """
     config = compose_unchecked(source, overrides)
     if base is not None:

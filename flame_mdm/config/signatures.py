@@ -260,7 +260,7 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
 
 
 def parameters(target: str) -> frozenset[str]:
-    """Returns the argument names in the source of a class or function; "**" = any argument."""
+    """Returns the argument names of a class or function from its source; "**" = any argument."""
     return frozenset(_signature(target))
 
 

@@ -96,7 +96,7 @@ class Units(Crop):
 
 @dataclass(frozen=True)
 class Whole(Crop):
-    """FLAME's rule: a sample is an entire clip, truncated after `max_frames`."""
+    """FLAME's rule: a sample is an entire clip, truncated to at most `max_frames` frames."""
 
     min_frames: int = 1
     max_frames: int = 471

@@ -260,8 +260,8 @@ class Folder(MotionSource):
     def files(self) -> dict[str, MotionFile]:
         """Maps names to motion files, in sorted order.
 
-        The name of a file is its path in the folder, without extension. If a file has several
-        animations, each animation is called `PATH/ANIMATION`.
+        The name of a file is its path relative to the folder, without extension. If a file has
+        several animations, each animation is called `PATH/ANIMATION`.
         """
         files: dict[str, MotionFile] = {}
         for path in motions_in(self.path):

@@ -189,8 +189,8 @@ class _Unpickler(pickle._Unpickler):
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle with protocol 0 to 5.
 
-    A global is also permitted if its name begins with one of the prefixes in `opaque`. Its objects
-    are replaced by their state.
+    Globals whose names begin with one of the prefixes in `opaque` are permitted as well. The
+    objects of these globals are replaced by their state.
 
     Raises:
         UserError: If the file is damaged, or refers to other globals.

@@ -102,7 +102,7 @@ class Store:
 
     Raises:
         FileNotFoundError: If `folder` contains no store.
-        UserError: If its files are damaged.
+        UserError: If the files of the store are damaged.
     """
 
     def __init__(self, folder: Path):
@@ -150,7 +150,7 @@ class Store:
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
         """Returns the joint positions of clips at the frame rate of their recordings.
 
-        The result is None if positions are missing for any of the clips.
+        Returns None if positions are missing for any of the clips.
         """
         if "references.npz" not in self.info["sha256"]:
             return None
@@ -159,7 +159,7 @@ class Store:
         return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def licenses(self) -> list[dict[str, Any]]:
-        """Lists each license with the number of its clips, their total minutes and their actions.
+        """Lists each license with its number of clips, total minutes and actions.
 
         The list is empty if the data set does not specify licenses. A clip and its copies count as
         one clip.
@@ -200,9 +200,9 @@ class Store:
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
     """Encodes every clip of a data set and writes the store.
 
-    The store has a temporary name until it is complete. If another process is writing it, this
-    function waits and opens the result. If data cannot be read, no files are left behind. An
-    existing intact store is replaced.
+    The store has a temporary name until it is complete. If another process is writing the same
+    store, this function waits and then opens this store. If data cannot be read, no files are left
+    behind. An existing intact store is replaced.
 
     Raises:
         UserError: If `folder` contains anything other than an intact store.
@@ -390,7 +390,8 @@ def _encoded(
 ) -> Generator[tuple[Clip, np.ndarray]]:
     """Yields each clip with the features of its entire motion.
 
-    Worker processes encode the motions. If a motion has several clips, it is encoded only once.
+    Worker processes encode the motions. If several clips share a motion, the motion is encoded only
+    once.
     """
     groups: deque[list[Clip]] = deque()
 

@@ -85,7 +85,7 @@ def content() -> dict[str, Any]:
 def draw_captions(
     rng: np.random.Generator, attributes: Attributes, count: int, incomplete: bool = False
 ) -> tuple[list[str], Attributes]:
-    """Draws `count` different captions for a clip, and also returns the attributes that they state.
+    """Draws `count` different captions for a clip; returns them and the attributes they state.
 
     If `incomplete` is True and the grammar contains captions that omit attributes, all captions
     omit the same attributes.
@@ -180,8 +180,8 @@ def _conjugated(rng: np.random.Generator, text: str, tenses: Sequence[tuple[str,
 def entry(table: Mapping[str, Any], attributes: Attributes) -> Any:
     """Returns the table entry for the action and one of its attributes, such as "walk left".
 
-    If there is no such entry, the result is the entry for the action alone, or None if that is also
-    missing.
+    If there is no such entry, returns the entry for the action alone, or None if this entry is
+    missing as well.
     """
     action = str(attributes["action"])
     keys = [f"{action} {value}" for value in attributes.values()] + [action]
@@ -220,7 +220,7 @@ class Synthetic(MotionSource):
 
     Args:
         clips: number of clips.
-        seed: seed for the clips, which must be 0 or more.
+        seed: seed for the clips, 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
         actions: "core" for 22 actions, or "all" to add 54 actions, clips of two simultaneous
             actions, and parts of cycles.
@@ -360,7 +360,7 @@ def _check_often(often: Sequence[str], share: float, actions: Mapping[str, Actio
 def prompts(count: int | None = None) -> list[tuple[str, Attributes]]:
     """Returns fixed prompts and their attributes.
 
-    They are used for samples on dashboards and for `evaluators.metrics.attributes`.
+    The prompts are used for samples on dashboards and for `evaluators.metrics.attributes`.
 
     Args:
         count: number of prompts to return, starting with the first. Default: all.

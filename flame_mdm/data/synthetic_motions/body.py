@@ -2,8 +2,8 @@
 
 The upper body is computed from joint angles with forward kinematics. Two-bone inverse kinematics
 makes the legs follow planned footprints, so that a foot on the ground does not move at all. Hands
-that reach for something also use inverse kinematics. The bone lengths are similar to the
-bone lengths of HumanML3D's reference skeleton (Guo et al. 2022).
+that reach for something also use inverse kinematics. HumanML3D's reference skeleton (Guo et al.
+2022) has similar bone lengths.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def ease(t: np.ndarray, start: float, end: float) -> np.ndarray:
 def pulse(t: np.ndarray, start: float, top: float, leave: float, end: float) -> np.ndarray:
     """Returns a curve that rises from 0 to 1 and falls back to 0.
 
-    It rises between `start` and `top`, and falls between `leave` and `end`.
+    The curve rises between `start` and `top`, and falls between `leave` and `end`.
     """
     return ease(t, start, top) - ease(t, leave, end)
 
@@ -71,9 +71,9 @@ class Body:
     def __init__(
         self, rng: np.random.Generator, t: np.ndarray, width: float | Sequence[float] | None = None
     ):
-        """`width` is half the distance between the feet in meters, or a range to sample it from.
+        """`width` is half the distance between the feet, in meters, or a range for this value.
 
-        None = the width of a relaxed stance.
+        If `width` is a range, the value is drawn from it. None = the width of a relaxed stance.
         """
         self.t = t
         half = rng.uniform(width[0], width[1]) if isinstance(width, Sequence) else width
@@ -114,7 +114,7 @@ class Body:
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
 
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
-        """Blends the current pose of an arm with another pose, which has the weight `weight` (F,).
+        """Blends the current pose of an arm with another pose, whose weight is `weight` (F,).
 
         The other pose consists of four angles: forward, sideways, outward rotation and elbow bend.
         """
@@ -131,8 +131,8 @@ class Body:
         """Moves a wrist toward a point (3,) or (F, 3), in meters, by the fraction `weight` (F,).
 
         If the weight is 0, the angles of the arm determine the position of the wrist. `frame` is
-        "world", "chest" or "head". With "chest" and "head", the point is relative to this joint,
-        with x to the left and z ahead.
+        "world", "chest" or "head". With "chest" or "head", the point is given in the coordinates of
+        this joint: x points to the left, and z points ahead.
         """
         self.reaches.append((side, weight[:, None], np.asarray(target, float), frame))
 

@@ -7,7 +7,7 @@ from flame_mdm.data.synthetic_motions.gestures import seat
 
 
 def hold(rng: np.random.Generator, t: np.ndarray, seconds: float = 0.5) -> np.ndarray:
-    """Returns the weight (F,) of a pose that begins early and lasts until the end of the clip."""
+    """Returns the weight (F,) of a pose that begins early in the clip and lasts until its end."""
     start = rng.uniform(0.05, 0.2)
     return pulse(t, start, start + rng.uniform(0.9, 1.15) * seconds, t[-1] - seconds, t[-1])
 

@@ -109,9 +109,9 @@ def push_ups(body: Body, rng: np.random.Generator, t: np.ndarray, requested: Att
 
 
 def _toes(heel: float) -> tuple[float, float]:
-    """Returns the toe position of a foot with a raised heel, in meters.
+    """Returns the position of the toes, in meters, of a foot with a raised heel.
 
-    The two numbers are the toes' distances in front of the ankle and below it.
+    The two numbers are the distances by which the toes are in front of the ankle and below it.
     """
     _, low, ahead = FOOT
     return ahead * np.cos(heel) + low * np.sin(heel), ahead * np.sin(heel) - low * np.cos(heel)

@@ -21,18 +21,18 @@ STEP_SECONDS, STEP_HEIGHT = 0.35, 0.07
 
 
 def join(first: Body, second: Body, overlap: float = 0.0, blend: float = 0.4) -> Body:
-    """Returns a body that moves like `first` until the end of `first`, and then like `second`.
+    """Returns a body that moves like `first` until `first` ends, and then like `second`.
 
-    The changes during the second motion are added to the end of the first motion. The body at the
-    end of the first motion may differ from the body at the beginning of the second motion. This
-    difference is faded out, except for the position in the world. A foot that has a different
-    position at the beginning of the second motion takes a step to this position.
+    The changes during the second motion are added to the values at the end of the first motion. The
+    body at the end of the first motion may differ from the body at the beginning of the second
+    motion. This difference is faded out, except for the position in the world. A foot that has a
+    different position at the beginning of the second motion takes a step to this position.
 
     Args:
         first: a body at evenly spaced times.
         second: a body at times with the same spacing.
         overlap: seconds by which the second motion begins before the end of the first motion.
-        blend: duration of the fade-out in seconds, from the end of the first motion.
+        blend: duration of the fade-out in seconds, measured from the end of the first motion.
     """
     spacing = second.t[1] - second.t[0]
     start = len(first.t) - min(round(overlap / spacing), len(first.t) - 1) - 1

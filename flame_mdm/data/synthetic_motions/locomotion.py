@@ -51,7 +51,7 @@ class Gait:
 def walk_along(
     body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int
 ) -> np.ndarray:
-    """Moves the pelvis along a path at `speed` m/s, and places footprints on both sides of it.
+    """Moves the pelvis along a path at `speed` m/s, with footprints on both sides of the path.
 
     The foot `first` takes the first step. Returns how far (F,) the right foot is in front of the
     left foot, in meters along the heading of the pelvis.
@@ -125,7 +125,7 @@ def walk_along(
 
 
 def straight(x: float, z: float) -> Path:
-    """Returns a straight path along the vector (x, z), which also determines its length."""
+    """Returns a straight path along the vector (x, z), which also scales the path's length."""
     return lambda share, length: (x * share * length, z * share * length, 0 * share)
 
 

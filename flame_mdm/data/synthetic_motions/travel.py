@@ -136,8 +136,8 @@ def _tread(
     """Lifts the feet alternately in place, the left foot first.
 
     Each foot is lifted by `lift` meters, and moves forward by `ahead` meters while it is in the
-    air. Returns two curves (F,). The first is a wave that is 1 when the left foot is up and -1 when
-    the right foot is up. The second curve indicates whether the body is moving.
+    air. Returns two curves (F,). The first curve is a wave that is 1 when the left foot is up and
+    -1 when the right foot is up. The second curve indicates whether the body is moving.
     """
     t = body.t
     phases = max(2, round((t[-1] - 0.2) * 2 * frequency))

@@ -202,7 +202,7 @@ def _meant(word: str, vocabulary: Collection[str]) -> str | None:
 
 
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:
-    """Splits a sentence that describes several actions into parts.
+    """Splits a sentence with several actions into one part per action.
 
     For example, "walks, turns left and waves. Then she sits" has four parts.
 

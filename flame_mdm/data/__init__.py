@@ -134,12 +134,15 @@ class MotionSource(ABC):
     def counts(self) -> Mapping[str, float]:
         """Returns statistics of the raw data, under the names used in `published.yaml`.
 
-        They are saved once `clips` is exhausted.
+        The statistics are saved once `clips` is exhausted.
         """
         return {}
 
     def findings(self) -> list[str]:
-        """Returns findings about the motions. They are complete once `clips` is exhausted."""
+        """Returns findings about the motions.
+
+        The findings are complete once `clips` is exhausted.
+        """
         return []
 
     def changed(self, store: Path) -> list[str]:

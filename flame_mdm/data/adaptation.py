@@ -117,7 +117,7 @@ def check_clips(path: str | Path, fps: float) -> None:
     that were left out.
 
     Raises:
-        UserError: If a motion cannot be read, if its floor rises, or if its body floats.
+        UserError: If a motion cannot be read, if the floor rises, or if the body floats.
     """
     folder = Folder(str(path))
     faults = [

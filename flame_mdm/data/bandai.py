@@ -256,8 +256,8 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
 
     Args:
         skeleton: skeleton of the file.
-        rotations: (F, J, 3, 3), each relative to the parent joint.
-        translations: (F, J, 3) in centimeters, each relative to the parent joint.
+        rotations: (F, J, 3, 3), rotation of each joint relative to its parent.
+        translations: (F, J, 3), translation of each joint relative to its parent, in centimeters.
     """
     # Each SMPL joint has the same parent as in the file, except spine1, which lies between two
     # joints of the file and rotates with the pelvis. Therefore, with the axes B of the rest pose, a

@@ -1,6 +1,6 @@
 """Rest poses of SMPL and SMPL+H.
 
-They are read from licensed model files, which users must download.
+The poses are read from licensed model files, which users must download.
 """
 
 from pathlib import Path

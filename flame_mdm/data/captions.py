@@ -18,10 +18,10 @@ SPLITTABLE = 10  # with this many motions or more, each split has at least one m
 def table_rows(
     path: Path, columns: Collection[str] = COLUMNS
 ) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yields the rows of a caption table.
+    """Yields each row of a caption table as a pair.
 
-    Each row is a pair of its location (file and line) for error messages and a dictionary that maps
-    each column to its cell.
+    The pair consists of the row's location (file and line), for error messages, and a dictionary
+    that maps each column to its cell.
 
     Raises:
         UserError: If the table is damaged, has no column `id`, or has a column that is not in
@@ -56,7 +56,7 @@ def known_split(split: str) -> Split:
 def drawn_splits(
     sources: Mapping[str, str], stated: Mapping[str, Split | None]
 ) -> dict[str, Split]:
-    """Returns the split of each motion: the split that the table specifies, or a drawn split.
+    """Returns the split of each motion, drawing the splits that the table does not specify.
 
     Splits are drawn with a hash of the source, so that all motions from the same source are in the
     same split. If no motion is drawn for training, the source with the highest hash in the largest

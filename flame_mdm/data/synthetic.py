@@ -222,7 +222,7 @@ class Synthetic(MotionSource):
         clips: number of clips.
         seed: seed for the clips, 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
-        actions: "core" for 22 actions, or "all" to add 54 actions, clips of two simultaneous
+        actions: "core" for 22 actions, or "all" to add 54 actions, clips with two simultaneous
             actions, and parts of cycles.
         core_share: if `actions` is "all", the fraction of clips whose action is drawn from the 22
             core actions, as with "core". The actions of the other clips are drawn from all actions.
@@ -284,7 +284,7 @@ class Synthetic(MotionSource):
         return in_order(partial(self.clip, fps=fps), range(self.size), self.workers)
 
     def clip(self, index: int, fps: float) -> Clip:
-        """Returns clip number `index` with `round(seconds * fps) + 1` frames."""
+        """Returns clip number `index`, which has `round(seconds * fps) + 1` frames."""
         rng = np.random.default_rng((self.seed, index))
         attributes = self.attributes(rng)
         action = str(attributes["action"])

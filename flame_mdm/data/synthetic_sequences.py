@@ -55,15 +55,15 @@ HIGHER = ("climb stairs", "climb ladder")  # they end above the floor, so nothin
 
 
 class SyntheticSequences(Synthetic):
-    """Clips with the end of a previous motion, followed by the motion that the captions describe.
+    """Clips that show the end of a previous motion and then the motion that the captions describe.
 
     The previous motion is a different action, the same action, or standing still. The described
-    motion begins before the body comes to rest. A person who sits, lies or kneels stands up first.
-    Motions such as walking continue until the end of the clip.
+    motion begins before the body comes to rest. A person who is sitting, lying or kneeling stands
+    up first. Motions such as walking continue until the end of the clip.
 
     Args:
         clips: number of clips.
-        seed: seed for the clips, which must be 0 or more.
+        seed: seed for generating the clips; must be 0 or more.
         workers: number of processes that generate clips; 0 = one per core.
         often: see `Synthetic`.
         often_share: see `Synthetic`.
@@ -153,7 +153,7 @@ def _earlier(rng: np.random.Generator, start: str) -> Attributes:
 
 
 def _way(rng: np.random.Generator, posture: str, fps: float, up: bool = False) -> Body:
-    """Returns a body that moves from standing into a posture or, with `up`, back to standing."""
+    """Returns a body that moves from standing to a posture, or back to standing if `up` is True."""
     name = WAYS_DOWN[posture]
     body = _moved(rng, ACTIONS[name].draw(rng, name), fps)
     frames = np.arange(len(body.t))

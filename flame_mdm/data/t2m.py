@@ -56,8 +56,8 @@ class Cut(NamedTuple):
     ) -> Clip:
         """Cuts this part from a motion and returns it as a clip.
 
-        `facts` are additional attributes. The attribute `tokens` is left out if any description has
-        no tokens.
+        `facts` contains additional attributes. The attribute `tokens` is left out if any
+        description has no tokens.
         """
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
         attributes = facts | ({"tokens": tokens} if all(tokens) else {})
@@ -125,7 +125,7 @@ def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
 
 
 def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
-    """Reads the lists of names, and maps each name to its split, in the original order.
+    """Reads the lists of names and maps each name to its split, in the original order.
 
     Raises:
         UserError: If a name is in two splits.
@@ -143,8 +143,8 @@ class T2MFolder(MotionSource):
     """Reader for a processed folder with the layout of HumanML3D and KIT-ML.
 
     Cuts and mirrored copies are in the same split as their motion. The attribute `tokens` contains
-    one list per caption, with its words and their parts of speech. Mirrored copies have names of
-    their own, so they can be excluded separately.
+    one list per caption, with the caption's words and their parts of speech. Mirrored copies have
+    names of their own, so they can be excluded separately.
     """
 
     representation: str  # name of the representation of the features in the folder
@@ -158,7 +158,7 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Maps names of motions to splits. Excluded motions are left out."""
+        """Maps the names of the motions to their splits. Excluded motions are left out."""
         return self.not_excluded(read_splits(self.path, ".txt", self.get_it), self.path)
 
     @cached_property
@@ -222,7 +222,7 @@ class T2MFolder(MotionSource):
     def counts(self) -> dict[str, float]:
         """Returns the statistics that are listed in `published.yaml`.
 
-        Motions, texts and words are counted without mirrored copies.
+        The counts of motions, texts and words exclude mirrored copies.
         """
         texts = [
             text for name, texts in self.texts.items() if not name.startswith("M") for text in texts

@@ -167,12 +167,12 @@ class UESTC(MotionSource):
 
 
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:
-    """Converts VIBE's estimates to a raw motion (F, 75) float32.
+    """Converts VIBE's estimates to a raw float32 motion (F, 75).
 
     VIBE estimates a weak-perspective camera, which consists of a scale s and a shift. ACTOR's code
-    uses the shift as the x and y of the body, and computes the depth from the scale: z = f / (s w /
-    2) for a camera with focal length f and an image that is w pixels wide. Videos of side 2 are
-    rotated about the vertical axis by the angle of their view.
+    uses the shift as the x and y coordinates of the body, and computes the depth z from the scale:
+    z = f / (s w / 2) for a camera with focal length f and an image that is w pixels wide. For
+    videos of side 2, the motion is rotated about the vertical axis by the angle of the view.
 
     Args:
         pose: (F, 72), axis-angle vectors.

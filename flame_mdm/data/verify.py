@@ -28,7 +28,7 @@ STILL_DISTANCE = 0.01
 def report(data: MotionDataModule) -> dict[str, Any]:
     """Checks the hashes and the content of a prepared data set, and writes a report.
 
-    The report is the file `verify.json` in the folder of the store.
+    The report is saved as `verify.json` in the folder of the store.
 
     Returns:
         The content of the report: the data set, the hashes of its `files`, its `figures` next to
@@ -127,8 +127,8 @@ def deviations(content: dict[str, Any]) -> list[str]:
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
     """Returns the figures for the store and its raw data, together with the published ones.
 
-    If a figure exists for both, it is listed twice, and the figure for the store is called `NAME of
-    the store`.
+    A figure that exists for both the store and the raw data is listed twice. The figure for the
+    store is called `NAME of the store`.
     """
     labeled = [clip for clip in store.clips if clip.action is not None]
     counted: dict[str, float] = {"clips": len(store.clips), **store.info["clips"]}

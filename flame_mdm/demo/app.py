@@ -93,7 +93,7 @@ def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
 
 
 class Server(uvicorn.Server):
-    """A server that ends the streams of open pages at shutdown, before it waits for requests."""
+    """A server that, at shutdown, ends the streams of open pages before it waits for requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]
@@ -125,7 +125,7 @@ class Writers:
 
 
 def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
-    """Adds the routes for blocks of streams (`/live`), files of streams, and the stream player."""
+    """Adds the routes for stream blocks (`/live`), stream files, and the stream player."""
     waiting = 0
 
     @app.get("/live.html")

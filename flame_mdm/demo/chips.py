@@ -21,8 +21,8 @@ SHOWN = ("direction", "speed", "count", "side")  # attributes that are shown as 
 def chips(abilities: Abilities, parts: Sequence[Part], readings: Sequence[Reading]) -> str:
     """Returns the chips for a text: its actions in order, their attributes, and ignored words.
 
-    Each option of a chip is the entire text, with a different word for the action or attribute. The
-    option that the user chooses replaces the text in the form.
+    The value of each option is the entire text, with a different word for the action or attribute.
+    The option that the user chooses replaces the text in the form.
 
     Args:
         abilities: the actions and attributes that the model knows, which become the options of the

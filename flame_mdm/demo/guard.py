@@ -1,4 +1,4 @@
-"""A guard for the demo's server that refuses all requests that do not come from the page."""
+"""A guard that refuses all requests to the demo's server unless they come from the page."""
 
 import asyncio
 import ipaddress
@@ -66,7 +66,7 @@ class Call(Post):
 
 
 class Reset(Post):
-    """A message in which the page states that it no longer waits for the result of a call."""
+    """A message in which the page states that it is no longer waiting for the result of a call."""
 
     event_id: Id
 
@@ -82,7 +82,7 @@ Meters = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)]
 
 
 class LiveCall(Post):
-    """A request for a stream's frames from index `begin` on; `stream` is "" for a new stream."""
+    """A request for a stream's frames from index `begin`; `stream` is "" for a new stream."""
 
     stream: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{32})?$")]
     text: Annotated[str, StringConstraints(min_length=1, max_length=MAX_TEXT, pattern=PLAIN)]

@@ -86,13 +86,13 @@ class LiveStreams:
     def block(
         self, name: str, text: str, begin: int, path: Sequence[tuple[float, float]] = ()
     ) -> dict[str, Any]:
-        """Returns the frames of a stream from frame `begin` on, in the player's format.
+        """Returns the frames of a stream, starting at frame `begin`, in the player's format.
 
         Args:
             name: name of the stream, or "" to begin a new stream, whose name is in the result.
             text: description of the motion.
-            begin: index of the first frame to return. Existing frames of the stream from this index
-                on are dropped and replaced.
+            begin: index of the first frame to return. Existing frames of the stream at or after
+                this index are dropped and replaced.
             path: waypoints (x, z), in meters, that are still ahead in frame `begin`. `reached` in
                 the result lists the indices of the frames in which waypoints are reached, in order.
 
@@ -127,7 +127,7 @@ class LiveStreams:
         }
 
     def file(self, name: str, ending: str) -> bytes:
-        """Returns the content of a motion file with the last minute of a stream.
+        """Returns the content of a motion file that contains the last minute of a stream.
 
         Raises:
             UserError: If the stream has ended, or if no file format has this extension.

@@ -109,7 +109,7 @@ class DemoRequest(BaseModel):
     def total_seconds(self, parts: Sequence[tuple[str, float | None]]) -> float:
         """Returns the total duration of the parts.
 
-        A part without a duration is as long as `seconds` or, if that is None, `USUAL_SECONDS`.
+        A part without a duration lasts `seconds` or, if `seconds` is None, `USUAL_SECONDS`.
         """
         return sum(seconds or self.seconds or USUAL_SECONDS for _, seconds in parts)
 

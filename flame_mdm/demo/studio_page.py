@@ -368,7 +368,7 @@ def _links(files: Sequence[tuple[str, str]]) -> str:
 
 
 def _examples(model: MotionGenerator) -> dict[str, str]:
-    """Returns texts or actions from the training data, with picture addresses ("" = no picture)."""
+    """Maps texts or actions from the training data to picture addresses ("" = no picture)."""
     if model.conditioned_on == "text" and Reader.fits(model.facts):
         doable = Abilities(model.facts).actions
         return {

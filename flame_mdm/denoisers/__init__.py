@@ -21,11 +21,12 @@ class Denoiser(nn.Module, ABC):
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads, which must divide `latent_dim`.
+        num_heads: number of attention heads; must divide `latent_dim`.
         dropout: probability of dropout after the positional encoding and inside the layers, from 0
             to 1 (exclusive).
         project_condition: whether to project the condition before it is added to the time
-            embedding. MDM does not project action embeddings. C must then equal `latent_dim`.
+            embedding. MDM does not project action embeddings. Without the projection, C must equal
+            `latent_dim`.
 
     Example:
         >>> import torch

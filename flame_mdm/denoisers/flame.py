@@ -25,7 +25,7 @@ class FLAME(Denoiser):
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads, which must divide `latent_dim`.
+        num_heads: number of attention heads; must divide `latent_dim`.
         dropout: probability of dropout inside the layers.
         max_frames: maximum length of a motion that ML can embed.
         length_token: whether to include ML, which the first row of table 4 omits.
@@ -34,7 +34,8 @@ class FLAME(Denoiser):
         condition_frames: whether to also add TS and CLS to every frame. A small network then learns
             to follow the text in fewer training steps.
         length_unit: unit of the embedded length, in frames. ML embeds the length rounded down to a
-            multiple of this unit, because the lengths of training windows are such multiples.
+            multiple of this unit, because the lengths of all training windows are multiples of the
+            unit.
 
     Example:
         >>> denoiser = FLAME(

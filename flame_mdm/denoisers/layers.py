@@ -161,7 +161,7 @@ class Transformer(nn.Module):
 
 
 class TimeAndCondition(nn.Module):
-    """Embedding of time and condition, the token z_tk of MDM (Tevet et al. 2023, section 3).
+    """Embeds the time and the condition as MDM's token z_tk (Tevet et al. 2023, section 3).
 
     The embedding is the time's sinusoid, passed through two linear layers, plus the projected
     condition. The null condition is a zero vector *before* the projection, so that only the bias of

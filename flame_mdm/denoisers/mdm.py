@@ -22,7 +22,7 @@ class MDMEncoder(Denoiser):
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads, which must divide `latent_dim`.
+        num_heads: number of attention heads; must divide `latent_dim`.
         dropout: probability of dropout after the positional encoding and inside the layers.
         project_condition: whether to project the condition before it is added to the time embedding.
         max_tokens: maximum number of condition tokens between the time and the frames (30 in MFM
@@ -105,8 +105,8 @@ class MDMDecoder(Denoiser):
     """Transformer decoder over the frames; used by MDM and DiP.
 
     The memory of the cross-attention is time + condition. With `context_frames`, clean frames
-    precede the noisy frames, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1). Only their
-    positions identify them as clean, and their outputs are discarded.
+    precede the noisy frames, as in DiP (Tevet et al. 2025, "CLoSD", section 3.1). Clean frames are
+    identified only by their positions, and their outputs are discarded.
 
     Args:
         in_features: D, the number of features per frame.
@@ -115,7 +115,7 @@ class MDMDecoder(Denoiser):
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
         num_layers: number of layers.
-        num_heads: number of attention heads, which must divide `latent_dim`.
+        num_heads: number of attention heads; must divide `latent_dim`.
         dropout: probability of dropout after the positional encoding and inside the layers.
         project_condition: whether to project the condition before it is added to the time embedding.
         input_token: content of the token before the frames, if any. "condition" is time +
@@ -123,8 +123,8 @@ class MDMDecoder(Denoiser):
             the time, as in MDM's code since February 2025.
         token_memory: whether to use all condition tokens as memory, with the time added to each of
             them, as MDM does with DistilBERT.
-        memory: how the time is included in a memory of all tokens: "add" adds it to each token, and
-            "concat" places it before them as a separate token.
+        memory: how the time is included in a memory of all tokens: "add" adds the time to each
+            token, and "concat" places it before the tokens as a separate token.
         mask_padding: whether to mask the padding in attention. In the released models without
             `mask_frames`, frames attend to the padding.
         context_frames: number of clean frames that precede the motion; see `Condition.prefix`.

@@ -1,4 +1,4 @@
-"""Encoders of target conditions, which state where joints should be at the end of a motion.
+"""Encoders for target conditions, which specify where joints should be at the end of a motion.
 
 Source: Tevet et al. 2025, "CLoSD". A target (B, 8, 4) contains one slot per joint. Each slot
 contains x, y, z, and a flag, which is 1 if the joint is requested and 0 if it is free.
@@ -20,7 +20,7 @@ SLOTS = 8
 class TargetEncoder(nn.Module, ABC):
     """Embeds the target of a condition as vectors (B, features). Without a target, the embedding is 0.
 
-    A target that requests no joints is not equivalent to no target, because its embedding contains
+    A target that requests no joints differs from a missing target, because its embedding contains
     the biases of the network.
 
     Example:
@@ -54,7 +54,7 @@ class SingleTarget(TargetEncoder):
 
 
 class SplitTarget(TargetEncoder):
-    """Embeds each slot with a separate network, and concatenates the outputs."""
+    """Embeds each slot with a separate network and concatenates the outputs."""
 
     def __init__(self, features: int, layers: int):
         super().__init__()
@@ -75,10 +75,10 @@ class SplitTarget(TargetEncoder):
 
 
 class MultiTarget(TargetEncoder):
-    """Embeds each slot with a separate network, and returns a weighted sum over requested slots.
+    """Embeds each slot with a separate network and returns a weighted sum over the requested slots.
 
-    The learned weights are divided by their sum over all slots, which may be near 0, as in the
-    authors' code. `layers` has no effect.
+    As in the authors' code, the learned weights are divided by their sum over all slots. This sum
+    may be near 0. `layers` has no effect.
     """
 
     def __init__(self, features: int, layers: int):

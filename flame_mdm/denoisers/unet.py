@@ -22,8 +22,8 @@ class MDMUNet(Denoiser):
     """U-Net over time, for motions of any length. The features of a frame are its channels.
 
     Padding does not affect real frames. Padded frames are set to 0 before every convolution, as if
-    the motion ended there, and are excluded from the normalization statistics. A frame of a coarser
-    level is real if the first of its two finer frames is real.
+    the motion ended there, and are excluded from the normalization statistics. A frame at a coarser
+    level is real if the first of its two frames at the finer level is real.
 
     Args:
         in_features: D, the number of features per frame.
@@ -31,7 +31,7 @@ class MDMUNet(Denoiser):
         cond_features: C; 0 = unconditional.
         latent_dim: width of the time and condition embeddings.
         channels: width of each level. Each level has half the frame rate of the previous one.
-        num_groups: number of groups in each group norm, which must divide all widths.
+        num_groups: number of groups in each group norm; must divide all widths.
         dropout: probability of dropout inside the blocks.
         project_condition: whether to project the condition before it is added to the time
             embedding.

@@ -1,11 +1,11 @@
 """ASF/AMC motion capture files (Acclaim, CMU): one file per skeleton, and one per motion.
 
-An ASF file lists the bones of a subject. For each bone, it contains the direction (in world
-coordinates) and the length in the standing rest pose, the axes C of the coordinate system in which
-the bone turns, and the degrees of freedom. An AMC file contains the angles of these degrees of
-freedom in each frame. If M is the rotation given by these angles, the bone turns by C M C^-1
-relative to its parent. With the order XYZ, for example, the rotation about x is applied first:
-C = Rz Ry Rx.
+An ASF file lists the bones of a subject. For each bone, it contains the bone's direction in world
+coordinates and its length, both in the standing rest pose. It also contains the axes C of the
+coordinate system in which the bone turns, and the bone's degrees of freedom. An AMC file contains
+the angles of these degrees of freedom in each frame. If M is the rotation given by these angles,
+the bone turns by C M C^-1 relative to its parent. With the order XYZ, for example, the rotation
+about x is applied first: C = Rz Ry Rx.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class Bone(NamedTuple):
         vector: (3,), from the start of the bone to its end.
         axes: the axes C, as a rotation.
         order: order of the axes, such as "XYZ".
-        freedoms: names of the degrees of freedom, such as "RX", in the order of the file.
+        freedoms: names of the degrees of freedom, such as "RX", in the order in which the file
+            lists them.
     """
 
     vector: np.ndarray

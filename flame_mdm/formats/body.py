@@ -110,7 +110,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
 
 
 def local_rotations(body: FittedBody) -> np.ndarray:
-    """Returns the rotations of a body's joints relative to the parents, with shape (F, 22, 3, 3).
+    """Returns the rotations of a body's joints relative to their parents, with shape (F, 22, 3, 3).
 
     The bend of the toes is included.
     """

@@ -44,8 +44,8 @@ def bone_poses(
 ) -> BoneRotations:
     """Returns the rotations of SMPL's joints, taken from the bones in a file.
 
-    The file's rotations cannot be used if the rest pose is unknown, or if they do not reproduce the
-    joint positions, for example because position channels move each joint.
+    The file's rotations cannot be used if the rest pose is unknown or if the rotations do not
+    reproduce the joint positions, for example because position channels move each joint.
 
     Args:
         tree: the tree of joints in the file.
@@ -108,7 +108,7 @@ def _rest(
 
 
 def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
-    """Returns the bone rotations (22, 3, 3) in a pose, turned so that y is up and +z is ahead.
+    """Returns the bone rotations (22, 3, 3) in a pose, turned so that y is up and +z is forward.
 
     Returns None if the body is not upright in the `pose` (22, 3).
     """

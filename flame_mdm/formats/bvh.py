@@ -59,7 +59,7 @@ class Bvh:
         ]
 
     def rotations(self) -> np.ndarray:
-        """Returns the joint rotations relative to the parents, with shape (F, J, 3, 3)."""
+        """Returns the joint rotations relative to the joints' parents, with shape (F, J, 3, 3)."""
         rotations = np.tile(np.eye(3), (len(self.frames), len(self.joints), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
@@ -141,7 +141,7 @@ def read_lines(path: str | Path) -> Lines:
 def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
-    Raises a `UserError` that names the file and the line if the file is incomplete or invalid.
+    If the file is incomplete or invalid, raises a `UserError` that names the file and the line.
     """
     source = read_lines(path)
     if [word.upper() for word in next(iter(source), [])] != ["HIERARCHY"]:

@@ -160,7 +160,7 @@ def read_skinned(path: Path) -> Character:
 
 
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the pose in which the skin was bound, and the corners of a box around the meshes.
+    """Returns the bind pose of the skin and the corners of a box around the meshes.
 
     The pose consists of one matrix per node, with shape (N, 4, 4). If the nodes are stored in a
     different pose, the orientation of the skin's coordinates is derived from the pelvis, which is
@@ -204,7 +204,7 @@ def moved(character: RestPose, motion: PosedFigure) -> tuple[np.ndarray, np.ndar
 class UnknownJoints(UserError):
     """Error raised when joints cannot be identified.
 
-    `template` contains the lines of a file that lists joint names, for the user to complete.
+    `template` contains the lines of a file with joint names, which the user can complete.
     """
 
     def __init__(self, message: str, template: list[str]):
@@ -279,7 +279,7 @@ def known_skeletons() -> list[dict[str, str]]:
 
 
 def write(path: Path, character: Character, motion: PosedFigure, name: str) -> str:
-    """Writes the motion to a copy of the character's file; returns a summary line.
+    """Writes the motion to a copy of the character's file and returns a summary line.
 
     The motion becomes the first animation in the file.
     """
@@ -325,7 +325,7 @@ def write(path: Path, character: Character, motion: PosedFigure, name: str) -> s
 
 
 def write_bvh(path: Path, character: BvhCharacter, motion: PosedFigure) -> str:
-    """Writes the motion to a copy of the character's file; returns a summary line."""
+    """Writes the motion to a copy of the character's file and returns a summary line."""
     if path.suffix.lower() != ".bvh":
         raise UserError(
             f"{path}: a .bvh character has no meshes, so it can only be saved as a .bvh file"

@@ -49,7 +49,7 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
     the user can correct both at once.
 
     Raises:
-        UserError: If the size is wrong, if a foot has no length, or if the feet point backwards.
+        UserError: If the size is wrong, if a foot has no length, or if the feet point backward.
     """
     doubt = lying(joints, layout.up, np.array(UP[layout.up], float))
     check_size(joints, layout.unit, layout.children, doubt)
@@ -121,9 +121,9 @@ def below_floor(joints: np.ndarray) -> str:
 def rest_frames(joints: np.ndarray, fps: float) -> int:
     """Returns the number of initial frames that show a rest pose or lead from it to the motion.
 
-    Several programs write a T-pose or A-pose as the first frame. The pose then jumps to the motion,
-    or changes to it within a few frames. If the person really stood in a rest pose at first, there
-    is no such jump, and no frames are counted.
+    Several programs write a T-pose or A-pose as the first frame. From this pose, the body then
+    jumps to the motion or moves to it within a few frames. If the person really stood in a rest
+    pose at first, there is no such jump, and no frames are counted.
     """
     if len(joints) < 3 or not _is_rest_pose(joints[0].astype(float)):
         return 0

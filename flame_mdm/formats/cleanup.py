@@ -1,4 +1,4 @@
-"""Cleanup of generated motion.
+"""Cleans up generated motions.
 
 Cleanup smooths the paths of joints, makes bone lengths constant, keeps feet in place and above the
 floor, and moves hands out of the body.

@@ -1,4 +1,4 @@
-"""Conversion of motions to the joint positions or SMPL rotations that representations encode."""
+"""Converts motions to the joint positions or SMPL rotations that representations encode."""
 
 from dataclasses import dataclass
 
@@ -38,9 +38,9 @@ class RawMotion:
     Attributes:
         values: joint positions (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
-        note: a line for the user if a body with different proportions was used, otherwise "". The
-            line states the error, and whether the rotations come from the file or were fitted to
-            the joints.
+        note: a line for the user if a body with different proportions was used, or "" otherwise.
+            The line states the error, and whether the rotations come from the file or were fitted
+            to the joints.
         error: mean distance in meters between the joints of this body and the joints of the motion.
     """
 
@@ -60,8 +60,8 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
     Joint positions are resampled with cubic splines, and rotations with spherical interpolation
     (slerp). KIT-ML's 21 joints are computed from SMPL's joints. If SMPL rotations are unknown, they
     are computed from the bones of the file or, without bones, fitted to the joints. Rotations that
-    are computed or fitted in this way are for a body with an adult's bones, whose path is scaled in
-    proportion to the leg length.
+    are computed or fitted in this way describe a body with an adult's bones. The path of this body
+    is scaled in proportion to the leg length.
 
     Raises:
         UserError: If the representation cannot encode the skeleton of the motion.
@@ -126,15 +126,15 @@ def _rotations(motion: Motion, fps: float, axes: Tensor) -> RawMotion:
 
 
 def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
-    """Transfers a motion to an adult body, and scales its path in proportion to the leg length.
+    """Transfers a motion to an adult body and scales the path in proportion to the leg length.
 
     Args:
         body: the motion on a body with its original bone lengths.
         joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:
-        The poses, and an array (F, 22): the distance in meters between each joint in these poses
-        and the same joint in the scaled `joints`.
+        The poses, and an array (F, 22) with the distance in meters between each joint in these
+        poses and the same joint in the scaled `joints`.
     """
     adult = body.offsets.new_tensor(ADULT[: len(SMPL22)])
     legs = list(LEGS)

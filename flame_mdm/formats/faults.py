@@ -242,7 +242,7 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns vectors (F, P, 3) from a segment to points (F, P, 3).
 
-    Each vector begins at the nearest point of the segment. `start` and `end` are (F, 3).
+    Each vector begins at the nearest point of the segment. `start` and `end` have the shape (F, 3).
     """
     axis, points = (end - start)[:, None], points - start[:, None]
     share = (points * axis).sum(-1, keepdims=True) / np.maximum(

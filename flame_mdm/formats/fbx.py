@@ -113,7 +113,7 @@ class Short(int):
 
 
 def read(path: Path) -> Record:
-    """Reads a binary FBX file of version 7, and returns the record that contains all others.
+    """Reads a binary FBX file of version 7 and returns the record that contains all others.
 
     Raises:
         UserError: If the file is too large or damaged, is an ASCII file, or has an earlier version.
@@ -158,7 +158,7 @@ class _Reader:
         return root
 
     def _record(self, start: int, limit: int, depth: int) -> tuple[Record, int] | None:
-        """Returns the record at `start`, and where the record ends; None at the end of a list."""
+        """Returns the record at `start` and its end position, or None at the end of a list."""
         end, count, size, length = self.head.unpack_from(self.content, start)
         if end == 0:
             return None

@@ -72,7 +72,7 @@ class Curve:
     """An animation curve: a number that depends on time.
 
     Attributes:
-        times: (K,), times of the keys in seconds, increasing.
+        times: (K,), times of the keys in seconds, in increasing order.
         values: (K,), value at each of these times.
         flags: (K,), method of interpolation from each key to the next.
         slopes: (K, 2), for cubic segments, the slopes per second after each key and before the next
@@ -87,8 +87,8 @@ class Curve:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F,) at times (F,) in seconds.
 
-        Times before the first key get the value of the first key, and times after the last key get
-        the value of the last key.
+        Before the first key, the result is the value of the first key. After the last key, the
+        result is the value of the last key.
         """
         if len(self.times) == 1:
             return np.full(len(times), self.values[0])
@@ -327,7 +327,7 @@ class _Scene:
         return CENTIMETER * (scale if 0 < scale < LARGEST else 1)
 
     def _axes(self) -> np.ndarray:
-        """Returns the rotation (3, 3) from the axes of the file to x left, y up and z ahead."""
+        """Returns the rotation (3, 3) from the file's axes to x left, y up and z forward."""
         axes = np.zeros((3, 3))
         for row, name, usual in ((0, "Coord", 0), (1, "Up", 1), (2, "Front", 2)):
             axis = int(self._setting(f"{name}Axis", usual))

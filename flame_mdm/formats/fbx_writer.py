@@ -93,7 +93,7 @@ class _Writer:
         return root
 
     def _new(self) -> int:
-        """Returns the id of a new object. Some readers fail with negative or small ids."""
+        """Returns the id of a new object. Some readers cannot handle negative or small ids."""
         self.last_id += 1
         return self.last_id
 
@@ -268,7 +268,7 @@ class _Writer:
         axes: Sequence[str] = AXES,
         interpolation: int = LINEAR_KEY,
     ) -> None:
-        """Adds a curve for each axis of a property; `values` are (F, axes)."""
+        """Adds a curve for each axis of a property; `values` has the shape (F, axes)."""
         # An animated property is a CurveNode that is connected to the property of the bone. Each
         # axis has a curve with times, values and flags. One flag applies to all keys.
         node, record = self._object("AnimationCurveNode", label, "", "AnimCurveNode")

@@ -95,7 +95,7 @@ def direction(degrees: float) -> np.ndarray:
 
 
 def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the root's velocities (F,) along a direction, and at 90 degrees to the left of it.
+    """Returns the root's velocities (F,) in a direction and 90 degrees to the left of this direction.
 
     The direction is relative to the heading of the root.
     """

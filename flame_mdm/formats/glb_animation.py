@@ -91,7 +91,7 @@ class Track:
     """A property of a node over time.
 
     Attributes:
-        times: (K,), times of the keys in seconds, increasing.
+        times: (K,), times of the keys in seconds, in increasing order.
         values: (K, C), value at each of these times.
         interpolation: method of interpolation between the keys, such as "LINEAR".
         slopes: (2, K, C), slopes per second before and after each key; used only for CUBICSPLINE.
@@ -105,8 +105,8 @@ class Track:
     def at(self, times: np.ndarray) -> np.ndarray:
         """Returns the values (F, C) at times (F,). Rotations are not normalized.
 
-        Times before the first key get the value of the first key, and times after the last key get
-        the value of the last key.
+        Before the first key, the result is the value of the first key. After the last key, the
+        result is the value of the last key.
         """
         # Each time lies in a segment between two keys. CUBICSPLINE stores slopes per second, which
         # are converted to slopes per segment.

@@ -43,7 +43,7 @@ class GroundedMotion:
 
     Attributes:
         local: (F, 22, 3), joint positions relative to the root, which faces +z.
-        path: (F, 2), x and z of the root.
+        path: (F, 2), x and z coordinates of the root.
         heading: (F,), direction of the root; 0 = facing +z.
         contacts: (F, 2), whether the left and the right toes are planted.
         fps: frames per second.
@@ -140,7 +140,7 @@ def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
 def anchored(
     motion: GroundedMotion, pose: np.ndarray, seconds: float, *, at_end: bool
 ) -> GroundedMotion:
-    """Replaces the first or last pose of a motion, and blends the change out over `seconds`.
+    """Replaces the first or last pose of a motion and fades the change out over `seconds`.
 
     `pose` (22, 3) is relative to the root. Bones keep their lengths.
     """
@@ -180,9 +180,9 @@ def planted(
 ) -> GroundedMotion:
     """Returns a copy of the motion in which the toes stay in place during contacts.
 
-    The toes also stay above the floor. If a leg is too short to reach, the body is lowered. With
-    `fixed_start`, the first pose does not change; with `fixed_end`, the last pose does not change.
-    A foot that is planted in such a fixed pose stays where it is in that pose.
+    The toes also stay above the floor. If a leg is too short to reach the planted foot, the body is
+    lowered. With `fixed_start`, the first pose does not change; with `fixed_end`, the last pose
+    does not change. A foot that is planted in such a fixed pose keeps its position from this pose.
     """
     # Each toe is moved to one footprint per contact. If a leg is too short for its footprint, the
     # whole body is lowered smoothly for a moment. Then the legs bend to reach the footprints.

@@ -58,7 +58,7 @@ Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """How the joints in files map to SMPL's 22 joints, whose positions are in meters, y up.
+    """A map from the joints in files to SMPL's 22 joints, with positions in meters, y up.
 
     The fields are the keys of `skeleton.yaml`.
     """
@@ -84,7 +84,7 @@ class Layout(BaseModel):
 
     @property
     def used(self) -> set[str]:
-        """The names, as used in the files, of the joints that the map uses."""
+        """The names of the joints that the map uses, as spelled in the files."""
         return {name for source in self.map.values() for name in _shares(source)}
 
     @property
@@ -146,7 +146,7 @@ class Layout(BaseModel):
         return pairs
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Maps joints (F, J, 3), which have these names, to SMPL's joints (F, 22, 3).
+        """Maps joints (F, J, 3) with the given names to SMPL's joints (F, 22, 3).
 
         The result is float32, in meters, y up.
         """
@@ -328,7 +328,7 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 
 
 def _one(name: str, candidates: Sequence[str]) -> str:
-    """Returns the joint of a file to which a name refers.
+    """Returns the joint in a file to which the given name refers.
 
     If several joints match, the joint with exactly this name is returned.
     """
@@ -372,7 +372,7 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 def read_skeleton(path: Path) -> dict[str, Any]:
     """Reads fields of `Layout` from a skeleton file.
 
-    Raises a `UserError` that names the file and the key if a field is invalid.
+    If a field is invalid, raises a `UserError` that names the file and the key.
     """
     try:
         fields = Layout.model_validate(read_yaml(path)).model_dump(exclude_unset=True)
@@ -439,7 +439,10 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
 
 
 def _usual_unit(leg: float, unit: float) -> str:
-    """Returns advice for a file whose `leg` length in meters is implausible in all common units."""
+    """Returns advice for a file whose leg length is implausible in all common units.
+
+    `leg` is the length in meters that results from `unit`.
+    """
     usual = unit * USUAL_LEG / leg if leg > 0 else 0.0
     if not 0 < usual < math.inf:
         return "The unit is wrong"
@@ -455,7 +458,7 @@ def check_feet(joints: np.ndarray) -> None:
     """Checks the feet of a body with SMPL's joints (F, 22, 3).
 
     Raises:
-        UserError: If a foot has no length, or if the toes point backwards.
+        UserError: If a foot has no length, or if the toes point backward.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     for side in ("left", "right"):
@@ -494,7 +497,7 @@ def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
         skeleton: name of the skeleton.
 
     Raises:
-        UserError: If limbs differ in length between the sides, or if their length changes.
+        UserError: If limbs differ in length between the sides, or if the length of a limb changes.
     """
     lengths = np.stack(
         [_lengths(joints, side + start, side + end) for side in SIDES for start, end in LIMBS], 1

@@ -1,4 +1,4 @@
-"""Matching of joint names.
+"""Matches joint names.
 
 The Blender extension also contains this file, so it uses only the standard library.
 

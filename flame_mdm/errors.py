@@ -29,7 +29,7 @@ class UserError(ValueError):
 def first_line(error: BaseException) -> str:
     """Returns the first line of an error's message.
 
-    If that line ends with a colon, the second line is appended.
+    If the first line ends with a colon, the second line is appended.
     """
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     if len(lines) > 1 and lines[0].endswith(":"):

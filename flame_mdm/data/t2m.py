@@ -30,8 +30,8 @@ MAX_TOKENS = 20
 class Description(NamedTuple):
     """One line of a text file.
 
-    The line describes the motion from `begin` to `end`, in seconds. Both are 0 if the line
-    describes the entire motion.
+    The line describes the motion from `begin` to `end`, in seconds. `begin` and `end` are 0 if the
+    line describes the entire motion.
     """
 
     caption: str
@@ -66,7 +66,7 @@ class Cut(NamedTuple):
 
 
 def parse(text: str, where: str) -> list[Description]:
-    """Parses the descriptions in a text file. As in the published code, a NaN tag means 0.
+    """Parses the descriptions in a text file. As in the published code, a NaN tag is treated as 0.
 
     `where` identifies the file in error messages.
     """
@@ -116,9 +116,9 @@ def words_of(caption: str) -> list[str]:
 
 
 def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
-    """Returns up to 20 tokens between sos and eos, padded to 22 with unk.
+    """Returns up to 20 tokens, enclosed in sos and eos and padded to 22 tokens with unk.
 
-    Also returns the number of tokens without padding.
+    Also returns the number of tokens before padding.
     """
     framed = ["sos/OTHER", *tokens[:MAX_TOKENS], "eos/OTHER"]
     return framed + ["unk/OTHER"] * (MAX_TOKENS + 2 - len(framed)), len(framed)

@@ -58,7 +58,7 @@ class UESTC(MotionSource):
 
     As in the published data set, training clips with fewer than 45 frames are left out, and all
     test clips are kept. In the published split, all 51 training subjects are used for training. The
-    project's own split uses 5 of these subjects for validation.
+    project's own split uses 5 of these training subjects for validation.
     """
 
     name = "uestc"
@@ -78,7 +78,7 @@ class UESTC(MotionSource):
     def count(self) -> int:
         """Returns the number of videos.
 
-        This includes the few videos that turn out to be too short when they are read.
+        The number includes the few videos that turn out to be too short when they are read.
         """
         return len(self.used)  # including the few that are left out when their poses are read
 

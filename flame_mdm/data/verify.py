@@ -32,9 +32,9 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
     Returns:
         The content of the report: the data set, the hashes of its `files`, its `figures` next to
-        the published ones, the number of captions, the number of clips per action, the lengths of
-        the clips, clips that are `still` or `duplicates`, deviations of the stored statistics, and
-        `excluded` clips.
+        the published figures, the number of captions, the number of clips per action, the lengths
+        of the clips, clips that are `still` or `duplicates`, deviations of the stored statistics,
+        and `excluded` clips.
 
     Raises:
         FileNotFoundError: If the data set is not prepared.
@@ -112,7 +112,7 @@ def lines(content: dict[str, Any]) -> list[str]:
 
 
 def deviations(content: dict[str, Any]) -> list[str]:
-    """Returns one line for each figure that differs from the published one."""
+    """Returns one line for each figure that differs from the published figure."""
     differing = [
         (name, f["found"], f["published"])
         for name, f in content["figures"].items()
@@ -125,7 +125,7 @@ def deviations(content: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store) -> dict[str, dict[str, Any]]:
-    """Returns the figures for the store and its raw data, together with the published ones.
+    """Returns the figures for the store and its raw data, together with the published figures.
 
     A figure that exists for both the store and the raw data is listed twice. The figure for the
     store is called `NAME of the store`.

@@ -1,6 +1,6 @@
 """The demo's server: page, motion files and limits.
 
-It requires the `demo` extra (gradio).
+The server requires the `demo` extra (gradio).
 """
 
 import asyncio
@@ -172,7 +172,7 @@ def add_live(app: FastAPI, live: LiveStreams, writers: Writers) -> None:
 def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
     """Returns the application, which serves the page at `/` and files at `/motion.bvh?...`.
 
-    The addresses of the files contain the query string of a link.
+    The address of a file contains the query string of a link to the request.
     """
     app = FastAPI(openapi_url=None)
     writers = Writers()

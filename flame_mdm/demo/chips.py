@@ -77,7 +77,7 @@ def _step(
 
 
 def _action_label(action: str) -> str:
-    """Returns the words for an action without its usual direction.
+    """Returns the words for an action, without the action's usual direction.
 
     The direction is omitted, because another chip may contradict it.
     """

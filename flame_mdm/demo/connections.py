@@ -60,7 +60,10 @@ class Connection(H11Protocol):
         self.stall: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Watches a new connection and closes the longest-waiting ones if there are too many."""
+        """Watches a new connection.
+
+        If there are too many connections, the longest-waiting connections are closed.
+        """
         super().connection_made(transport)
         self.network = _network(self.client[0]) if self.client else None
         self._watch()

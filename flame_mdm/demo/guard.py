@@ -47,7 +47,7 @@ Id = Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")]
 
 
 class Post(BaseModel):
-    """The body of a request. Its values are not converted, and unknown keys are refused."""
+    """The body of a request. Values are not converted, and unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -55,7 +55,7 @@ class Post(BaseModel):
 class Call(Post):
     """A call to one of the page's functions.
 
-    Its arguments are strings, never objects that could refer to a file.
+    The arguments are strings, never objects that could refer to a file.
     """
 
     data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
@@ -103,12 +103,12 @@ POSTS: dict[str, type[Post]] = {
 class Guard:
     """ASGI middleware that checks requests before the application receives them.
 
-    It checks the host, origin, path, size and content of the request. `hosts` contains the names of
-    this server, in addition to localhost and numeric addresses. A request with any other host name
-    may come from a page whose domain name was made to resolve to this computer (DNS rebinding).
-    `calls` contains one entry per function that the page can call: the key is the function's index,
-    and the value consists of the function's path and a check of the arguments. `is_open` returns
-    whether a session has called a function and may therefore read results.
+    The guard checks the host, origin, path, size and content of the request. `hosts` contains the
+    names of this server, in addition to localhost and numeric addresses. A request with any other
+    host name may come from a page whose domain name was made to resolve to this computer (DNS
+    rebinding). `calls` contains one entry per function that the page can call: the key is the
+    function's index, and the value consists of the function's path and a check of the arguments.
+    `is_open` returns whether a session has called a function and may therefore read results.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Guard:
     async def _until_closing(self, receive: Receive) -> Message:
         """Returns the next message.
 
-        When the server stops, this is a disconnect message, so that open streams end.
+        When the server stops, the next message is a disconnect message, so that open streams end.
         """
         tasks = [asyncio.ensure_future(receive()), asyncio.ensure_future(self.closing.wait())]
         try:

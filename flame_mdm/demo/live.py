@@ -73,7 +73,7 @@ class LiveStreams:
     def can_lead(self) -> bool:
         """Whether visitors can lead the person along waypoints.
 
-        This requires the representation `HumanML` and a model that understands the text `WALK`.
+        Waypoints require the representation `HumanML` and a model that understands the text `WALK`.
         """
         if not isinstance(self.model.representation, HumanML):
             return False
@@ -163,7 +163,7 @@ class LiveStreams:
         return name, self._streams[name]
 
     def _running(self, name: str) -> LiveStream:
-        """Returns a stream by its name. Raises `UserError` if it has ended."""
+        """Returns the stream with the given name. Raises `UserError` if the stream has ended."""
         if name not in self._streams:
             raise UserError("this stream has ended. Reload the page to start another one")
         return self._streams[name]

@@ -114,7 +114,7 @@ class DemoRequest(BaseModel):
         return sum(seconds or self.seconds or USUAL_SECONDS for _, seconds in parts)
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps as (index of the motion to edit, keywords for `generate` or `edit`).
+        """Returns steps as pairs (index of the motion to edit, keywords for `generate` or `edit`).
 
         In the first step, which generates motions, the index is None.
         """
@@ -176,7 +176,7 @@ def query_pairs(query: str) -> list[tuple[str, str]]:
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
-    """Returns the request in the query string of a link. Raises `UserError` if it is invalid.
+    """Returns the request in the query string of a link. Raises `UserError` for invalid requests.
 
     Keys that begin with "__" belong to the host and are ignored.
     """
@@ -200,7 +200,7 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
 def checked(values: dict[str, Any]) -> DemoRequest:
     """Builds a request, replacing empty values with the defaults.
 
-    If a value is invalid, raises a `UserError` that quotes it.
+    If a value is invalid, raises a `UserError` that quotes the value.
     """
     try:
         return DemoRequest(

@@ -15,7 +15,7 @@ STILLS = Path(__file__).parent / "stills"
 
 @cache
 def still(action: str, side: Value | None = None) -> bytes | None:
-    """Returns a WebP image of an action, or None if there is no picture of it.
+    """Returns a WebP image of an action, or None if no picture of the action exists.
 
     Args:
         action: name of the action in `actions.yaml`.

@@ -58,7 +58,7 @@ class Studio:
         self.live = LiveStreams(streaming[0]) if streaming else None
 
     def model(self, name: str) -> MotionGenerator:
-        """Returns a model by its name on the page. Raises `UserError` if the name is unknown.
+        """Returns the model with this name on the page. Raises `UserError` if the name is unknown.
 
         A model with an adapter is loaded only when it is first used.
         """
@@ -138,7 +138,7 @@ class Studio:
         return _cleaned(model, motions) if cleanup else motions
 
     def understood(self, request: DemoRequest) -> DemoRequest:
-        """Returns the request; a sentence with several actions is converted to a sequence.
+        """Returns the request, with a sentence of several actions converted to a sequence.
 
         Raises the same errors as `generate`.
         """

@@ -83,7 +83,7 @@ SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return lo
 
 
 def build_page(studio: Studio) -> gr.Blocks:
-    """Returns the page. Its functions `show`, `halt` and `switch` run on the server."""
+    """Returns the page. The functions `show`, `halt` and `switch` of the page run on the server."""
     stops: dict[str, Event] = {}
 
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008

@@ -11,12 +11,12 @@ class Denoiser(nn.Module, ABC):
     """Base class for denoisers.
 
     A denoiser predicts the target of a process from a noisy motion. Subclasses take some of the
-    following arguments. The first three depend on other parts of the model, and `Parts.build`
-    passes them; all others are set in the configuration.
+    following arguments. The first three arguments depend on other parts of the model and are passed
+    by `Parts.build`. All other arguments are set in the configuration.
 
     Args:
         in_features: D, the number of features per frame.
-        out_features: D, or 2D with a learned variance.
+        out_features: D, or 2 * D if the variance is learned.
         cond_features: C, the width of the condition; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
@@ -56,8 +56,8 @@ class Denoiser(nn.Module, ABC):
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time, given as a row index into the sinusoidal table.
             mask: (B, F) bool, True = real frame. See also `mask_padding`.
-            cond: the condition. For samples whose condition was dropped, it is already the null
-                condition.
+            cond: the condition. For samples whose condition was dropped, `cond` already contains
+                the null condition.
 
         Raises:
             UserError: If a motion is too long for the network, if there are no condition tokens or

@@ -20,7 +20,7 @@ class FLAME(Denoiser):
 
     Args:
         in_features: D, the number of features per frame.
-        out_features: D, or 2D with a learned variance.
+        out_features: D, or 2 * D if the variance is learned.
         cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.

@@ -16,7 +16,7 @@ class MDMGRU(Denoiser):
 
     Args:
         in_features: D, the number of features per frame.
-        out_features: D, or 2D with a learned variance.
+        out_features: D, or 2 * D if the variance is learned.
         cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         num_layers: number of layers of the GRU.
@@ -24,8 +24,9 @@ class MDMGRU(Denoiser):
         project_condition: whether to project the condition before it is added to the time
             embedding.
         recur_over_batch: whether to recur from sample to sample instead of from frame to frame.
-            MDM's released code does this because its axes are swapped. This option is only for
-            reproduction, because results then depend on the order of the samples in the batch.
+            MDM's released code recurs from sample to sample because its axes are swapped. This
+            option is intended only for reproduction, because results then depend on the order of
+            the samples in the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

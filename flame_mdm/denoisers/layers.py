@@ -123,7 +123,7 @@ class TransformerLayer(nn.Module):
 class Transformer(nn.Module):
     """A stack of post-norm layers without a causal mask.
 
-    With cross-attention, it is a decoder; otherwise, it is an encoder.
+    With cross-attention, the stack is a decoder; otherwise, it is an encoder.
     """
 
     def __init__(

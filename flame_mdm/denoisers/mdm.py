@@ -17,7 +17,7 @@ class MDMEncoder(Denoiser):
 
     Args:
         in_features: D, the number of features per frame.
-        out_features: D, or 2D with a learned variance.
+        out_features: D, or 2 * D if the variance is learned.
         cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
@@ -110,7 +110,7 @@ class MDMDecoder(Denoiser):
 
     Args:
         in_features: D, the number of features per frame.
-        out_features: D, or 2D with a learned variance.
+        out_features: D, or 2 * D if the variance is learned.
         cond_features: C; 0 = unconditional.
         latent_dim: width of the layers.
         ff_size: hidden width of the feed-forward layers.
@@ -128,8 +128,8 @@ class MDMDecoder(Denoiser):
         mask_padding: whether to mask the padding in attention. In the released models without
             `mask_frames`, frames attend to the padding.
         context_frames: number of clean frames that precede the motion; see `Condition.prefix`.
-        target_encoder: network that embeds `Condition.target`. Its output is added to the time
-            embedding. "none" ignores targets.
+        target_encoder: network that embeds `Condition.target`. The output of this network is added
+            to the time embedding. "none" ignores targets.
         target_layers: number of hidden layers of the target encoders "single" and "split".
         condition_frames: whether to also add time + condition to every noisy frame. A small network
             then learns to follow the text in fewer training steps, and can distinguish noisy frames

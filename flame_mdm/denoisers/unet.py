@@ -1,4 +1,4 @@
-"""The U-Net of MDM (Tevet et al. 2023, section 4.1), whose code is not public.
+"""The U-Net of MDM (Tevet et al. 2023, section 4.1). The code of this U-Net is not public.
 
 The paper specifies convolutions over time, joints as channels, and 23.47 M parameters. All other
 details follow the network of DDPM (Ho et al. 2020, appendix B), with the scale-and-shift injection
@@ -27,7 +27,7 @@ class MDMUNet(Denoiser):
 
     Args:
         in_features: D, the number of features per frame.
-        out_features: D, or 2D with a learned variance.
+        out_features: D, or 2 * D if the variance is learned.
         cond_features: C; 0 = unconditional.
         latent_dim: width of the time and condition embeddings.
         channels: width of each level. Each level has half the frame rate of the previous one.

@@ -47,7 +47,7 @@ class PosedFigure(Figure):
     def posed(self) -> Poses:
         """Returns the rotations of SMPL's joints.
 
-        If they are unknown, they are computed from the joint positions.
+        If the rotations are unknown, they are computed from the joint positions.
         """
         if self.poses is not None:
             return self.poses
@@ -73,7 +73,8 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     The body's joints coincide with the motion's joints, raised by the thickness of the sole.
 
     Args:
-        motion: the clip. If it contains no rotations, they are computed from its joint positions.
+        motion: the clip. If the clip contains no rotations, they are computed from the joint
+            positions.
         body: the mesh; None = the mannequin.
 
     Raises:

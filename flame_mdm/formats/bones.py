@@ -124,7 +124,7 @@ def _upright(pose: np.ndarray, turned: np.ndarray) -> np.ndarray | None:
 
 
 def _limbs() -> list[tuple[int, int]]:
-    """Returns the first and the last joint of each bone in the arms and legs."""
+    """Returns the first and last joints of each bone in the arms and legs."""
     return [
         (JOINT[f"{side}_{start}"], JOINT[f"{side}_{end}"])
         for side in SIDES

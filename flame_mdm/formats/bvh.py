@@ -133,7 +133,7 @@ def forward_kinematics(
 
 
 def read_lines(path: str | Path) -> Lines:
-    """Reads a text file. Raises `UserError` if it is too large or not UTF-8."""
+    """Reads a text file. Raises `UserError` if the file is too large or not UTF-8."""
     regular_file(path, TEXT_LIMIT)
     return Lines(Path(path).read_bytes(), str(path))
 
@@ -262,7 +262,7 @@ class Lines:
     def word(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy.
 
-        If `expected` is not empty, the word must match it, ignoring case.
+        If `expected` is not empty, the word must match `expected`, ignoring case.
         """
         if not self.pending:
             self.pending = next(iter(self), [])[::-1]
@@ -302,7 +302,7 @@ class Lines:
 
 
 def write(bvh: Bvh, path: str | Path) -> None:
-    """Writes a BVH file. Reading it back with `read` returns the same numbers.
+    """Writes a BVH file. Reading the file with `read` returns the same numbers.
 
     Joints are written in depth-first order.
     """

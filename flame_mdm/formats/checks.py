@@ -45,8 +45,8 @@ def check_body(joints: np.ndarray, layout: Layout) -> None:
     """Checks that joints (F, 22, 3) form a human body.
 
     The file's `layout` specifies the unit, the up axis, and whether the person may be a child. If
-    the size is wrong and the body is lying, the message names both the unit and the axis, so that
-    the user can correct both at once.
+    the size is wrong and the body is lying down, the message names both the unit and the axis, so
+    that the user can correct both at once.
 
     Raises:
         UserError: If the size is wrong, if a foot has no length, or if the feet point backward.
@@ -65,7 +65,7 @@ def uprightness(joints: np.ndarray) -> float:
 
 
 def lying(joints: np.ndarray, up: str, axes: np.ndarray) -> str:
-    """Returns a message if the body is lying in most frames, or "" otherwise.
+    """Returns a message if the body is lying down in most frames, or "" otherwise.
 
     If the body would stand upright with another up axis, the message suggests that axis. `up` is
     the file's up axis. `axes` (3, 3) is the matrix that converted `joints` (F, 22, 3) from the
@@ -109,7 +109,7 @@ def jump(joints: np.ndarray, fps: float) -> str:
 def below_floor(joints: np.ndarray) -> str:
     """Returns a message if a body with an adult's bones sinks below the floor, or "" otherwise.
 
-    This happens if the person in the file is smaller than an adult.
+    The body sinks below the floor if the person in the file is smaller than an adult.
     """
     lowest = float(np.median(joints[..., 1].min(1)))
     if lowest > -UNDER:

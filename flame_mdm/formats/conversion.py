@@ -129,7 +129,7 @@ def _adult(body: Poses, joints: np.ndarray) -> tuple[Poses, np.ndarray]:
     """Transfers a motion to an adult body and scales the path in proportion to the leg length.
 
     Args:
-        body: the motion on a body with its original bone lengths.
+        body: the motion of a body with the original bone lengths.
         joints: (F, 22, 3), joint positions of the motion, in meters.
 
     Returns:

@@ -161,7 +161,7 @@ def _stretched(
 
 
 def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Returns how deep the elbows and wrists are inside the body. Wrists include the hands."""
+    """Returns how deep the elbows and wrists are inside the body. The depth of a wrist also covers the hand."""
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T
@@ -212,9 +212,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 
     Returns:
         Two arrays for three points: the elbow, the wrist and the middle of the hand. The first
-        contains their depths (F, 3) in meters, which are negative outside the body. The second
-        contains, for each point, a unit vector (F, 3, 3) away from the axis of the body part in
-        which the point is deepest.
+        array contains the depths (F, 3) of these points in meters. Depths are negative outside the
+        body. The second array contains, for each point, a unit vector (F, 3, 3) that points away
+        from the axis of the body part in which the point is deepest.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

@@ -65,7 +65,7 @@ FOOTER_END = bytes.fromhex("f85a8c6adef5d97eece90ce3758f290b")
 
 @dataclass(eq=False)
 class Record:
-    """A record of an FBX file.
+    """A record in an FBX file.
 
     Attributes:
         name: name of the record, such as "Model".

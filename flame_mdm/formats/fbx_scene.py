@@ -238,7 +238,7 @@ class _Scene:
                 self.models[child].parent = parent
 
     def takes(self) -> list[tuple[str, int]]:
-        """Returns the name and the layer id of each animation that has keys."""
+        """Returns the name and the layer id of each animation that contains keys."""
         takes = []
         for number, record in self.records.items():
             if record.name != "AnimationStack":

@@ -40,7 +40,7 @@ HELD_KEY = 0x2  # flag of a key whose value is held until the next key
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a motion, including the person's skin if the clip has one."""
+    """Writes a motion, including the person's skin if the clip includes one."""
     fbx.write(path, _Writer(clip).scene())
 
 
@@ -194,7 +194,7 @@ class _Writer:
         return poses
 
     def _material(self, material: Material) -> int:
-        """Adds a material, and its image if it has one. Returns the id of the material."""
+        """Adds a material and, if present, the material's image. Returns the id of the material."""
         number, record = self._object("Material", material.name, "")
         record.add("Version", Int(102))
         record.add("ShadingModel", "lambert")

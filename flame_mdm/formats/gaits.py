@@ -95,7 +95,7 @@ def direction(degrees: float) -> np.ndarray:
 
 
 def progress(motion: GroundedMotion, degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the root's velocities (F,) in a direction and 90 degrees to the left of this direction.
+    """Returns the root's velocities (F,) along a direction and 90 degrees to the left of it.
 
     The direction is relative to the heading of the root.
     """
@@ -211,7 +211,7 @@ def closed(motion: GroundedMotion) -> GroundedMotion:
 
 
 def moving(motion: GroundedMotion) -> tuple[int, int]:
-    """Returns the first and last frame of the movement, extended by `MARGIN` at both ends."""
+    """Returns the first and last frames of the movement, extended by `MARGIN` at both ends."""
     speed = np.linalg.norm(np.gradient(motion.world(), axis=0), axis=-1).max(1) * motion.fps
     speed = gaussian_filter1d(speed, 0.05 * motion.fps, mode="nearest")
     fast = np.flatnonzero(speed > SETTLED)

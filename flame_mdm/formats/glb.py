@@ -206,7 +206,7 @@ def read(path: Path) -> Glb:
     """Reads a .glb file.
 
     Raises:
-        UserError: If the file is too large or damaged, or is not glTF 2.0 in a single file.
+        UserError: If the file is too large or damaged, or if it is not a single glTF 2.0 file.
     """
     regular_file(path, LIMIT)
     content = path.read_bytes()
@@ -283,7 +283,7 @@ def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ..
 
 
 def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
-    """Returns the corners (8, 3) of the bounding box of a part of a mesh."""
+    """Returns the corners (8, 3) of the bounding box of a mesh part."""
     accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
     if {len(accessor.min), len(accessor.max)} != {3}:
         raise ValueError("a mesh has no bounds for its positions")
@@ -293,7 +293,7 @@ def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
 
 
 def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
-    """Returns a skin's inverse bind matrices (K, 4, 4), or an array (0, 4, 4) if it has none."""
+    """Returns a skin's inverse bind matrices (K, 4, 4), or an array (0, 4, 4) if there are none."""
     if skin.inverseBindMatrices < 0:
         return np.zeros((0, 4, 4))
     accessor = _item(parts.accessors, skin.inverseBindMatrices, "inverseBindMatrices")

@@ -277,8 +277,8 @@ def _track(file: glb.Glb, sampler: _Sampler, width: int) -> Track:
 def _rate(file: glb.Glb, items: Sequence[_Animation]) -> float:
     """Returns the frame rate.
 
-    The frame rate is read from `asset.extras.fps` if it is stored there. Otherwise, it is computed
-    from the intervals between keys.
+    The frame rate is read from `asset.extras.fps` if it is stored there. Otherwise, the frame rate
+    is computed from the intervals between keys.
     """
     # glTF stores keys, but no frame rate. In a sampled animation, the median interval between keys
     # determines the frame rate. Times have single precision, so the rate is rounded to a nearly

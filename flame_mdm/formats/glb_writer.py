@@ -12,7 +12,7 @@ VERTICES, INDICES = 34962, 34963  # values of a buffer view's target in glTF
 
 
 def write(path: Path, clip: RiggedClip, text: str) -> None:
-    """Writes a clip with one node per joint, and with the person's skin if the clip has one.
+    """Writes a clip with one node per joint, and with the person's skin if the clip includes one.
 
     `text` is stored in the file. The node `lifted`, which is the parent of the joints, is raised by
     the thickness of the soles, so that the person stands on the soles. In a rig with a root on the
@@ -59,7 +59,7 @@ def write(path: Path, clip: RiggedClip, text: str) -> None:
 
 
 def _skin(binary: Binary, skin: Skin) -> dict[str, Any]:
-    """Appends a person's mesh, and returns the document's entries for it."""
+    """Appends a person's mesh and returns the document's entries for the mesh."""
     light = np.rint(255 * (skin.colors / 255) ** 2.2)  # from screen colors to linear colors
     light = np.pad(light, ((0, 0), (0, 1)), constant_values=255).astype("u1")
     attributes = {

@@ -45,7 +45,7 @@ class GroundedMotion:
         local: (F, 22, 3), joint positions relative to the root, which faces +z.
         path: (F, 2), x and z coordinates of the root.
         heading: (F,), direction of the root; 0 = facing +z.
-        contacts: (F, 2), whether the left and the right toes are planted.
+        contacts: (F, 2), whether the left and right toes are planted.
         fps: frames per second.
     """
 
@@ -121,7 +121,7 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns whether the left and right toes are planted (F, 2), judged by height and speed."""
+    """Returns whether (F, 2) the left and right toes are planted, based on height and speed."""
     # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
     # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]
@@ -170,7 +170,7 @@ def with_lengths(joints: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Returns the first and last frame of each series of True values in `flags` (F,)."""
+    """Returns the first and last frames of each series of True values in `flags` (F,)."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(int), 0]))
     return [(begin, end - 1) for begin, end in edges.reshape(-1, 2).tolist()]
 

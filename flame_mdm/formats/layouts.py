@@ -262,7 +262,7 @@ def tree_layout(file: bvh.Bvh, fields: Mapping[str, Any]) -> tuple[Layout, Seque
 def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns the layout and joint names of an array (F, J, 3).
 
-    Both are taken from `fields` or determined by the number of joints.
+    The layout and the names are taken from `fields` or determined by the number of joints.
     """
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"joints have shape {joints.shape}, not (frames, joints, 3)")
@@ -485,7 +485,7 @@ def check_feet(joints: np.ndarray) -> None:
 
 
 def check_order(joints: np.ndarray, count: int, skeleton: str) -> None:
-    """Checks that an array is not from another skeleton with the same number of joints.
+    """Checks that an array does not belong to another skeleton with the same number of joints.
 
     A person's limbs have the same length on both sides, and their lengths do not change. If the
     joint order or the skeleton is wrong, the compared pairs of joints are not limbs.

@@ -81,8 +81,8 @@ class Motion(PosedFigure):
         notes: lines for the user about the file that was read, for example about frames that were
             left out.
         bones: rotations from the bones of the source file, which also show how a forearm turns
-            about its own axis. They are used to encode features that contain rotations. Files and
-            pictures are created from `poses` or joint positions instead.
+            about its own axis. These rotations are used to encode features that contain rotations.
+            Files and pictures are created from `poses` or joint positions instead.
 
     Raises:
         UserError: If a shape is wrong, a joint position is NaN or infinite, or the frame rate is
@@ -257,7 +257,7 @@ class Motion(PosedFigure):
 def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Returns the 22 joints' axis-angle vectors (F, 66), and the translation (F, 3).
 
-    Both are in AMASS's coordinates: meters, z up.
+    The rotations and the translation are in AMASS's coordinates: meters, z up.
     """
     world = poses.rotations.clone()
     world[:, 0] = AMASS_AXES @ world[:, 0]

@@ -82,8 +82,8 @@ def spelled(pairs: Mapping[str, str]) -> dict[str, str]:
 def best_match(names: Sequence[str], skeletons: Mapping[str, Mapping[str, str]]) -> Match:
     """Returns the skeleton that best matches a list of joint names.
 
-    Skeletons without missing joints are preferred, then those with more matching names, then those
-    listed earlier. If several prefixes match equally well, the match is ambiguous.
+    Skeletons without missing joints are preferred, then skeletons with more matching names, then
+    skeletons listed earlier. If several prefixes match equally well, the match is ambiguous.
 
     Args:
         names: joint names in a file. At least one name is required.

@@ -161,7 +161,10 @@ def _stretched(
 
 
 def _inside(joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Returns how deep the elbows and wrists are inside the body. The depth of a wrist also covers the hand."""
+    """Returns how deep the elbows and wrists are inside the body.
+
+    The depth of a wrist is the larger of the depths of the wrist and the hand.
+    """
     depth = np.zeros(joints.shape[:2])
     for side in ("left", "right"):
         elbow, wrist, hand = depths(joints, names, side)[0].T

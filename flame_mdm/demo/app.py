@@ -93,7 +93,7 @@ def connection_limits(hosts: Collection[str]) -> ConnectionLimits:
 
 
 class Server(uvicorn.Server):
-    """A server that, at shutdown, ends the streams of open pages before it waits for requests."""
+    """Ends the streams of open pages at shutdown, before the server waits for running requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.config.app.closing.set()  # type: ignore[union-attr]

@@ -121,7 +121,10 @@ def grounded(joints: np.ndarray, fps: float) -> GroundedMotion:
 
 
 def planted_toes(joints: np.ndarray, fps: float) -> np.ndarray:
-    """Returns whether (F, 2) the left and right toes are planted, based on height and speed."""
+    """Returns whether the left and right toes are planted, with shape (F, 2).
+
+    The result is based on the height and speed of the toes.
+    """
     # A toe is planted in a frame if it is low, and slow before or after the frame. Gaps and
     # contacts shorter than `SHORT` are removed.
     toes = joints[:, [leg[-1] for leg in FEET]]

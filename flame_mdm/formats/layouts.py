@@ -328,7 +328,7 @@ def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
 
 
 def _one(name: str, candidates: Sequence[str]) -> str:
-    """Returns the joint in a file to which the given name refers.
+    """Returns the joint that the given name refers to in a file.
 
     If several joints match, the joint with exactly this name is returned.
     """

@@ -1,7 +1,7 @@
 # pyright: standard
 """Models that generate motions.
 
-They are independent of Lightning, whose import takes longer than sampling a motion.
+They do not depend on Lightning, because importing it takes longer than sampling a motion.
 `flame_mdm.task` trains them.
 """
 
@@ -51,7 +51,7 @@ class Parts:
 
     @classmethod
     def build(cls, config: Config, representation: Representation, num_actions: int) -> Self:
-        """Builds the parts in a recipe and sets the sizes that depend on other parts."""
+        """Builds the parts of a recipe and sets the sizes that depend on other parts."""
         process: Process = instantiate(config["process"])
         condition: ConditionEncoder = instantiate(config["condition"], {"num_actions": num_actions})
         sizes = sizes_of_denoiser(config, representation, process, condition)
@@ -72,7 +72,7 @@ def sizes_of_denoiser(
 
 
 def _length_unit(config: Config) -> int:
-    """Returns the unit of the training lengths: all are multiples of this number of frames."""
+    """Returns the unit of length: all training lengths are multiples of this number of frames."""
     crop = config.get("data", {}).get("crop")
     return crop.get("unit", 1) if isinstance(crop, dict) else 1
 
@@ -344,7 +344,8 @@ class Blocks:
         options: sampler options, none of which may be None.
         seed: seed of the noise.
         replication: index of the replication, used to sample several motions per id.
-        unconditioned: whether all conditions are null conditions. Guidance is then not applied.
+        unconditioned: whether all conditions are null conditions. In this case, guidance is not
+            applied.
         fade: if two blocks do not fit together, the jump at the seam is faded out over this number
             of frames; see `joined`. 0 = no fading, as in DiP's code.
 
@@ -385,7 +386,7 @@ class Blocks:
         Args:
             cond: the conditions of this block.
             kept: (B,) int64, number of frames to keep at the beginning of the block. The next block
-                continues these frames. Default: all frames.
+                continues from the last of these frames. Default: all frames.
             edit: part of the block that is given rather than generated.
         """
         model, prefix = self.model, self.prefix
@@ -457,7 +458,7 @@ class DistilledGenerator(MotionGenerator):
     def check_request(self, options: SamplerOptions | None, unconditioned: bool) -> None:
         """Raises `UserError` if guidance or an unconditioned motion is requested.
 
-        A student model supports neither of them.
+        Student models support neither.
         """
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):

@@ -32,8 +32,8 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
     """Returns the squared error (B,) between `a` and `b` (B, F, ...), averaged over real frames.
 
-    `mask` is (B, F). All samples have equal weight, regardless of their lengths (Tevet et al. 2022,
-    eq. 2, averaged as in their code).
+    `mask` has shape (B, F). All samples have equal weight, regardless of their lengths (Tevet et
+    al. 2022, eq. 2, averaged as in their code).
 
     Example:
         >>> masked_mse(torch.zeros(1, 2, 3), torch.full((1, 2, 3), 2.0), torch.ones(1, 2) > 0).tolist()
@@ -68,7 +68,7 @@ class _MaskedSquaredError(torch.autograd.Function):
 def bone_lengths(joints: Tensor, edges: Sequence[tuple[int, int]] | Tensor) -> Tensor:
     """Returns the lengths (..., N) of N bones, given joint positions (..., J, 3).
 
-    `edges` (N, 2) contains the joint indices of the parent and the child of each bone.
+    `edges` (N, 2) contains the joint indices of each bone's parent and child.
     """
     parents, children = torch.as_tensor(edges).T
     return (joints[..., children, :] - joints[..., parents, :]).norm(dim=-1)
@@ -92,13 +92,13 @@ class MotionLosses(nn.Module):
         foot_contact: weight of the squared velocity of feet that touch the ground in the data (eq.
             4). As in the paper's sum over all frames, feet that are not in contact contribute 0 to
             the mean.
-        bone_length: weight of the squared error, in square meters, of the bone lengths. This is
-            InterGen's bone-length loss (arXiv:2304.05684), but at all noise levels; InterGen
-            applies it only up to a certain noise level.
+        bone_length: weight of the squared error of the bone lengths, in square meters. This is
+            InterGen's bone-length loss (arXiv:2304.05684), but applied at all noise levels.
+            InterGen applies it only up to a certain noise level.
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of leading features that `velocity` uses. MDM's code omits the
-            last row of the feature matrix, and thus uses 144 of the 25 x 6 features, or 262 of the
-            263. None = all features.
+            last row of the feature matrix. It therefore uses 144 of the 25 x 6 features, or 262 of
+            the 263 features. None = all features.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)

@@ -1,4 +1,4 @@
-"""Loads bodies by name: the mannequin, the body in a file, and Anny's people of all shapes.
+"""Loads bodies by name: the mannequin, a body from a file, or an Anny body of any shape.
 
 Anny's shapes are specified by numbers (`body="anny age=0.9"`). Source: Brégier et al., "Human Mesh
 Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589, (c) 2025 NAVER Corp., Apache-2.0.
@@ -75,9 +75,9 @@ CLOTHES = {
 def load_body(name: str) -> Mesh:
     """Returns the body with the given name.
 
-    The name is "mannequin", a file, or "anny" with shape parameters, such as "anny gender=1
-    age=0.9". Creating the first Anny body takes about 90 seconds. Each body is saved in the user's
-    cache.
+    The name is "mannequin", the path of a body file, or "anny" followed by shape parameters, such
+    as "anny gender=1 age=0.9". Creating the first Anny body takes about 90 seconds. Each Anny body
+    is saved in the user's cache folder.
 
     Raises:
         UserError: If the file is damaged, a shape parameter is invalid, or Anny is not installed.
@@ -232,7 +232,7 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns how far points on the head lie inside the region of the hair.
+    """Returns how far points on the head lie inside the hair region.
 
     This region is above the forehead and behind the ears.
     """
@@ -275,7 +275,7 @@ def packed(
     joints: np.ndarray,
     turns: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays that make up a body file; such files are read by `Mesh`.
+    """Returns the arrays that make up a body file. `Mesh` reads such files.
 
     Points are stored in units of 1/20 mm, with the pelvis at 0, and normals in units of 1/127.
     """

@@ -1,4 +1,4 @@
-"""Joint rotations from joint positions: analytic inverse kinematics of SMPL's 22 joints."""
+"""Joint rotations from joint positions: analytic inverse kinematics for SMPL's 22 joints."""
 
 import math
 from collections.abc import Sequence
@@ -48,9 +48,10 @@ SQUARINGS = 12
 
 @dataclass(eq=False)
 class Poses:
-    """A moving body, defined by its rest pose and rotations, in meters, y up.
+    """A moving body, defined by its rest pose and rotations.
 
-    The rest pose is SMPL's rest pose: arms to the sides, facing +z, left at +x.
+    Lengths are in meters, and y is up. The rest pose is SMPL's rest pose: arms to the sides, facing
+    +z, left at +x.
     """
 
     # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
@@ -70,9 +71,10 @@ class Poses:
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
 
     def resampled(self, rate: float, fps: float) -> "Poses":
-        """Returns the motion at `fps` instead of `rate` frames per second.
+        """Returns the motion, resampled from `rate` to `fps` frames per second.
 
-        Rotations are interpolated on the sphere, and the path of the pelvis by cubic splines.
+        Rotations are interpolated on the sphere, and the path of the pelvis is interpolated with
+        cubic splines.
         """
         if math.isclose(rate, fps):
             return self
@@ -86,10 +88,10 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class BoneRotations:
-    """Rotations of SMPL's joints, taken from the bones of a file.
+    """Rotations of SMPL's joints, taken from the bones in a file.
 
     Attributes:
-        poses: the rotations, for a body with the bone lengths of the file. None if the file
+        poses: the rotations, for a body with the bone lengths in the file. None if the file
             contains no usable rotations.
         reason: why the rotations in the file cannot be used, or "" if they can be used or if the
             file contains no rotations.
@@ -100,15 +102,15 @@ class BoneRotations:
 
 
 def solve(joints: Tensor, fps: float) -> Poses:
-    """Computes a body, and the rotations with which the body reproduces the joint positions.
+    """Computes a body and the joint rotations that reproduce the given joint positions.
 
     Each bone has its mean length over the clip. The pelvis and the chest, which have three bones
-    each, receive the rotation that fits all three bones best (Kabsch 1976). The rotation of every
-    other joint points its bone at the next joint.
+    each, are given the rotation that best fits all three bones (Kabsch 1976). Every other joint is
+    rotated so that its bone points at the next joint.
 
     Positions do not determine the twist of a bone about its own axis. Thighs and upper arms are
     twisted so that knees and elbows bend like hinges. The twist of the spine is distributed evenly
-    from pelvis to chest. All other joints, including head, hands and toes, follow their parent.
+    from pelvis to chest. All other joints, including the head, hands and toes, follow their parent.
 
     Args:
         joints: (F, 22, 3), joint positions in the order of `SMPL22`, in meters, y up.
@@ -220,12 +222,14 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
 def _twist(
     group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float
 ) -> Tensor:
-    """Returns quaternions (F, G, 4) that twist limbs about their axes so that their hinges match.
+    """Returns quaternions (F, G, 4) that twist limbs about their axes.
+
+    After the twist, knees and elbows bend like hinges.
 
     Args:
         group: the G joints at which the limbs begin.
         swung: (F, G, 4), rotations of the limbs before the twist.
-        offsets: (G, 3), offsets of the limbs.
+        offsets: (G, 3), offset of each limb's second joint from its first in the rest pose.
         bones: (F, 22, 3), vectors along all bones.
         fps: frames per second.
     """

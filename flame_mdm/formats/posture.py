@@ -1,6 +1,6 @@
 """World rotations of a body.
 
-The Blender extension also contains this file, so it requires only numpy.
+The Blender extension also contains this file. Therefore, the file requires only numpy.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def complete(
 
     Returns:
         The rotations of the body parts in the rest pose (22, 3, 3), their world rotations in each
-        frame (F, 22, 3, 3), and the joint offsets (22, 3) of the body on flat feet.
+        frame (F, 22, 3, 3), and the joint offsets (22, 3) of the body with flat feet.
     """
     # A person standing upright is assumed to look straight ahead. Therefore, the median direction
     # from neck to head, relative to an upright chest, is the direction of a level head. The toes
@@ -77,7 +77,7 @@ def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotations (..., 3, 3) that turn `start` (..., 3) to `end` (..., 3)."""
+    """Returns the smallest rotations (..., 3, 3) that turn `start` (..., 3) onto `end` (..., 3)."""
     a, b = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=-1)

@@ -1,7 +1,7 @@
 """The reader for motion files; the writers are in `flame_mdm.formats.motion`.
 
-`docs/formats.md` describes the files. The commands, data sets and the Python API all use this
-reader, so that a file always has the same skeleton and frame rate and passes the same checks.
+`docs/formats.md` describes the file formats. The commands, data sets and the Python API all use
+this reader, so that a file always has the same skeleton and frame rate and passes the same checks.
 """
 
 import math
@@ -95,9 +95,9 @@ class Recording:
     """A motion that was read from a file, and additional information from the reader.
 
     Attributes:
-        motion: the motion. Its notes are lines for the user.
+        motion: the motion. Its notes are messages for the user.
         layout: skeleton, unit and frame rate of the file, as listed by `prepare`.
-        doubts: properties that look wrong, which the motion's notes also list.
+        doubts: properties that look wrong. The motion's notes also list them.
         smpl: SMPL's translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes, or None if the
             file does not contain them.
         tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
@@ -121,20 +121,22 @@ def read(
 ) -> Motion:
     """Reads a motion file.
 
-    Supports `.npz` files from this project, from AMASS, or with joints and fps; `.bvh` files;
-    animations in `.fbx`, `.glb`, `.vrm` and `.vrma` files; and `.amc`, `.json` and `.npy` files.
+    Supports `.npz` files that come from this project or AMASS or that contain joints and fps;
+    `.bvh` files; animations in `.fbx`, `.glb`, `.vrm` and `.vrma` files; and `.amc`, `.json` and
+    `.npy` files.
 
     Args:
         path: the file. Unless this project wrote the file, it is described by the nearest
-            `skeleton.yaml` in its folder or the parent folders. `fps`, `unit` and `up` override
-            this description.
+            `skeleton.yaml` in its folder or a parent folder. `fps`, `unit` and `up` override this
+            description.
         fps: frames per second; overrides the rate in the file. .npy and .amc files contain no frame
             rate.
         unit: meters per unit of length in the file. Does not apply to files with SMPL's rotations,
-            such as AMASS's files.
+            such as AMASS files.
         up: the up axis of the file: y, z or -y.
         resample_to: target frame rate; None = the frame rate of the file. Rotations are
-            interpolated on the sphere, and joint positions and translations by cubic splines.
+            interpolated on the sphere. Joint positions and translations are interpolated with cubic
+            splines.
         animation: name or 1-based number of an animation in an FBX or GLB file; None = the first
             animation.
 
@@ -424,9 +426,9 @@ def _of_ours(
 
 
 def _rate(data: Mapping[str, Any], rate: float | None, fields: Mapping[str, Any]) -> float:
-    """Returns the frame rate of arrays.
+    """Returns the frame rate of a file's arrays.
 
-    The command takes precedence over the file, and the file over skeleton.yaml.
+    The command takes precedence over the file, and the file takes precedence over skeleton.yaml.
     """
     rate = data.get("fps", fields.get("fps")) if rate is None else rate
     if rate is None:
@@ -479,7 +481,7 @@ def _label(path: Path, layout: Layout, rate: float) -> str:
 
 
 def _resampled(motion: Motion, fps: float | None) -> Motion:
-    """Returns a motion at another frame rate, without features and rotations.
+    """Returns a motion, resampled to another frame rate, without its features and rotations.
 
     A motion that already has this frame rate is returned unchanged.
     """
@@ -503,7 +505,7 @@ def _matrices(smpl: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """Returns a translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes.
 
-    `axes` (3, 3) rotates the axes of the file to y up.
+    `axes` (3, 3) rotates the axes of the file so that y is up.
     """
     if torch.equal(axes, AMASS_AXES):
         return translation, turns

@@ -1,4 +1,4 @@
-"""Checks of frame rates and lengths, and resampling of motions.
+"""Checks frame rates and lengths, and resamples motions.
 
 Frame rates and lengths are limited, because even a file of a few bytes can declare any values.
 """
@@ -30,7 +30,7 @@ MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
-    """Checks a frame rate and returns it as a float. `name` is its name in error messages.
+    """Checks a frame rate and returns it as a float. Error messages call the value `name`.
 
     Raises:
         UserError: If the value is not a number in the range `RATES`.
@@ -69,7 +69,7 @@ def check_tree(frames: int, joints: int, size: int) -> None:
 def frame_pairs(
     frames: int, rate: float, fps: float, joints: int, slack: float = 1e-6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the old frames before and after each new frame, and where the new frame lies.
+    """For each new frame, returns the old frames before and after it and its position between them.
 
     The third array contains the position of each new frame between the two old frames, from 0 to 1.
 
@@ -111,7 +111,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 def interpolate(values: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Evaluates the cubic spline through values (F, ...) at `times` (N,).
 
-    Times are measured in frames, and the values are those at times 0, 1, ...
+    Times are in frames. The values are given at times 0, 1, ...
     """
     from scipy.interpolate import CubicSpline  # imported here, because few motions need it
 

@@ -1,4 +1,4 @@
-"""Motions for the skeletons of other programs and data sets.
+"""Transfers motions to the skeletons of other programs and data sets.
 
 `rigs.yaml` contains the names, rest poses and axes of these skeletons.
 """
@@ -47,7 +47,7 @@ def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
 def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a skeleton in `rigs.yaml`.
 
-    For each part, yields its key, the prefix of SMPL's joints, and the mark of the side in joint
+    For each part, yields its key, the prefix of SMPL's joints, and the mark for the side in joint
     names.
     """
     yield "trunk", "", ""
@@ -166,7 +166,7 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
-    """Converts rotations to Euler angles in radians that do not jump between frames.
+    """Converts rotations to Euler angles, in radians, that do not jump between frames.
 
     Programs can therefore interpolate the angles.
 

@@ -1,6 +1,6 @@
 """Skeletons of other programs, and moving characters.
 
-The Blender extension also contains this file, so it requires only numpy.
+The Blender extension also contains this file. Therefore, the file requires only numpy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -137,7 +137,7 @@ def recognized(
     The correspondence is taken from the most similar known skeleton.
 
     Args:
-        names: joint names by index.
+        names: joint names, keyed by joint index.
         skeletons: for each skeleton, a mapping from joint spellings to SMPL joints, as in
             `flame_mdm.formats.names.best_match`.
     """
@@ -197,7 +197,7 @@ def rest_pose(
     lowest: np.ndarray,
     vertical: Sequence[int],
 ) -> RestPose:
-    """Returns a rest pose, turned so that y is up and +z is ahead.
+    """Returns a rest pose, turned so that y points up and +z points forward.
 
     Args:
         source: name of the character in error messages.

@@ -1,4 +1,4 @@
-"""Moving skeletons of other programs, with a person's skin, for .glb, .fbx and USD files.
+"""Moving skeletons of other programs, including a person's skin, for .glb, .fbx and USD files.
 
 Lengths are in meters, and y is up. The rest pose faces +z. F, J and V are the numbers of frames,
 joints and vertices.
@@ -28,7 +28,7 @@ class Material:
     Attributes:
         name: the name of the material.
         color: red, green and blue from 0 to 1, in sRGB.
-        image: content of a PNG or JPEG file, whose colors are multiplied by `color`. Empty = no
+        image: content of a PNG or JPEG file. Its colors are multiplied by `color`. Empty = no
             image.
     """
 
@@ -65,8 +65,8 @@ class Skin:
             of each joint.
         colors: (V, 3), vertex colors in sRGB, from 0 to 255; (0, 3) if only the materials have
             colors.
-        uvs: (V, 2), positions of the vertices in the images, from the lower left corner; (0, 2) if
-            there are no images.
+        uvs: (V, 2), texture coordinates of the vertices, measured from the lower left corner of the
+            images; (0, 2) if there are no images.
     """
 
     name: str
@@ -97,9 +97,9 @@ class RiggedClip:
         rest: (J, 3, 3), rotation of each joint relative to its parent in the rest pose.
         turns: (F, J, 3, 3), rotations relative to the parents.
         moves: for each joint whose position changes, its positions (F, 3) relative to the parent.
-        lift: the thickness of the soles; writers raise a person by this height above the joint
-            positions in this clip.
-        skins: the skinned meshes; () if no person fits the motion.
+        lift: the thickness of the soles. Writers raise the person above the joint positions in this
+            clip by this height.
+        skins: the skinned meshes; () if the clip contains no person.
         scales: (J,), scale of each joint: units of its parent per unit of the joint.
         root: index of the joint on the floor that is the parent of the hips; -1 = no such joint.
         contacts: (F, 2), whether the left and the right toes are planted; (0, 2) = unknown.
@@ -122,7 +122,7 @@ class RiggedClip:
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the joints' world positions (F, J, 3) and world rotations (F, J, 3, 3).
 
-        The joints are not lifted. All joints of the skeleton must have a scale of 1.
+        The positions do not include `lift`. All joints of the skeleton must have a scale of 1.
         """
         positions = np.tile(self.offsets, (len(self.turns), 1, 1))
         for joint, moved in self.moves.items():
@@ -141,7 +141,7 @@ class RiggedClip:
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
     def contact_changes(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """For each of `CONTACTS`, returns the K frames with a change, and the K values after it.
+        """For each of `CONTACTS`, returns the K frames with a change and the K values after them.
 
         The first frame is always included. The result is empty if the contacts are unknown.
         """
@@ -178,9 +178,9 @@ class RiggedClip:
         return replace(self, turns=turns, moves=moves)
 
     def on_soles(self) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-        """Returns `offsets` and `moves`, changed so that the person stands on the soles.
+        """Returns `offsets` and `moves`, raised so that the person stands on the soles of the feet.
 
-        The hips are lifted, but a root on the floor stays there.
+        The hips are raised, but a root on the floor stays on the floor.
         """
         offsets = self.offsets.copy()
         moves = {joint: moved.copy() for joint, moved in self.moves.items()}
@@ -276,8 +276,7 @@ def _with_root_motion(
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """Transfers the horizontal path and the heading of the hips to the root, which is their parent.
 
-    The heading is the direction of the hips about the vertical axis, relative to their direction in
-    the rest pose.
+    The heading is the rotation of the hips about the vertical axis, relative to the rest pose.
     """
     root, joint = skeleton.parents[skeleton.hips], skeleton.hips
     above = skeleton.turns[root]
@@ -300,7 +299,7 @@ def _with_root_motion(
 
 
 def _skin(body: FittedBody, rig: Rig) -> Skin:
-    """Returns the mesh of a body in its stored pose, with the hips at the rig's rest position."""
+    """Returns a body's mesh in its stored pose, with the hips at their rest position in the rig."""
     mesh = body.mesh
     moved = rig.positions[rig.hips] + [0, body.lift, 0] - body.joints[0]
     weights = mesh.weights[:, : len(SMPL22)].copy()  # helper bones are merged into their joints

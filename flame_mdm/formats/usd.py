@@ -56,7 +56,7 @@ def write(path: Path, clip: RiggedClip) -> None:
 
 
 def _paths(clip: RiggedClip) -> list[str]:
-    """Returns the path from the root to each joint, composed of names from `_name`."""
+    """Returns the path from the root to each joint, composed of the names that `_name` returns."""
     paths: list[str] = []
     for name, parent in zip(clip.joints, clip.parents, strict=True):
         paths.append(f"{paths[parent]}/{_name(name)}" if parent >= 0 else _name(name))
@@ -160,7 +160,7 @@ def _mesh(stage: Any, skin: Skin) -> None:
 
 
 def _extent(stage: Any, root: Any, clip: RiggedClip) -> None:
-    """Declares the person's bounding box in each frame, which is computed from the joints."""
+    """Declares the person's bounding box in each frame, computed from the joints."""
     from pxr import UsdGeom, Vt
 
     positions, _ = clip.world()  # scales are ignored, because the box only has to be large enough

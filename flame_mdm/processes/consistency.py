@@ -30,9 +30,9 @@ def consistency_terms(
 ) -> dict[str, Tensor]:
     """Computes the losses of a student.
 
-    The student's estimate at x_t is compared with the estimate after one step of the teacher, which
-    is a DDIM step with eta = 0 or, for a flow, an Euler step. At the last time of the grid, the
-    target is the teacher's own clean estimate.
+    The student's estimate at x_t is compared with the estimate after one step of the teacher. This
+    step is a DDIM step with eta = 0 or, for a flow, an Euler step. At the last time of the grid,
+    the target is the teacher's own clean estimate.
 
     Args:
         process: the process of both the student and the teacher. The prediction must be the clean

@@ -39,16 +39,16 @@ class GaussianDiffusion(Process):
             term of a single step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to
             1 in FLAME's code.
         average_padding: whether to average losses over the padded length, with zero noise in the
-            padding, as in FLAME's code. Short motions then have less weight. The denoiser must
-            return 0 in the padding.
+            padding, as in FLAME's code. In this case, short motions have less weight. The denoiser
+            must return 0 in the padding.
         clip_x0: whether to clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
         timestep_sampling: distribution of the diffusion steps drawn for training (FLAME, tables 6
             and 7).
         skip: whether to add a skip connection around the network, which requires the prediction
             "epsilon". The predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras
-            et al. 2022, eq. 7, for data of variance 1). The output is then a velocity, but the loss
-            is the error of the noise. The network does not need to pass its input through, and the
-            clean estimate is computed without division by the signal.
+            et al. 2022, eq. 7, for data of variance 1). With this connection, the output is a
+            velocity, but the loss is the error of the noise. The network does not need to pass its
+            input through, and the clean estimate is computed without division by the signal.
         min_snr: maximum weight of a step. The squared error is weighted as if the clean motion were
             predicted with weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None =
             every step has weight 1, regardless of the prediction.
@@ -222,9 +222,9 @@ class GaussianDiffusion(Process):
         """See `Process.sample`. The denoiser is called once per step.
 
         Noise draws are numbered in the order in which they are used. `options.num_inference_steps`
-        is either the number of steps, from 2 to T, or a list of steps in increasing order. For a
-        number, `options.spacing` determines which steps are used. The sampler "consistency" takes 1
-        to T steps, selected by `grid`. An edit with mode "x0" reproduces the kept part exactly.
+        is either the number of steps, from 2 to T, or a list of steps in increasing order. If it is
+        a number, `options.spacing` determines which steps are used. The sampler "consistency" takes
+        1 to T steps, selected by `grid`. An edit with mode "x0" reproduces the kept part exactly.
         """
         sampler, steps = self.find_sampler(options), self._steps(options)
         if edit is not None:

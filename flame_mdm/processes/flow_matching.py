@@ -31,8 +31,8 @@ class FlowMatching(Process):
         quantize_time: whether to pass floor(1000 t) to the denoiser, as a row index into the time
             table, as in MFM's code.
         odeint_grid: whether to use float32 multiples of 1 / N as times, like torchdiffeq's Euler
-            steps in MFM's code. For some N, `quantize_time` then rounds some times to a table row
-            that is one lower than with N equal steps. This never happens for N = 10, 20 or 30.
+            steps in MFM's code. For some N, `quantize_time` then rounds some times to the table row
+            below the row that N equal steps would use. This never happens for N = 10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).
@@ -87,7 +87,7 @@ class FlowMatching(Process):
         return t * x + (1 - (1 - self.sigma_min) * t) * noise
 
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """See `Process.target`: the velocity (Lipman et al. 2023, eq. 23) or the clean motion."""
+        """Returns the velocity (Lipman et al. 2023, eq. 23) or the clean motion; see `Process.target`."""
         return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:

@@ -57,8 +57,7 @@ def percentiles(drawn: Sequence[float], value: float) -> tuple[float, float]:
 
     Source: Efron and Tibshirani 1993, section 13.3. Some metrics, such as Fréchet distances, are
     larger for sets with repeated motions (section 10.6). The bootstrap values are therefore shifted
-    so that their mean is the value.
-    The interval is valid only for sets of the same size.
+    so that their mean equals the value. The interval is valid only for sets of the same size.
 
     Example:
         >>> percentiles([1.0, 2.0, 3.0], 5.0)
@@ -128,7 +127,7 @@ class Checkpoint(Schema):
 
 
 class UsedSkeleton(Schema):
-    """Source of the bone lengths when joint positions are computed from SMPL rotations.
+    """Source of the bone lengths with which joint positions are computed from SMPL rotations.
 
     The source is SMPL's model file or a stand-in for it.
     """
@@ -221,8 +220,8 @@ class AuditedGrade(ClosedSchema):
     """Results for one grade of a perturbation.
 
     Each metric has four numbers: its value, the half width of the value's 95 % interval, the
-    difference from real motions, and the half width of the interval of this difference. A number
-    that cannot be computed is None.
+    difference from real motions, and the half width of the difference's interval. A number that
+    cannot be computed is None.
     """
 
     grade: Number

@@ -87,7 +87,10 @@ class FlowMatching(Process):
         return t * x + (1 - (1 - self.sigma_min) * t) * noise
 
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Returns the velocity (Lipman et al. 2023, eq. 23) or the clean motion; see `Process.target`."""
+        """See `Process.target`.
+
+        The target is the velocity (Lipman et al. 2023, eq. 23) or the clean motion.
+        """
         return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
@@ -133,9 +136,9 @@ class FlowMatching(Process):
         A flow takes N >= 1 equal steps, except with "dopri5", which chooses its own step sizes.
 
         Only "consistency" adds noise. An edit with mode "trajectory" is applied before each step at
-        a time <= `until`: the kept part is replaced by the straight path from its noise to the
-        known motion (MFM, algorithm 1). After this time, the model may change the kept part freely.
-        Mode "x0" overwrites the kept part in the clean estimate of every call and therefore
+        a time <= `until`: the kept part is set to its point on the straight path from its noise to
+        the known motion (MFM, algorithm 1). After this time, the model may change the kept part
+        freely. Mode "x0" overwrites the kept part in the clean estimate of every call and therefore
         reproduces it exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps

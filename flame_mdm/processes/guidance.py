@@ -85,7 +85,7 @@ class Positions:
         frames: (M,) int64, indices of the frames.
         joints: (M,) int64, indices of the joints.
         axes: (M,) int64, the axes; 0 = x, 1 = y, 2 = z.
-        values: (M,) the coordinates in meters.
+        values: (M,), the coordinates in meters.
     """
 
     frames: Tensor
@@ -140,21 +140,21 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Changes motions as little as possible, so that joints reach the requested world positions.
+    """Makes the smallest changes with which the joints reach the requested world positions.
 
     Each Gauss-Newton step changes the normalized features as little as possible to reach the
     positions. A Gaussian-process prior keeps the change smooth in time. In frames with a requested
     position, bone lengths are also constrained: they must equal their medians over the motion.
-    Neighboring frames receive only part of the change, which would shorten turning bones, so their
-    bone lengths are restored afterward.
+    Neighboring frames receive only part of the change. This would shorten turning bones, so the
+    bone lengths in these frames are restored afterward.
 
     Args:
         x: (B, F, D) normalized motions.
         to_joints: function that converts normalized features (F, D) to joint positions (F, J, 3) in
             meters.
         positions: the positions to reach.
-        bones: (3, N) int64: a frame, and the parent and child of a bone. All bones are listed for
-            each frame in which the change could affect their lengths.
+        bones: (3, N) int64, the frame, parent and child of each bone. All bones are listed for each
+            frame in which the change could affect their lengths.
         free: (B, F, D) bool, True = this feature may change.
         smoothness: standard deviation of the Gaussian process, in frames.
 
@@ -213,7 +213,7 @@ def _with_bones(
 ) -> Tensor:
     """Returns the nearest motion (F, D) in which the bones have the requested lengths.
 
-    `lengths` (F, N) contains the lengths of the bones `edges` (N, 2) in each frame.
+    `lengths` (F, N) contains, for each frame, the lengths of the bones in `edges` (N, 2).
     """
     # Gauss-Newton steps as in `reach`, but for each frame separately: A^T (A A^T)^-1 e
 

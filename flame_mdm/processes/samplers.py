@@ -108,7 +108,7 @@ def ancestral(x: Tensor, run: Descent, i: int) -> Tensor:
 
 
 def ddim(x: Tensor, run: Descent, i: int) -> Tensor:
-    """Takes a step of DDIM.
+    """Takes a DDIM step.
 
     With eta = 0 (the default), the step is deterministic; with eta = 1, it is as random as a step
     of `ancestral`. Source: Song et al. 2021, eq. 12 and 16 (non-Markovian sampling).
@@ -185,8 +185,7 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
 def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
     """Estimates the clean motion and adds new noise for the next step.
 
-    This is the sampler of distilled models. Source: Song et al. 2023, "Consistency Models",
-    algorithm 1.
+    Distilled models use this sampler. Source: Song et al. 2023, "Consistency Models", algorithm 1.
 
     Args:
         x: (B, F, D) noisy motion at step i.
@@ -213,8 +212,8 @@ def blended(
     """Samples with an edit whose mode is "x_t".
 
     At each step, the kept part is replaced by the known motion with the current amount of noise.
-    With `edit.blend` "after", the kept part is also replaced before the first step, by the known
-    motion with the initial noise. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each
+    If `edit.blend` is "after", the kept part is also replaced by the known motion with the initial
+    noise before the first step. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each
     step again and repeats the step.
 
     Args:
@@ -254,7 +253,9 @@ DIFFUSION_SAMPLERS = {
 
 
 def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of Euler's method: order 1, one call to the denoiser.
+    """Takes a step of Euler's method.
+
+    The method has order 1 and calls the denoiser once.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -274,7 +275,9 @@ def euler(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def midpoint(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Takes a step of the midpoint method: order 2, two calls to the denoiser.
+    """Takes a step of the midpoint method.
+
+    The method has order 2 and calls the denoiser twice.
 
     Args:
         x: (B, F, D) motion at time t.
@@ -377,7 +380,7 @@ def dopri5(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
 
 
 def consistency_flow(x: Tensor, run: Flow, t: float, end: float) -> Tensor:
-    """Jumps to the data and adds new noise for the next time; see `consistency`.
+    """Estimates the clean motion and adds new noise for the next time; see `consistency`.
 
     Args:
         x: (B, F, D) motion at time t.

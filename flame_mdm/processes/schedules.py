@@ -1,4 +1,4 @@
-"""Noise schedules of Gaussian diffusion: coefficients, and selection of sampling steps."""
+"""Noise schedules for Gaussian diffusion: coefficients and the selection of sampling steps."""
 
 import math
 
@@ -35,9 +35,9 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 def linear_betas(num_train_timesteps: int) -> Tensor:
     """Returns the float64 noise variances (T,) of the linear schedule (Ho et al. 2020, section 4).
 
-    For T = 1000, the variances increase from 1e-4 to 0.02. For other T, they are multiplied by
-    1000 / T, so that the final noise is the same, as in guided-diffusion. All variances are clipped
-    at 0.999.
+    For T = 1000, the variances increase from 1e-4 to 0.02. For other values of T, they are
+    multiplied by 1000 / T, so that the final noise is the same, as in guided-diffusion. All
+    variances are clipped at 0.999.
 
     Example:
         >>> [round(beta, 5) for beta in linear_betas(1000)[[0, -1]].tolist()]
@@ -70,7 +70,7 @@ def with_more_noise(betas: Tensor, noise_scale: float) -> Tensor:
 
 
 class Schedule:
-    """Coefficients of a Gaussian diffusion, indexed by step i: 0 (least noise) to N - 1.
+    """Coefficients of a Gaussian diffusion, indexed by step i, from 0 (least noise) to N - 1.
 
     The tables are float64 on the CPU and are rounded only once, when they are used. They are not
     buffers, because casting or moving a model (bfloat16, MPS) must not round them. Formulas: Ho et

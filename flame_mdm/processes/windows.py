@@ -64,9 +64,9 @@ def spans(
     Args:
         lengths: number of frames in each part.
         longest: maximum number of frames in a window.
-        overlap: number of frames that neighboring windows share, an even number.
-        loop: whether the last part is followed by the first one. Windows may then begin before
-            frame 0.
+        overlap: even number of frames that neighboring windows share.
+        loop: whether the last part is followed by the first one. In this case, windows may begin
+            before frame 0.
 
     Returns:
         For each window, the index of its part, its first frame and its number of frames.
@@ -99,8 +99,8 @@ def cover(
     """Returns the frames and weights of windows, without conditions.
 
     The weight of a window rises over the overlap at its start and falls over the overlap at its
-    end. Past its end, a window is padded with the subsequent frames of the motion, where the last
-    frame is followed by the first one.
+    end. Past its end, a window is padded with the subsequent frames of the motion, wrapping around
+    after the last frame.
 
     Args:
         windows: W windows, each given by the index of its motion, its first frame and its number of

@@ -34,7 +34,7 @@ LEGEND = (
 class Seen:
     """Response of a metric to a perturbation.
 
-    `grade` and `outside` are None if there is no such grade.
+    `grade` and `outside` are None if no grade meets their conditions.
     """
 
     # Weakest grade such that, at this and all stronger grades, the paired difference from real
@@ -113,7 +113,7 @@ class CitedCard:
     data: Data
 
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
-        """Returns a sort key, which is larger for cards that fit the evaluated data better.
+        """Returns a sort key that is larger for cards that fit the evaluated data better.
 
         The criteria are, in this order, equal length limits, the test split, the same data, and the
         number of motions.
@@ -134,8 +134,8 @@ def card_of(data: Data, sha256: str | None) -> CitedCard | None:
     """Returns the extractor's card that best fits the evaluated data, or None.
 
     Without an extractor, the card covers the metrics computed from joint positions. Cards are in
-    the folder FLAME_MDM_AUDITS (default: runs/audit) and in the repository, where audited.json
-    lists them.
+    the folder set by FLAME_MDM_AUDITS (default: runs/audit) and in the repository, where
+    audited.json lists them.
     """
     extractor = sha256[:12] if sha256 else None
     listed = read_json(Path(__file__).with_name("audited.json"), list[ListedCard])
@@ -152,14 +152,14 @@ def card_of(data: Data, sha256: str | None) -> CitedCard | None:
 
 
 def read_card(path: Path) -> AuditCard:
-    """Reads the JSON of a card. Raises `UserError` if it is damaged or from an older version."""
+    """Reads a card's JSON file. Raises `UserError` if it is damaged or from an older version."""
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
 def write_card(cards: Sequence[AuditCard], out: Path, name: str = "") -> list[Path]:
     """Writes one card, or two cards side by side, as a web page and as Markdown. Returns the paths.
 
-    `name` is the name of the files. By default, it consists of the names of the cards.
+    `name` is the file name without the suffix. By default, it consists of the names of the cards.
     """
     metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
     metrics.sort(key=lambda metric: any(_facts_of(card, metric).exact for card in cards))

@@ -45,7 +45,7 @@ def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[En
 
 
 def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
-    """Returns evenly spaced groups with at most `most` clips in total, but at least one group."""
+    """Returns evenly spaced groups with up to `most` clips in total, but at least one group."""
     for count in range(min(len(families), max(1, most)), 0, -1):
         chosen = [families[k] for k in np.linspace(0, len(families) - 1, count).round().astype(int)]
         if sum(map(len, chosen)) <= most:
@@ -77,7 +77,7 @@ def write_page(
     title: str,
     body: Mesh | None,
 ) -> None:
-    """Writes a page that plays clips, grouped by split. A mirrored copy is next to its original."""
+    """Writes a page that plays clips by split, with mirrored copies next to their originals."""
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],

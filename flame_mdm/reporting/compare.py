@@ -120,7 +120,7 @@ def comparison(
     Args:
         compared: runs and folders of motions.
         shown: the motions of each run and folder, keyed by prompt. The page plays the motions for
-            the prompts that all of them share.
+            the prompts that all runs and folders share.
         mesh: the body to draw.
         evidence: function that returns the marks for the timeline of a motion.
     """

@@ -24,7 +24,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def render(template: str, **values: Any) -> Markup:
-    """Renders a file of `templates/`.
+    """Renders a file in `templates/`.
 
     In HTML and SVG, all text is escaped except for the output of other templates.
     """
@@ -55,7 +55,7 @@ def _environment() -> Environment:
 
 
 def number(value: float | None) -> str:
-    """Formats a number for a table with four significant digits, or as a dash if it is missing."""
+    """Formats a number with four significant digits for a table, or as a dash if it is missing."""
     if value is None:
         return "–"
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
@@ -64,7 +64,7 @@ def number(value: float | None) -> str:
 
 
 def filled(head: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Removes the empty columns and rows of a table, whose first column contains the row names."""
+    """Removes a table's empty columns and rows. The first column contains the row names."""
     rows = [row for row in rows if {*row[1:]} - {"–", ""}]
     kept = [k for k in range(len(head)) if not k or {row[k] for row in rows} - {"–", ""}]
     return [head[k] for k in kept], [[row[k] for k in kept] for row in rows]

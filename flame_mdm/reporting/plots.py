@@ -183,7 +183,7 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    """Returns the points of a curve, sorted by step, without NaN and values that would overflow."""
+    """Returns the points of a curve, sorted by step, without NaN or values that would overflow."""
     return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]
 
 

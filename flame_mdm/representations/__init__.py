@@ -95,7 +95,7 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion as features (F', D) float32 in the data's units."""
+        """Encodes a raw motion as float32 features (F', D) in the data's units."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
         """Encodes several motions. Subclasses may encode them in one pass."""
@@ -147,7 +147,7 @@ class Representation(nn.Module, ABC):
         return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
-        """Adapts the features (..., F, D) of cut clips to make them start like complete motions.
+        """Adapts the features (..., F, D) of cut clips so that they start like complete motions.
 
         By default, the features are returned unchanged.
         """

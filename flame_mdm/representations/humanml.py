@@ -42,9 +42,9 @@ class HumanML(Representation):
 
     The variant "legacy" reproduces the published data with all its peculiarities. The direction
     across the body is the direction across the shoulders minus the direction across the hips,
-    instead of their sum. In the first frame, the heading is 0, although the smoothed heading is
-    not. `turn` is half the turn to the right, and changes its sign where the heading crosses 180
-    degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
+    instead of their sum. In the first frame, the heading is set to 0, although the smoothed heading
+    is not 0. `turn` is half the turn to the right, and changes its sign where the heading crosses
+    180 degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
     rotations of the bones relative to the inverse heading, including the bones at the shoulders.
     `decode` also follows the published code. If a bone points exactly opposite to its rest
     direction, the published code returns NaN. This implementation returns a half turn instead.
@@ -115,7 +115,7 @@ class HumanML(Representation):
         self.units_per_metre, self.contact_threshold = units_per_metre, contact_threshold
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes finite joint positions (T >= 3, J, 3) as features (T - 1, D) float32.
+        """Encodes finite joint positions (T >= 3, J, 3) as float32 features (T - 1, D).
 
         The positions are in meters, with y up.
         """
@@ -224,7 +224,7 @@ class HumanML(Representation):
     def _retarget(self, joints: Tensor, first: Tensor, clip: Tensor) -> Tensor:
         """Changes the bone lengths and scales the root trajectory.
 
-        The scale is the ratio of the new and old leg lengths in the first frame.
+        The scale is the ratio of the new leg length to the old leg length in the first frame.
         """
         target = torch.tensor(self.bone_lengths, dtype=joints.dtype)
         bones = self.skeleton.bones(joints)
@@ -266,8 +266,8 @@ class HumanML(Representation):
     def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
         """Returns the shortest arcs from the rest directions to the directions of the bones.
 
-        The arcs (N, J - 1, 6) are given as 6D columns. Each arc is relative to the arc of the
-        parent.
+        The arcs (N, J - 1, 6) are in the 6D representation (columns). Each arc is relative to the
+        parent's arc.
         """
         rest = joints.new_tensor(self.skeleton.raw_offsets)
         arcs = rotation.between(rest, self.skeleton.bones(joints))

@@ -256,7 +256,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
 
 
 def _numbers(result: Result) -> str:
-    """Returns a sentence with the numbers of motions and replications on which most values are based.
+    """Returns a sentence that states on how many motions and replications most values are based.
 
     The number of real motions is added if it differs.
     """
@@ -392,7 +392,7 @@ def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Formats all numbers in a column with the same number of decimals.
 
-    The largest number gets about three digits. Settings with at most one decimal are shown
+    The largest number is shown with about three digits. Settings with at most one decimal are shown
     unchanged, and numbers that would be rounded to zero are shown with two significant digits.
     """
     for index in range(columns):

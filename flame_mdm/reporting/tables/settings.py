@@ -18,7 +18,7 @@ HYPERPARAMETERS = LABELS["hyperparameters"]
 def hyperparameters(name: str) -> dict[str, Any]:
     """Returns the `HYPERPARAMETERS` of a recipe, keyed by name.
 
-    Unset keys get the default values of their class.
+    Unset keys have the default values of their classes.
     """
     config = compose(name)
     settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | _sizes(config)

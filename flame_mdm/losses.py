@@ -1,4 +1,4 @@
-"""Reconstruction error over real frames, and geometric losses of the clean estimate."""
+"""Reconstruction error over real frames, and geometric losses on the clean estimate."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -190,10 +190,10 @@ def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _turns(joints: np.ndarray) -> np.ndarray:
-    """Returns world rotations (22, 3, 3) from SMPL's rest pose to Anny's rest pose.
+    """Returns the world rotations (22, 3, 3) that turn SMPL's rest pose into Anny's rest pose.
 
-    `joints` (22, 3) are in Anny's rest pose. The pelvis, chest and head keep their directions, and
-    the feet stay level. The arms are twisted so that the elbows bend like SMPL's.
+    `joints` (22, 3) are in Anny's rest pose. The pelvis, chest and head keep their orientations,
+    and the feet stay level. The arms are twisted so that the elbows bend like SMPL's.
     """
     turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     usual = np.array(ADULT)
@@ -217,7 +217,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
 def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Returns vertex colors (V, 3), from 0 to 255, based on the joints that the vertices follow.
 
-    The hair has the shape of the mannequin's hair.
+    The hair is shaped like the mannequin's hair.
     """
     table = np.array([CLOTHES.get(name.split("_")[-1], SHIRT) for name in SMPL22.joints], float)
     colors = weights @ table
@@ -252,9 +252,9 @@ def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
 def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Adds helper bones to skinning weights, and returns the new weights (V, 28).
 
-    The upper part of a limb follows a helper bone that turns less about the limb's axis. The lower
-    part of a forearm follows a helper bone that takes on part of the wrist's twist. `joints` (22,
-    3) are the joint positions of the mesh.
+    The upper part of a limb follows a helper bone that takes on only part of the twist about the
+    limb's axis. The lower part of a forearm follows a helper bone that takes on part of the wrist's
+    twist. `joints` (22, 3) are the joint positions of the mesh.
     """
     columns = []
     for joint, _ in HELPERS:
@@ -277,7 +277,8 @@ def packed(
 ) -> dict[str, np.ndarray]:
     """Returns the arrays that make up a body file. `Mesh` reads such files.
 
-    Points are stored in units of 1/20 mm, with the pelvis at 0, and normals in units of 1/127.
+    Points are stored in units of 1/20 mm, with the pelvis at 0. Normals are stored in units of
+    1/127.
     """
     bones, shares = largest_weights(weights)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)

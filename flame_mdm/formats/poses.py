@@ -50,8 +50,8 @@ SQUARINGS = 12
 class Poses:
     """A moving body, defined by its rest pose and rotations.
 
-    Lengths are in meters, and y is up. The rest pose is SMPL's rest pose: arms to the sides, facing
-    +z, left at +x.
+    Lengths are in meters, and y is up. The rest pose is SMPL's rest pose: arms out to the sides,
+    facing +z, with the left side at +x.
     """
 
     # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
@@ -93,8 +93,8 @@ class BoneRotations:
     Attributes:
         poses: the rotations, for a body with the bone lengths in the file. None if the file
             contains no usable rotations.
-        reason: why the rotations in the file cannot be used, or "" if they can be used or if the
-            file contains no rotations.
+        reason: why the rotations in the file cannot be used, or "" if they are usable or the file
+            contains no rotations.
     """
 
     poses: Poses | None = None
@@ -136,7 +136,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
 
 
 def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
-    """Like `solve`, but without checks; returns offsets (22, 3) and quaternions (F, 22, 4).
+    """Returns offsets (22, 3) and quaternions (F, 22, 4), like `solve` but without checks.
 
     Both results have the same precision as the joints. The function has no data-dependent branches,
     and it processes similar joints in a single batch so that its ONNX graph is small.
@@ -256,7 +256,7 @@ def _twist(
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
-    """Smooths values (F, N) over time with a Gaussian; `frames` is its standard deviation."""
+    """Smooths values (F, N) over time with a Gaussian of standard deviation `frames`."""
     reach = int(4 * frames + 0.5)
     weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / frames) ** 2).to(x)
     padded = torch.cat([x[:1].expand(reach, -1), x, x[-1:].expand(reach, -1)])

@@ -67,8 +67,8 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
 def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Returns three orthonormal axes as the rows of a matrix (3, 3).
 
-    The rows are the normalized direction, the normalized part of `u` that is orthogonal to it, and
-    the cross product of the two.
+    The rows are the normalized direction, the normalized part of `u` that is orthogonal to this
+    direction, and the cross product of the two.
     """
     along = direction / np.linalg.norm(direction)
     across = u - (u @ along) * along

@@ -1,4 +1,4 @@
-"""The reader for motion files; the writers are in `flame_mdm.formats.motion`.
+"""Reads motion files. The writers are in `flame_mdm.formats.motion`.
 
 `docs/formats.md` describes the file formats. The commands, data sets and the Python API all use
 this reader, so that a file always has the same skeleton and frame rate and passes the same checks.
@@ -100,7 +100,7 @@ class Recording:
         doubts: properties that look wrong. The motion's notes also list them.
         smpl: SMPL's translation (F, 3) and quaternions (F, 24, 4) in AMASS's axes, or None if the
             file does not contain them.
-        tree: the tree of joints without rest-pose frames, at the frame rate of the file, or None if
+        tree: the joint tree, without rest-pose frames and at the frame rate of the file, or None if
             the file contains no tree.
     """
 
@@ -309,7 +309,7 @@ def _of_joints(
 ) -> Recording:
     """Converts an array of joints to a recording.
 
-    `said` contains the keys that were set in the command, which override the keys in the file.
+    `said` contains the keys that were set in the command. They override the keys in the file.
     """
     rate, joints = _rate(data, rate, fields), data["joints"]
     stated = {key: data[key] for key in ("up", "unit") if key in data}
@@ -451,7 +451,7 @@ def _checked(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: str) -> None:
-    """Raises `UserError` if a key is set that has no effect on the file."""
+    """Raises `UserError` if a key that has no effect on the file is set."""
     for key in without_effect:
         if key in fields:
             raise UserError(
@@ -515,7 +515,7 @@ def _in_amass_axes(translation: Tensor, turns: Tensor, axes: Tensor) -> tuple[Te
 
 
 def _smpl_poses(pelvis: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
-    """Returns poses of SMPL's mean body, rotated to y up by `axes` (3, 3)."""
+    """Returns poses of SMPL's mean body. `axes` (3, 3) rotates them so that y is up."""
     rotations = rotations[:, : len(SMPL22)].clone()
     rotations[:, 0] = axes @ rotations[:, 0]
     return Poses(

@@ -26,7 +26,7 @@ def is_at_60(trial: str) -> bool:
 
 
 def known_rate(name: str, skeleton: str, fps: float) -> float | None:
-    """Returns the frame rate of a recording if its name and skeleton show that `fps` is wrong.
+    """Returns a recording's true frame rate if its name and skeleton show that `fps` is wrong.
 
     BVH conversions specify 120 frames per second for nearly all of CMU's recordings.
     """

@@ -1,6 +1,6 @@
 """Checks frame rates and lengths, and resamples motions.
 
-Frame rates and lengths are limited, because even a file of a few bytes can declare any values.
+Frame rates and lengths are limited, because even a file of a few bytes can declare any value.
 """
 
 import math

@@ -38,7 +38,10 @@ REACH = 0.999  # maximum distance from hip to ankle, as a fraction of the straig
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A skeleton with J joints in its rest pose, in meters, y up, facing +z."""
+    """A skeleton with J joints in its rest pose, facing +z.
+
+    Lengths are in meters, and y is up.
+    """
 
     # Names of the joints; parents precede their children
     joints: tuple[str, ...]
@@ -76,7 +79,7 @@ class Rig:
         )
 
     def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
-        """Converts world positions (..., 3) to the coordinates of a joint's parent at rest."""
+        """Converts world positions (..., 3) to the rest-pose coordinates of a joint's parent."""
         parent = self.parents[joint]
         if parent < 0:
             return positions @ self.frame
@@ -173,7 +176,10 @@ def matched(
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """A character's skeleton in its rest pose, y up, facing +z, in the character's unit."""
+    """A character's skeleton in its rest pose, facing +z.
+
+    Lengths are in the character's unit, and y is up.
+    """
 
     # The skeleton, whose neutral rotations `fitted` replaces for a motion
     rig: Rig
@@ -379,7 +385,7 @@ def follow(
 def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
-    """Returns the knee position (F, 3) that moves the ankle to `target`, or as close as possible.
+    """Returns the knee position (F, 3) that moves the ankle to `target` or as close as possible to it.
 
     The knee bends to the same side as before.
     """

@@ -54,9 +54,9 @@ class Skin:
         name: the name of the mesh.
         points: (V, 3), vertices in the coordinates of the mesh.
         normals: (V, 3), unit normals of the vertices.
-        triangles: (T, 3), counterclockwise when seen from outside.
+        triangles: (T, 3), vertex indices of the triangles, counterclockwise when seen from outside.
         palette: the materials of the mesh.
-        materials: (T,), index in `palette` of each triangle's material.
+        materials: (T,), each triangle's material, as an index in `palette`.
         ordered: indices of the skeleton's joints that can move the mesh. For a person, joints that
             follow SMPL's joints come first, in SMPL's order.
         bones: (V, K), the joints that move each vertex, as indices in `ordered`.
@@ -136,7 +136,7 @@ class RiggedClip:
         return positions, turns
 
     def part(self, frames: slice, name: str, contacts: np.ndarray) -> "RiggedClip":
-        """Returns some frames as a new clip with the given `name` and `contacts` (F, 2)."""
+        """Returns a range of frames as a new clip with the given `name` and `contacts` (F, 2)."""
         moves = {joint: moved[frames] for joint, moved in self.moves.items()}
         return replace(self, name=name, turns=self.turns[frames], moves=moves, contacts=contacts)
 
@@ -234,8 +234,7 @@ def rigged(
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
-        fitted: the person's body, whose toes bend in the same way as in rendered images. None = no
-            skin.
+        fitted: the person's body, with toes that bend as in rendered images. None = no skin.
         root_motion: whether the root on the floor follows the position and direction of the hips.
             Otherwise, the root stays in place.
 

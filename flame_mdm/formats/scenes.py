@@ -30,7 +30,7 @@ def animations(path: Path) -> list[str]:
 def joint_names(scene: AnimatedNodes) -> tuple[str, ...]:
     """Returns a joint name for each node, in the form that skeleton layouts use.
 
-    If the file declares the bones of a humanoid, these bones receive SMPL's names. A node at the
+    If the file declares the bones of a humanoid, these bones are given SMPL's names. A node at the
     tip of a bone is always named `NAME.end`, like an end site in a BVH file, regardless of the
     node's suffix in the file.
     """

@@ -139,7 +139,7 @@ class FlowMatching(Process):
         a time <= `until`: the kept part is set to its point on the straight path from its noise to
         the known motion (MFM, algorithm 1). After this time, the model may change the kept part
         freely. Mode "x0" overwrites the kept part in the clean estimate of every call and therefore
-        reproduces it exactly.
+        reproduces the kept part exactly.
         """
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):

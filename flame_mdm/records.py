@@ -229,7 +229,7 @@ class AuditedGrade(ClosedSchema):
 
 
 class AuditedPerturbation(ClosedSchema):
-    """A perturbation of real motions and its grades, from weak to strong."""
+    """A perturbation of real motions, with its grades from weak to strong."""
 
     name: str
     group: str

@@ -385,7 +385,7 @@ def follow(
 def _bent(
     hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray
 ) -> np.ndarray:
-    """Returns the knee position (F, 3) that moves the ankle to `target` or as close as possible to it.
+    """Returns the knee position (F, 3) that moves the ankle as close as possible to `target`.
 
     The knee bends to the same side as before.
     """

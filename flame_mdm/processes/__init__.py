@@ -1,4 +1,4 @@
-"""Generative processes: corruption of motions, targets of denoisers, losses and sampling."""
+"""Generative processes: corruption of motions, denoiser targets, losses and sampling."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +53,7 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def out_features(self, features: int) -> int:
-        """Returns the denoiser's number of output channels for D = `features` input channels.
+        """Returns how many output channels the denoiser needs for D = `features` input channels.
 
         This number is D, or 2D if the variance is learned.
         """
@@ -66,7 +66,7 @@ class Process(nn.Module, ABC):
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """Computes the noisy motion x_t (B, F, D) at times t (B,) from a clean motion and noise.
 
-        The clean motion `x` and `noise` have the shape (B, F, D).
+        The clean motion `x` and `noise` have shape (B, F, D).
         """
 
     @abstractmethod

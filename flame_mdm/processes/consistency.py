@@ -31,7 +31,7 @@ def consistency_terms(
     """Computes the losses of a student.
 
     The student's estimate at x_t is compared with the estimate after one step of the teacher. This
-    step is a DDIM step with eta = 0 or, for a flow, an Euler step. At the last time of the grid,
+    step is a DDIM step with eta = 0 or, for a flow, an Euler step. At the last time in the grid,
     the target is the teacher's own clean estimate.
 
     Args:

@@ -34,21 +34,21 @@ class GaussianDiffusion(Process):
         variance: variance of the reverse process. "fixed_small" is the variance of the posterior.
             "fixed_large" is beta. "learned_range" lies between the two and is learned from D
             additional channels (Nichol and Dhariwal 2021, eq. 15).
-        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), which is used only if
-            the variance is learned. L_vlb is a sum over T steps, so it is computed as T times the
-            term of a single step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to
-            1 in FLAME's code.
+        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15). It is used only if the
+            variance is learned. L_vlb is a sum over T steps, so it is computed as T times the term
+            for a single step. The value 0.001 for T = 1000 (Nichol and Dhariwal) corresponds to 1
+            in FLAME's code.
         average_padding: whether to average losses over the padded length, with zero noise in the
             padding, as in FLAME's code. In this case, short motions have less weight. The denoiser
             must return 0 in the padding.
         clip_x0: whether to clamp the clean estimate to [-1, 1] during sampling, as in FLAME's code.
         timestep_sampling: distribution of the diffusion steps drawn for training (FLAME, tables 6
             and 7).
-        skip: whether to add a skip connection around the network, which requires the prediction
+        skip: whether to add a skip connection around the network. This requires the prediction
             "epsilon". The predicted noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras
             et al. 2022, eq. 7, for data of variance 1). With this connection, the output is a
-            velocity, but the loss is the error of the noise. The network does not need to pass its
-            input through, and the clean estimate is computed without division by the signal.
+            velocity, but the loss is the error of the noise. The network does not need to copy its
+            input to its output, and the clean estimate is computed without division by the signal.
         min_snr: maximum weight of a step. The squared error is weighted as if the clean motion were
             predicted with weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None =
             every step has weight 1, regardless of the prediction.
@@ -196,7 +196,7 @@ class GaussianDiffusion(Process):
         """Returns the terms (B, F, D) of the variational bound at steps t (B,), in nats.
 
         Source: Ho et al. 2020, eq. 5. Only the variance receives a gradient (Nichol and Dhariwal
-        2021, section 3.1). As in FLAME's code, the term of step 0 is the KL divergence computed
+        2021, section 3.1). As in FLAME's code, the term for step 0 is the KL divergence computed
         with the clipped posterior variance.
         """
         real = self.schedule.posterior_mean(x, x_t, t)

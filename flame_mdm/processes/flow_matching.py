@@ -25,14 +25,15 @@ class FlowMatching(Process):
         prediction: what the denoiser predicts, either the velocity of the path ("velocity", as in
             MFM) or the clean motion ("x0"), from which the velocity is computed. A network whose
             layers are narrower than the motion features cannot represent the noise in the velocity.
-        time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal",
-            the logistic function of a normal variable, which favors times in the middle (Esser et
-            al. 2024, eq. 19).
+        time_distribution: distribution of training times: "uniform" on [0, 1), or "logit_normal".
+            The latter is the logistic function of a normal variable and favors times in the middle
+            (Esser et al. 2024, eq. 19).
         quantize_time: whether to pass floor(1000 t) to the denoiser, as a row index into the time
             table, as in MFM's code.
         odeint_grid: whether to use float32 multiples of 1 / N as times, like torchdiffeq's Euler
-            steps in MFM's code. For some N, `quantize_time` then rounds some times to the table row
-            below the row that N equal steps would use. This never happens for N = 10, 20 or 30.
+            steps in MFM's code. For some N, `quantize_time` then rounds some times to a table row
+            that is one lower than the row that N equal steps would use. This never happens for N =
+            10, 20 or 30.
 
     Raises:
         UserError: If `sigma_min` is not in [0, 1).

@@ -38,8 +38,8 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
 
     Args:
         denoise: the denoiser. The condition passed to it must contain a null condition.
-        scale: guidance scale, either one number or one per sample (B,). If it is the number 1,
-            `denoise` itself is returned.
+        scale: guidance scale, either one number or one per sample (B,). If the scale is the number
+            1, `denoise` itself is returned.
         features: D, the number of features. Further channels contain a learned variance, which is
             not guided but taken from the conditional prediction.
 

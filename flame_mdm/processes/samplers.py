@@ -144,7 +144,7 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent, i: int) -> Tensor:
     """Takes a step of DPM-Solver++ (2M), a deterministic multistep solver of order 2.
 
     The solver calls the denoiser once per step. The first step has only order 1, because it has no
-    predecessor, and the last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
+    predecessor. The last step returns the clean estimate. Source: Lu et al. 2022b, algorithm 2.
 
     Args:
         x: (B, F, D) noisy motion at step i.
@@ -209,7 +209,7 @@ def consistency(x: Tensor, run: Descent, i: int) -> Tensor:
 def blended(
     sampler: Sampler, x: Tensor, run: Descent, steps: Sequence[int], edit: Edit, start: Tensor
 ) -> Tensor:
-    """Samples with an edit whose mode is "x_t".
+    """Samples with an edit in mode "x_t".
 
     At each step, the kept part is replaced by the known motion with the current amount of noise.
     If `edit.blend` is "after", the kept part is also replaced by the known motion with the initial

@@ -115,7 +115,7 @@ class CitedCard:
     def strength(self, data: Data) -> tuple[bool, bool, bool, int]:
         """Returns a sort key that is larger for cards that fit the evaluated data better.
 
-        The criteria are, in this order, equal length limits, the test split, the same data, and the
+        The criteria are, in this order: equal length limits, the test split, the same data, and the
         number of motions.
         """
         same_frames = self.data.frames == data.frames
@@ -203,7 +203,7 @@ def _section(card: AuditCard) -> dict[str, object]:
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
-    """Returns one row per perturbation, with cells (one per metric and card) and curves."""
+    """Returns one row per perturbation, with curves and one cell per metric and card."""
     by_name = [
         {perturbation.name: perturbation for perturbation in card.perturbations} for card in cards
     ]

@@ -82,8 +82,8 @@ def rating_page(
 ) -> str:
     """Returns a page that asks which of two motions fits a text better.
 
-    One motion is from the first run, and the other one from another run. The page hides the names
-    of the runs, and saves the answers to a file for `tally`.
+    One motion is from the first run, and the other is from another run. The page hides the names of
+    the runs, and saves the answers to a file for `tally`.
 
     Args:
         compared: two or more runs or folders of motions.

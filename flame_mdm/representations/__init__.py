@@ -1,4 +1,4 @@
-"""Motion representations: encoding of motions as features, and decoding to joint positions."""
+"""Motion representations, which encode motions as features and decode them to joint positions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """All frames (N, D) of a data set, which can be read in parts and more than once."""
+    """All frames (N, D) of a data set. They can be read in parts and more than once."""
 
     # Returns arrays (F, D) of arbitrary lengths, in the same order each time
     arrays: Callable[[], Iterable[np.ndarray]]
@@ -198,7 +198,7 @@ def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tu
 
 
 def moments(features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-    """Returns the mean (D,) and the sum of squared deviations (D,) of frames (N, D) in float64."""
+    """Returns the float64 mean (D,) and sum of squared deviations (D,) of frames (N, D)."""
     size, zero = 1 << 16, torch.zeros(())  # all frames of a data set would not fit in memory
     mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
     return mean, sum(

@@ -43,8 +43,8 @@ class HumanML(Representation):
     The variant "legacy" reproduces the published data with all its peculiarities. The direction
     across the body is the direction across the shoulders minus the direction across the hips,
     instead of their sum. In the first frame, the heading is set to 0, although the smoothed heading
-    is not 0. `turn` is half the turn to the right, and changes its sign where the heading crosses
-    180 degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
+    is not 0. `turn` is half the turn to the right, and changes sign where the heading crosses 180
+    degrees. The root velocity is in the body coordinates of the next frame. Rotations are world
     rotations of the bones relative to the inverse heading, including the bones at the shoulders.
     `decode` also follows the published code. If a bone points exactly opposite to its rest
     direction, the published code returns NaN. This implementation returns a half turn instead.
@@ -238,7 +238,8 @@ class HumanML(Representation):
         """Returns the x and z components (N, 2) of the direction that the hips and shoulders face.
 
         The direction is the cross product of the vertical and the direction to the right. If the
-        body lies on its side, the vector is shorter. `hips` is the weight of the hips.
+        body lies on its side, the returned vector is shorter than 1. `hips` is the weight of the
+        hips.
         """
         right_hip, left_hip, right_shoulder, left_shoulder = joints[
             :, list(self.skeleton.facing)

@@ -344,7 +344,7 @@ def _line(
 
 
 def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
-    """Describes the numbers of replications and motions for most metrics, and then the exceptions."""
+    """Describes how many replications and motions most metrics have, followed by the exceptions."""
     counts = {}
     for result, name in zip(results, values, strict=True):
         entry = (result.values or {}).get(name) if result else None

@@ -275,7 +275,7 @@ def draw(part: Part, figure: Figure) -> Markup | None:
     """Draws a figure of a part as SVG. Returns None if the figure has no points.
 
     Curves are labeled with the names of the rows, and curves of reported values are dashed. If
-    values are best when they equal the value of real motions, this value is drawn as a dotted line.
+    values should be close to the value of real motions, this value is drawn as a dotted line.
     """
     panels = []
     for column in figure.y:

@@ -42,7 +42,7 @@ def value(config: Config, key: str) -> Any:
 
 
 def _sizes(config: Config) -> dict[str, float]:
-    """Returns the number of features, and the number of the denoiser's parameters in millions.
+    """Returns the number of features and the number of parameters of the denoiser, in millions.
 
     The parameters of the language model are not counted.
     """

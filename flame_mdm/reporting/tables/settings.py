@@ -42,7 +42,7 @@ def value(config: Config, key: str) -> Any:
 
 
 def _sizes(config: Config) -> dict[str, float]:
-    """Returns the number of features and the number of parameters of the denoiser, in millions.
+    """Returns the number of features, and the denoiser's number of parameters in millions.
 
     The parameters of the language model are not counted.
     """

@@ -1,4 +1,4 @@
-"""Run directories: their layout, typed schemas of their files, and readers."""
+"""Run directories: their layout, typed schemas for their files, and functions that read them."""
 
 import json
 import re
@@ -35,7 +35,10 @@ class RunConfig(Schema):
 
 
 class TrainedOn(Schema):
-    """The `data` entry of a provenance file. It may contain additional facts about the data."""
+    """The `data` entry of a provenance file.
+
+    The entry may contain additional facts about the data.
+    """
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
@@ -88,7 +91,7 @@ def made_by(path: str | Path) -> str:
 
 @dataclass
 class Run:
-    """Content of a run directory.
+    """Contents of a run directory.
 
     `history` maps the name of each curve to a mapping from training steps to values. `results` maps
     paths in the directory to results.
@@ -132,7 +135,7 @@ def check_run(folder: Path) -> None:
 
 
 def read_run(folder: Path) -> Run:
-    """Returns the content of a run directory.
+    """Returns the contents of a run directory.
 
     Raises:
         UserError: If the folder is not a run directory or if a file is damaged.

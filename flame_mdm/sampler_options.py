@@ -84,5 +84,5 @@ class SamplerOptions:
         }
 
     def over(self, defaults: Self) -> Self:
-        """Returns these options, taking each option that is None from `defaults`."""
+        """Returns these options, with each None replaced by the value in `defaults`."""
         return replace(defaults, **self.chosen())

@@ -25,15 +25,16 @@ class Motion272(Representation):
     | velocities | 66 | differences of `positions` from the previous frame, without the root's displacement and turn |
     | rotations | 132 | SMPL's rotations as 6D rows; the root's rotation is in body coordinates |
 
-    In the first row, `turn` is the identity, and velocities are 0. The heading is computed from the
-    root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z. In
-    raw motions (see `smpl.read_pose`), z is up. Bone lengths are determined by `offsets`, whereas
-    the authors keep each subject's bone lengths.
+    In the first row, `turn` is the identity and all velocities are 0. The heading is computed from
+    the root's rotation, so it jumps when a body lies down. Motions begin at x = z = 0, facing +z.
+    In raw motions (see `smpl.read_pose`), z is up. Bone lengths are determined by `offsets`,
+    whereas the authors keep each subject's bone lengths.
 
     Args:
         fps: frames per second.
         offsets: (24, 3), offsets of the joints from their parents in the rest pose, in meters. The
-            first offset leads from the translation to the pelvis. Default: `ADULT`.
+            first offset is the position of the pelvis relative to the translation. Default:
+            `ADULT`.
 
     Example:
         >>> representation = Motion272()
@@ -49,7 +50,7 @@ class Motion272(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `read_pose`."""
+        """Encodes a raw motion (F >= 2, 3 + 3 K) as float32 features (F, 272); see `read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError(
@@ -66,7 +67,7 @@ class Motion272(Representation):
         return self.features_of(joints, rotations)
 
     def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
-        """Returns features (F, 272) float32 from joint positions and rotations (F, 22, 3, 3).
+        """Returns float32 features (F, 272) from joint positions and rotations (F, 22, 3, 3).
 
         The joint positions have the shape (F, 22, 3). In both arguments, y is up, and the body
         faces +z in the first frame.
@@ -109,8 +110,8 @@ class Motion272(Representation):
     def poses(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Decodes features (..., F, 272) to SMPL poses, with y up.
 
-        The poses consist of the position (..., F, 3) of the pelvis and SMPL's rotations (..., F,
-        22, 3, 3).
+        The poses consist of the pelvis position (..., F, 3) and SMPL's rotations (..., F, 22, 3,
+        3).
         """
         inverse, ground = self._root(features)
         turned = rotation.rot6d_to_matrix(self.rotations6d(features)[..., 1:, :], "rows")

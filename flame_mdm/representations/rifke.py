@@ -32,7 +32,7 @@ class Rifke(Representation):
     | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |
 
     Three peculiarities of the published code are kept. The height of the floor is a soft minimum,
-    which depends on the unit of length. Heading changes are not unwrapped. The heading is computed
+    so it depends on the unit of length. Heading changes are not unwrapped. The heading is computed
     from knees and elbows instead of the intended hips and shoulders.
 
     Args:
@@ -52,7 +52,7 @@ class Rifke(Representation):
         self.units_per_metre = units_per_metre
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes finite joint positions (T, 21, 3) as features (T, 64) float32.
+        """Encodes finite joint positions (T, 21, 3) as float32 features (T, 64).
 
         The positions are in meters, with y up.
         """
@@ -91,8 +91,8 @@ class Rifke(Representation):
     def floor(self, joints: Tensor) -> Tensor:
         """Estimates the height of the floor from joint positions (T, 21, 3).
 
-        Positions and heights are in KIT's unit. The estimate is a soft minimum, over time, of the
-        height of the lowest foot.
+        Positions and heights are in KIT's unit. The estimate is a soft minimum of the lowest foot's
+        height over time.
         """
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()
@@ -101,8 +101,8 @@ class Rifke(Representation):
     def heading(self, joints: Tensor) -> Tensor:
         """Returns the heading (T,) of a body with joint positions (T, 21, 3).
 
-        Headings are in radians, from -pi to pi. A body with heading 0 faces +z. Positive headings
-        are turned toward +x.
+        Headings are in radians, from -pi to pi. A body with heading 0 faces +z. For positive
+        headings, the body is turned toward +x.
         """
         left_knee, right_knee, left_elbow, right_elbow = joints[:, KNEES_AND_ELBOWS].unbind(1)
         across = right_knee - left_knee + right_elbow - left_elbow

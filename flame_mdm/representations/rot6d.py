@@ -16,8 +16,9 @@ class Rot6D(Representation):
     """The 25 x 6 unnormalized features of Petrovich et al. 2021 (ACTOR).
 
     The features are 24 rotations as 6D rows, followed by (x, y, z, 0, 0, 0). (x, y, z) is the
-    root's translation relative to the first frame. It is in meters and in camera coordinates, where
-    y points down and z points away from the camera. For raw motions, see `smpl.read_pose`.
+    root's translation relative to the first frame. The translation is in meters and in camera
+    coordinates, where y points down and z points away from the camera. See `smpl.read_pose` for the
+    layout of raw motions.
 
     Args:
         fps: frames per second.
@@ -38,13 +39,13 @@ class Rot6D(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K) as features (F, 150) float32; see `smpl.read_pose`."""
+        """Encodes a raw motion (F, 3 + 3 K) as float32 features (F, 150); see `smpl.read_pose`."""
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
 
     def rebase(self, features: Features) -> Features:
-        """Makes the root translation of each cut clip (..., F, D) relative to its first frame."""
+        """Makes root translations relative to the first frame of each cut clip (..., F, D)."""
         moved = deepcopy(features)
         translation = moved[..., 144:147]
         translation -= features[..., :1, 144:147]

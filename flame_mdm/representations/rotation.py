@@ -90,9 +90,9 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     """Converts 6D vectors (..., 6), orthonormal or not, to matrices (..., 3, 3).
 
     The vectors are orthonormalized with Gram-Schmidt (Zhou et al. 2019, eq. 15). Every pair of
-    finite vectors results in a rotation. If one vector has no direction, it is replaced by the
-    basis vector that is least parallel to the other vector. If the vectors are parallel, such a
-    basis vector replaces the second one. Two zero vectors result in the identity.
+    finite vectors yields a rotation. A zero vector is replaced by the basis vector that is least
+    parallel to the other vector. If the vectors are parallel, the second one is replaced in the
+    same way. Two zero vectors yield the identity.
     """
     degenerate = _degenerate(rot6d, *_orthogonal(rot6d))
     # There are no branches here, because neither exported graphs nor torch.func.vmap, which
@@ -106,8 +106,8 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
 def is_degenerate(rot6d: Tensor) -> Tensor:
     """Returns a bool tensor (...,) that is True where a 6D vector (..., 6) defines no rotation.
 
-    This is the case if one of its two vectors is 0, or if they are parallel. `rot6d_to_matrix`
-    replaces such vectors.
+    The rotation is undefined if one of the two 3D vectors is 0 or if both are parallel.
+    `rot6d_to_matrix` replaces such vectors.
     """
     return _degenerate(rot6d, *_orthogonal(rot6d)).squeeze(-1)
 
@@ -115,8 +115,8 @@ def is_degenerate(rot6d: Tensor) -> Tensor:
 def _orthogonal(rot6d: Tensor) -> tuple[Tensor, Tensor]:
     """Converts each 6D vector (..., 6) to two orthogonal vectors.
 
-    The results are the normalized first vector, and the component of the second vector that is
-    perpendicular to it.
+    The results are the normalized first vector and the component of the second vector that is
+    perpendicular to the first.
     """
     first, second = F.normalize(rot6d[..., :3], dim=-1), rot6d[..., 3:]
     return first, second - (first * second).sum(-1, keepdim=True) * first
@@ -126,7 +126,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
     """Returns a bool tensor (..., 1) that is True where a 6D vector (..., 6) defines no rotation.
 
     `first` and `across` are the results of `_orthogonal`. If the two vectors are parallel, `across`
-    consists of rounding errors. Vectors that contain NaN do not count as degenerate, so they stay
+    contains only rounding errors. Vectors that contain NaN do not count as degenerate, so they stay
     NaN.
     """
     length = torch.linalg.vector_norm(rot6d[..., 3:], dim=-1, keepdim=True)
@@ -140,7 +140,7 @@ def _degenerate(rot6d: Tensor, first: Tensor, across: Tensor) -> Tensor:
 def _shorter(normalized: Tensor) -> Tensor:
     """Returns a bool tensor (..., 1) that is True where a normalized vector has a norm below 1.
 
-    The original vector was close to 0 in this case.
+    In this case, the original vector was close to 0.
     """
     return (
         torch.linalg.vector_norm(normalized, dim=-1, keepdim=True)
@@ -195,7 +195,7 @@ def standardize(quaternion: Tensor) -> Tensor:
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the Hamilton product (..., 4) of a and b, which rotates first by b and then by a."""
+    """Returns the Hamilton product (..., 4) of a and b: the rotation by b, followed by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     product = [
@@ -229,7 +229,7 @@ def _scaled(vectors: Tensor) -> Tensor:
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """Returns the shortest rotation that turns the direction of `a` (..., 3) into `b`'s direction.
+    """Returns the shortest rotation from the direction of `a` (..., 3) to the direction of `b`.
 
     The quaternions (..., 4) have w >= 0. For opposite directions, the result is a half turn about
     a perpendicular axis. If a vector is 0, the result is the identity.
@@ -289,7 +289,7 @@ def continuous(quaternion: Tensor, dim: int) -> Tensor:
 def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
     """Rotates vectors (..., 3) about the vertical axis by `angle` (...) in radians.
 
-    Positive angles turn +z toward +x, to the left.
+    Positive angles turn +z toward +x, which is a turn to the left.
     """
     x, y, z = vector.unbind(-1)
     cosine, sine = torch.cos(angle), torch.sin(angle)

@@ -49,7 +49,7 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """For each joint, the reference joint of its rotation in HumanML3D.
+        """For each joint, the reference joint for its rotation in HumanML3D.
 
         The reference joint is the parent or, at the start of a chain, the root.
         """
@@ -68,7 +68,7 @@ class Skeleton:
     def mirror(self, joints: Tensor) -> Tensor:
         """Returns the mirror image of joint positions (..., J, 3).
 
-        The sign of x is changed, and left and right joints are swapped.
+        The sign of x is flipped, and left and right joints are swapped.
         """
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
@@ -257,7 +257,8 @@ SKELETONS: dict[str, Skeleton] = {skeleton.name: skeleton for skeleton in (SMPL2
 def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
     """Returns the indices of the joints in each body part.
 
-    As in MDM, lower_body consists of the root and the legs, and upper_body of all other joints.
+    As in MDM, lower_body consists of the root and the legs, and upper_body includes all other
+    joints.
     """
     parts: dict[str, list[int]] = {}
     for side in ("left", "right"):

@@ -59,15 +59,15 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """The 147 unnormalized features of Kim et al. 2023 (FLAME).
 
-    The features are the translation (3) and 24 rotations as 6D rows. Like AMASS, they use world
-    coordinates in meters, with z up, and are neither centered nor rotated. For raw motions, see
-    `read_pose`.
+    The features are the translation (3) and 24 rotations as 6D rows. As in AMASS, the coordinates
+    are world coordinates in meters, with z up. The motion is neither centered nor rotated. See
+    `read_pose` for the layout of raw motions.
 
     Args:
         fps: frames per second.
         offsets: (24, 3), offsets of the joints from their parents in the rest pose, in meters; used
-            for decoding. The first offset leads from the translation to the pelvis. Default:
-            `ADULT`.
+            for decoding. The first offset is the position of the pelvis relative to the
+            translation. Default: `ADULT`.
 
     Example:
         >>> representation = SMPL()
@@ -83,7 +83,7 @@ class SMPL(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K) as features (F, 147) float32; see `read_pose`."""
+        """Encodes a raw motion (F, 3 + 3 K) as float32 features (F, 147); see `read_pose`."""
         translation, rotations = read_pose(motion)
         return torch.cat(
             [translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1

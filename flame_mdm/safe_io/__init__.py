@@ -1,7 +1,7 @@
-"""Atomic writes, hashes, locks, and safe reading of files that come from other people.
+"""Atomic writes, hashes, locks, and safe reading of files from other people.
 
-Files that may come from other people are always read or checked with this module first. Such a file
-must be a regular file of limited size, and the sizes that it declares must match its actual size.
+Files that may come from other people are always read or checked by this module first. Such a file
+must be a regular file of limited size, and the sizes that it declares must match its content.
 Functions that read a file raise `FileNotFoundError` if it does not exist, and `UserError` if it is
 not a regular file or if its content is rejected.
 """
@@ -68,7 +68,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # error numbers of 
 
 @contextmanager
 def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Iterator[Path]:
-    """Yields a temporary path next to `path` that is renamed to `path` at the end.
+    """Yields a temporary path next to `path`; the file is renamed to `path` at the end.
 
     No files are left behind after a failure. The temporary name is unique, so several processes can
     write the same file; the last one wins. If `path` is a link, the link is replaced, and its
@@ -161,7 +161,8 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Describes why a file could not be written, and the free space if the disk may be full."""
+    """Describes why a file could not be written, and states the free space if the disk may be full.
+    """
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -208,7 +209,7 @@ def write_json(
 def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator[None]:
     """Adds the name of a file to every `UserError` whose message does not contain the name.
 
-    The exceptions in `errors` are converted to `UserError`, and `prefix` is added before their
+    The exceptions in `errors` are converted to `UserError`, and `prefix` is prepended to their
     messages.
     """
     try:
@@ -225,12 +226,12 @@ def naming(name: object, *errors: type[Exception], prefix: str = "") -> Iterator
 def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
     """Holds a lock file that names the process and the host.
 
-    If a dead process left the lock file behind, the name of that process is yielded, otherwise "".
-    If another process holds the lock, `busy` is called with the name of that process. Unless `busy`
+    Yields the name of the dead process that left the lock file behind, or "" if there is none. If
+    another process holds the lock, `busy` is called with the name of that process. Unless `busy`
     raises an error, this function then waits for the lock. `advice` is part of the warning about
     file systems that do not support locks. When the process ends, for whatever reason, the
     operating system releases the lock. The lock is a POSIX record lock. Unlike the locks of
-    `filelock`, such a lock also works between hosts on NFS and Lustre, but it is not available on
+    `filelock`, record locks also work across hosts on NFS and Lustre, but they are not available on
     Windows.
     """
     while True:
@@ -353,7 +354,10 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the plain content of a YAML file. Interpolations such as `${a}` are kept as text."""
+    """Returns the content of a YAML file as plain values.
+
+    Interpolations such as `${a}` are kept as text.
+    """
     import yaml
     from omegaconf import OmegaConf
 
@@ -371,10 +375,10 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def read_package_yaml(path: Path) -> Any:
-    """Returns the plain content of a YAML file that is part of the package.
+    """Returns the content of a YAML file of this package as plain values.
 
-    Thanks to LibYAML, this is fifteen times as fast as `read_yaml`, but the checks for files from
-    other people are skipped.
+    With LibYAML, this function is fifteen times as fast as `read_yaml`, but it skips the checks for
+    files from other people.
     """
     import yaml
 
@@ -450,7 +454,7 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
 
 @contextmanager
 def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
-    """Yields a file of arrays, opened for reading, and the size of the file.
+    """Opens a file of arrays for reading, and yields the file and its size.
 
     Errors caused by damaged content are converted to `UserError`.
     """

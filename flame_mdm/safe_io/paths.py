@@ -1,4 +1,4 @@
-"""Paths for writing safely to a folder that may contain files from other people.
+"""Checked and temporary paths for writing to a folder that may contain files from other people.
 
 Links must not lead out of the folder. A file that is written in place must not have a second name
 (a hard link). The names of temporary files are unique.
@@ -122,9 +122,9 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
     """Removes temporary files and folders left behind by dead processes.
 
     Args:
-        folder: folder of the temporary files and folders.
+        folder: the folder that contains the temporary files and folders.
         path: the file or folder whose temporary files are removed. None = all temporary files in
-            the folder are removed.
+            the folder.
         is_locked: whether this process holds the lock that is required for writing such files. If
             it does, files from processes on other machines are also removed. Otherwise, these files
             are kept, because their processes may still be alive.

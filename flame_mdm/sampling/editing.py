@@ -95,24 +95,24 @@ def edit(
         model: the model, from `flame_mdm.load`.
         motion: a `Motion`, a file or clip that `read_motion` can read, or joint positions (F, J, 3)
             in meters, with y up and in the joint order of a known skeleton.
-        texts: what the person does in the new part, as one string or several. By default, the new
-            part is unconditioned, unless `actions` are given.
-        fps: frames per second of an array or an .npy file. For other files, it overrides the frame
-            rate stated in the file.
+        texts: what the person does in the new part, as one string or several. Without texts and
+            `actions`, the new part is unconditioned.
+        fps: frames per second of an array or an .npy file. For other files, this value overrides
+            the frame rate stated in the file.
         cut: the part of the motion to use, as [begin, end] in seconds. Default: the entire motion.
         stages: list that receives clean estimates of the first motion, taken at equal intervals
             during sampling, followed by the motion itself.
         keywords: `region` or `region_seconds`, `joints` and `strength` select what is resampled.
-            `method`, `until` and `resample` determine how it is resampled. All of them are
-            described in `flame_mdm.sampling.motion_request.EditRequest`. The keywords of
-            `flame_mdm.generate` also apply, such as `samples` (1), `seed` (0) and `guidance_scale`.
-            `cleanup` also changes the kept part, usually by millimeters; `Edited.joint_error`
-            states by how much.
+            `method`, `until` and `resample` determine how this part is resampled.
+            `flame_mdm.sampling.motion_request.EditRequest` describes all of these keywords. The
+            keywords of `flame_mdm.generate`, such as `samples` (1), `seed` (0) and
+            `guidance_scale`, also apply. `cleanup` also changes the kept part, usually by
+            millimeters; `Edited.joint_error` states by how much.
 
     Returns:
         The edited motions, with `samples` motions for each text: all samples of the first text come
         first, then all samples of the second text, and so on. The list does not contain the
-        original, which is stored in the attribute `original` of each edited motion.
+        original, which is stored in the `original` attribute of each edited motion.
 
     Raises:
         UserError: If the request is invalid, if the process does not support the method, or if the
@@ -211,7 +211,7 @@ def _original(
     fps: float | None,
     cut: Sequence[float] | None,
 ) -> Motion:
-    """Returns the motion to edit, or its part `cut`, with features in the representation."""
+    """Returns the motion to edit, or its part `cut`, with features in the given representation."""
     if isinstance(motion, str | Path):
         return read_motion(representation, motion, fps=fps, cut=cut)
     if not isinstance(motion, Motion):
@@ -284,7 +284,7 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options of `Edit` and of the sampler, as required by an editing method.
+    """Returns the `Edit` options and the sampler options that an editing method requires.
 
     If the request does not name a method, the process's default method is used.
     """

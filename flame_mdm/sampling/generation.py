@@ -41,24 +41,24 @@ def generate(
     """Generates motions for texts or actions, or unconditioned motions if neither is given.
 
     A motion depends only on its text, its length, its sample number and the seed, not on the other
-    texts. If the same text is given several times, its sample numbers continue, so all of its
-    samples differ. "A man walks, then sits down" becomes the sequence "A man walks | sits down",
-    unless `split=False`.
+    texts. If a text is given several times, its sample numbers continue from one occurrence to the
+    next, so all of its samples differ. "A man walks, then sits down" becomes the sequence "A man
+    walks | sits down", unless `split=False`.
 
     Args:
         model: the model, from `flame_mdm.load`.
         texts: what the person does, as one string or several.
-        score: function that scores those `candidates` that have no faults. The candidate with the
-            highest score is kept. By default, the candidate with the fewest faulty frames is kept.
+        score: function that scores the `candidates` without faults. The candidate with the highest
+            score is kept. By default, the candidate with the fewest faulty frames is kept.
         edit: an edit that keeps part of a motion in every sample. The motion is as long as the
             samples; `known` and `keep` have the shape (1, F, D).
         stages: list that receives clean estimates of the first motion, taken at equal intervals
             during sampling, followed by the motion itself (MFM, figure 5).
-        keywords: fields of `flame_mdm.sampling.motion_request.SamplingRequest`, which describes
-            them: `actions` (instead of texts), `seconds` or `frames` (default: 3 seconds, or less
-            for one or two repetitions, as in "kicks twice"), `samples` per text (1), `candidates`
-            per sample (1), `seed` (0), `after`, `split` (True), `loop` (False), `targets` or
-            `path`, `shared_noise` (False) and `cleanup` (False). The sampler options
+        keywords: fields of `flame_mdm.sampling.motion_request.SamplingRequest` (see its
+            description): `actions` (instead of texts), `seconds` or `frames` (default: 3 seconds,
+            or less for one or two repetitions, as in "kicks twice"), `samples` per text (1),
+            `candidates` per sample (1), `seed` (0), `after`, `split` (True), `loop` (False),
+            `targets` or `path`, `shared_noise` (False) and `cleanup` (False). The sampler options
             `guidance_scale`, `sampler`, `num_inference_steps`, `eta` and `spacing` (default: the
             model's) are described in `flame_mdm.sampler_options.SamplerOptions`.
 
@@ -125,7 +125,7 @@ def sample(
 
 
 def best(candidates: Sequence[Motion], score: Score | None = None) -> Motion:
-    """Returns the candidate without faults that has the highest score.
+    """Returns the faultless candidate with the highest score.
 
     If all candidates have faults, all of them are scored. Without `score`, the candidate with the
     fewest faulty frames is returned.
@@ -206,7 +206,7 @@ def _sample(
 def _sample_streams(
     model: MotionGenerator, resolved: ResolvedRequest, rows: Sequence[_Row]
 ) -> list[Motion]:
-    """Samples motions as the beginnings of streams.
+    """Samples each motion as the beginning of a stream.
 
     Motions with targets are sampled one by one, because guidance toward targets supports only a
     single motion.
@@ -258,7 +258,10 @@ def _edit(model: MotionGenerator, resolved: ResolvedRequest, x: Tensor) -> Edit 
 
 
 def _decoded(model: MotionGenerator, resolved: ResolvedRequest, row: _Row, x: Tensor) -> Motion:
-    """Converts normalized features (F, D) to a motion that starts where the previous one ends."""
+    """Converts normalized features (F, D) to a motion.
+
+    If the motion continues a previous motion, the result begins with the previous motion.
+    """
     representation, prompt = model.representation, row.prompt
     features = representation.denormalize(x[: sum(prompt.frames)].float())
     if resolved.before is not None:

@@ -2,7 +2,7 @@
 """Keywords of `flame_mdm.generate` and `flame_mdm.edit`, with their types.
 
 The keywords are the fields of `SamplingRequest`, `EditRequest` and `SamplerOptions`. These classes
-define their defaults and help texts.
+define the defaults and help texts of the keywords.
 """
 
 from collections.abc import Mapping, Sequence

@@ -382,7 +382,7 @@ class SamplingRequest:
     def is_sequence(self) -> bool:
         """Whether motions are generated in windows.
 
-        This is the case if a prompt has several parts or states a duration, or if the motions loop
+        Windows are used if a prompt has several parts or states a duration, or if the motions loop
         or continue another motion.
         """
         return self.loop or self.after is not None or any(is_timed(parts) for parts in self.parts)
@@ -425,7 +425,7 @@ def read_parts(text: str) -> list[Part]:
     """Splits "walks @3 | sits down" into the parts [("walks", 3.0), ("sits down", None)].
 
     Raises:
-        UserError: If a part is empty, or its duration is not a number of seconds above 0.
+        UserError: If a part is empty, or if its duration is not a number of seconds above 0.
     """
     parts: list[Part] = []
     for part in text.split("|"):

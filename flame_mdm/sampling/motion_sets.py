@@ -156,7 +156,7 @@ class MadeSet:
 
 
 def make_set(model: MotionGenerator, content: MotionSet, seed: int = 0, **options: Any) -> MadeSet:
-    """Generates the motions of a set and cuts them into clips, with a progress bar.
+    """Generates the motions of a set, cuts them into clips, and shows a progress bar.
 
     For each motion, the candidate with the best clips is kept. In a good clip, the poses at the
     cuts are similar, the feet neither slide nor jerk, and few frames have faults. Motions that the
@@ -281,8 +281,8 @@ def motion_of(clip: Clip) -> Motion:
 def rig_clips(clips: list[Clip], rig: str | None, body: Mesh | None = None) -> list[RiggedClip]:
     """Converts clips to in-place clips that share one skeleton and one skin.
 
-    The rotations of all clips are computed together, because all clips must have the same rest
-    pose: programs apply all animations of a set to the skeleton of the first file.
+    All clips must have the same rest pose, because programs apply all animations of a set to the
+    skeleton of the first file. Therefore, the rotations of all clips are computed together.
     """
     fps = clips[0].motion.fps
     joints, frames = gaits.with_neighbors(clips, round(SEPARATION * fps))
@@ -331,7 +331,7 @@ def write_set(
 
 
 def _entry(clip: Clip, still: RiggedClip, files: Mapping[str, str]) -> dict[str, Any]:
-    """Returns the entry of a clip in `set.json`.
+    """Returns a clip's entry in `set.json`.
 
     Lengths are in meters, angles in degrees, and times in seconds.
     """

@@ -13,7 +13,7 @@ from flame_mdm.representations.rotation import rotate_y
 
 @dataclass(frozen=True)
 class Placement:
-    """Placement of B bodies: a rotation about the vertical axis and a shift on the floor.
+    """Placement of B bodies: a rotation about the vertical axis and a shift along the floor.
 
     The rotations (B,) are in radians, and the shifts (B, 3) are in meters, with y = 0. Both are
     float64.
@@ -30,10 +30,10 @@ class Placement:
 
     @classmethod
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
-        """Returns the placement that best maps the poses `local` (B, J, 3) to `world` (B, J, 3).
+        """Returns the placement that maps the poses `local` (B, J, 3) to `world` (B, J, 3).
 
-        It minimizes the squared error (Kabsch 1976, for a rotation about one axis). Heights do not
-        change. If the poses differ only in their placement, the error is 0.
+        The placement minimizes the squared error (Kabsch 1976, for a rotation about one axis).
+        Heights do not change. If the poses differ only in their placement, the error is 0.
         """
         local, world = local.double(), world.double()
         floor = local.new_tensor([1.0, 0.0, 1.0])
@@ -58,10 +58,10 @@ class Placement:
 
 
 def step_after(representation: Representation, last: Tensor, world: Tensor) -> Placement:
-    """Returns the placement from which the frames after `last` are decoded.
+    """Returns the placement for decoding the frames after `last`.
 
-    It does not depend on the later frames, because each frame contains the turn and the step of the
-    root to the next frame.
+    The placement does not depend on later frames, because each frame contains the root's turn and
+    step to the next frame.
 
     Args:
         representation: the representation of the features.

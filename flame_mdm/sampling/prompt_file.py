@@ -18,8 +18,8 @@ class PromptFile:
 
     Attributes:
         path: name of the file, as the user typed it.
-        lines: the prompts by line number, starting at 1. Blank lines are omitted.
-        refused: the errors that state why prompts cannot be sampled, by line number.
+        lines: the prompts, keyed by line number, starting at 1. Blank lines are omitted.
+        refused: the errors that state why prompts cannot be sampled, keyed by line number.
     """
 
     path: str
@@ -50,13 +50,13 @@ class PromptFile:
 
     @property
     def accepted(self) -> dict[int, str]:
-        """The prompts that are not refused, by line number."""
+        """The prompts that are not refused, keyed by line number."""
         return {
             number: prompt for number, prompt in self.lines.items() if number not in self.refused
         }
 
     def refuse(self, errors: Mapping[int, UserError]) -> None:
-        """Refuses prompts; the keys of `errors` are their indices among the accepted prompts."""
+        """Refuses prompts; the keys of `errors` are indices into the accepted prompts."""
         numbers = list(self.accepted)
         self.refused.update({numbers[position]: error for position, error in errors.items()})
 

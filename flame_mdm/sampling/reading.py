@@ -48,7 +48,7 @@ def read_motion(
 
     Raises:
         FileNotFoundError: If the motion does not exist.
-        UserError: If the motion is damaged or cannot be encoded, or `cut` is outside the motion.
+        UserError: If the motion is damaged or cannot be encoded, or if `cut` is outside the motion.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
@@ -96,7 +96,7 @@ def part_of(representation: Representation, motion: Motion, cut: Sequence[float]
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns the motion with features in the representation.
+    """Returns the motion with features in the given representation.
 
     If the motion has no features, they are computed from its joint positions.
     """

@@ -1,4 +1,4 @@
-"""`Body`: a motion, normalized in frame rate and size, on which claims are measured."""
+"""`Body`: a motion with a normalized frame rate and size, for measuring claims."""
 
 from functools import cached_property
 
@@ -20,7 +20,8 @@ FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the indices of a left and a right joint: "wrist" means left_wrist and right_wrist."""
+    """Returns the indices of the left and right joints: "wrist" means left_wrist and right_wrist.
+    """
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 
@@ -117,7 +118,7 @@ class Body:
 
     @cached_property
     def velocity(self) -> np.ndarray:
-        """Velocity (F, 2) of the pelvis to the left and forward, in m/s.
+        """Leftward and forward velocity (F, 2) of the pelvis, in m/s.
 
         The sway of individual steps is filtered out.
         """
@@ -159,7 +160,7 @@ class Body:
 
 
 def rate_of(values: np.ndarray) -> np.ndarray:
-    """Returns the rate of change per second of values (F, ...)."""
+    """Returns the rate of change of values (F, ...) per second."""
     if len(values) < 2:
         return np.zeros_like(values)
     return np.gradient(values, 1 / RATE, axis=0)

@@ -35,8 +35,8 @@ class Verdict:
         claim: the claim.
         answer: "yes", "no" or "cannot tell".
         reading: the measurement.
-        band: two thresholds of the score. The answer is "no" up to the first one, "yes" from the
-            second one on, and "cannot tell" in between.
+        band: two thresholds of the score. The answer is "no" up to the first threshold, "yes" from
+            the second threshold on, and "cannot tell" in between.
     """
 
     claim: Claim

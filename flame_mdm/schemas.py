@@ -36,7 +36,7 @@ class Schema(BaseModel):
 
 
 class ClosedSchema(Schema):
-    """Schema of a file that people write.
+    """Schema of a file that is written by hand.
 
     Unknown keys are errors, except for overrides such as `data.crop.max_frames`.
     """

@@ -4,9 +4,9 @@ A random number depends on its purpose, not on the order in which numbers are dr
 
 In a sampling run, each element of a motion's noise is a function of its index and of (seed,
 replication, id). The noise therefore does not depend on the batch, the padding, the number of ranks
-or the device. It is computed by hashing a counter (splitmix64: Steele, Lea and Flood 2014, "Fast
-splittable pseudorandom number generators") and mapping the hash to the normal distribution (Box and
-Muller 1958).
+or the device. The noise is computed by hashing a counter (splitmix64: Steele, Lea and Flood 2014,
+"Fast splittable pseudorandom number generators") and mapping the hash to the normal distribution
+(Box and Muller 1958).
 """
 
 import hashlib
@@ -90,7 +90,7 @@ def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
 
 
 def normal(keys: Tensor, frames: int, features: int) -> Tensor:
-    """Returns standard normal noise (B, F, D), float32, for keys (B,) int64.
+    """Returns float32 standard normal noise (B, F, D) for int64 keys (B,).
 
     Element (f, d) of the noise for a key does not depend on B or F (Box and Muller 1958).
 

@@ -174,7 +174,7 @@ class GeneratorTask(Task):
 
     Args:
         parts: the four parts of the generator.
-        losses: weights of the `MotionLosses` of the clean estimate.
+        losses: weights of the `MotionLosses` for the clean estimate.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
         cond_drop_prob: probability that a training sample receives the null condition.
         guidance_scale, sampler, num_inference_steps: defaults of `generate`; see

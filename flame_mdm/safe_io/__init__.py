@@ -161,8 +161,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Describes why a file could not be written, and states the free space if the disk may be full.
-    """
+    """Describes why a file could not be written; states the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason

@@ -55,8 +55,7 @@ def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
 
 
 def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
-    """Returns a warning if the features in some frames do not determine rotations, or [] otherwise.
-    """
+    """Returns a warning if features in some frames do not determine rotations; otherwise, []."""
     degenerate = sum(motion.degenerate for motion in motions)
     if not degenerate:
         return []

@@ -30,7 +30,7 @@ class Placement:
 
     @classmethod
     def fit(cls, local: Tensor, world: Tensor) -> Placement:
-        """Returns the placement that maps the poses `local` (B, J, 3) to `world` (B, J, 3).
+        """Returns the placement that best maps the poses `local` (B, J, 3) to `world` (B, J, 3).
 
         The placement minimizes the squared error (Kabsch 1976, for a rotation about one axis).
         Heights do not change. If the poses differ only in their placement, the error is 0.

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Resolves requests: determines everything that depends on the model, before sampling."""
+"""Resolves requests before sampling: determines everything that depends on the model."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -39,7 +39,7 @@ class ResolvedPrompt:
         conditions: caption or action of each part, as the model reads it.
         texts: the words of the prompt that belong to each part.
         frames: number of frames in each part. If the motion continues another one, the first part
-            includes the frames in which they overlap.
+            includes the frames in which the two motions overlap.
         unknown: words of the text that do not occur in the training captions or that the model does
             not read.
         summary: one line that states how the text was understood, or "" if the model's captions may
@@ -59,7 +59,7 @@ class ResolvedPrompt:
 
 @dataclass(frozen=True)
 class ResolvedRequest:
-    """A request resolved for a model: sentences are split, lengths are in frames, files are read.
+    """A request resolved for a model: sentences are split, files read, and lengths given in frames.
 
     Attributes:
         request: the original request.
@@ -69,9 +69,9 @@ class ResolvedRequest:
         targets: positions and poses to reach.
         edit: an edit that keeps part of a motion in all sampled motions. `known` and `keep` have
             the shape (1, F, D).
-        warnings: warnings for the user about the motion to continue (what was omitted from its file
-            or looks wrong), about differences between a text and what is sampled, and about words
-            that the model does not know or does not read.
+        warnings: warnings for the user. They concern the motion to continue (what was omitted from
+            its file or looks wrong), differences between a text and what is sampled, and words that
+            the model does not know or does not read.
     """
 
     request: SamplingRequest
@@ -96,7 +96,8 @@ def resolve(
         request: the request.
         model: the model that samples the motions.
         refused: mapping from prompt indices to errors. Prompts that the model cannot sample are
-            added to it; all other prompts are resolved. By default, the first error is raised.
+            added to this mapping; all other prompts are resolved. By default, the first error is
+            raised.
         check_words: whether to reject a text if the model knows none of its content words.
 
     Raises:
@@ -155,11 +156,12 @@ def resolve(
 def _usual_frames(
     prompt: ReadPrompt, requested: float | None, model: MotionGenerator
 ) -> list[float | None]:
-    """Returns the lengths, in frames, of the parts whose durations the prompt does not state.
+    """Returns the length, in frames, of each part without a stated duration.
 
     The result has one entry per part; None stands for the default length. The requested number of
-    frames, if any, applies to all parts. Otherwise, a part that states a number of repetitions is
-    as long as the repetitions take, because a longer motion would repeat the action more often.
+    frames, if any, applies to all parts. Otherwise, a part that states a number of repetitions
+    lasts as long as these repetitions take, because a longer motion would repeat the action more
+    often.
     """
     parts = len(prompt.parts)
     if requested is not None or not prompt.fitting:

@@ -19,7 +19,7 @@ MAX_SECONDS = 600
 def overlap(model: MotionGenerator) -> int:
     """Returns the number of frames that neighboring windows share.
 
-    The number is even, and 0 for a model that continues frames.
+    The number is always even. For a model that continues frames, it is 0.
     """
     if model.denoiser.context_frames:
         return 0
@@ -41,9 +41,9 @@ def part_frames(
         model: the model that samples the motion.
         text: the prompt, as it is quoted in error messages.
         parts: the parts of the prompt, with their durations in seconds if the prompt states them.
-        usual: the unrounded length, in frames, of each part whose duration the prompt does not
-            state. None stands for `USUAL_SECONDS` or, if that is too long for one window, for the
-            number of frames that fit into the window.
+        usual: the unrounded length, in frames, of each part without a stated duration. None stands
+            for `USUAL_SECONDS` or, if that is too long for one window, for the number of frames
+            that fit into the window.
         is_sequence: whether the motion is sampled in windows. If not, the prompt has a single part.
         loop: whether the last frame should lead back to the first one.
 
@@ -111,7 +111,7 @@ def windows(
     """Returns the windows of several sequences.
 
     For each sequence, `conditions` contains the texts or actions of its parts, and `lengths`
-    contains their lengths in frames.
+    contains the lengths of these parts in frames.
     """
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
     spans_of = [spans(parts, longest, shared, request.loop) for parts in lengths]

@@ -59,9 +59,9 @@ def stream(
             prepared data set. Only its last frames are used. By default, the person first stands
             still.
         seed: seed of the noise.
-        block: number of frames per block. The default and maximum is the number of frames that the
-            model predicts at once. Shorter blocks react sooner to a new text, but cost more time
-            per second of motion.
+        block: number of frames per block. The default, which is also the maximum, is the number of
+            frames that the model predicts at once. Shorter blocks react sooner to a new text, but
+            cost more time per second of motion.
         cleanup: whether to smooth the motion, keep bone lengths constant, and keep feet from
             sliding. Each block is then returned only after the next one has been computed, because
             the two blocks must fit together.
@@ -155,8 +155,8 @@ class Stream(Iterator[Motion]):
         person who is standing stays in place. After the last waypoint, the path no longer bends.
 
         Args:
-            waypoints: world positions (x, z) in meters, in order. They replace all earlier
-                waypoints; an empty list only removes them.
+            waypoints: world positions (x, z) in meters, in order. These waypoints replace all
+                earlier waypoints; an empty list only removes the earlier waypoints.
 
         Raises:
             UserError: If a waypoint does not consist of two finite numbers or is too far away, or
@@ -172,10 +172,10 @@ class Stream(Iterator[Motion]):
     def go_back(self, at: float) -> None:
         """Drops the frames after a given time, so that the next block continues from there.
 
-        If this is called before the dropped frames are shown, a new text takes effect at once, even
-        if blocks were computed in advance. The result is the same as if the text had been changed
-        at that time. Later changes of the text are also dropped, and waypoints that were reached
-        later count as not yet reached.
+        If this method is called before the dropped frames are shown, a new text takes effect at
+        once, even if blocks were computed in advance. The result is the same as if the text had
+        been changed at that time. Later changes of the text are also dropped, and waypoints that
+        were reached later count as not yet reached.
 
         Args:
             at: time in seconds since the start of the stream, in one of the last four blocks.
@@ -245,8 +245,8 @@ class OnlineCleanup:
 class PastBlock(NamedTuple):
     """A past block of a single stream, which `go_back` can shorten.
 
-    `begin` is the index of its first frame, and `number` is the index of the block, which
-    determines its noise.
+    `begin` is the index of the block's first frame. `number` is the index of the block, which
+    determines the block's noise.
     """
 
     begin: int
@@ -257,14 +257,14 @@ class PastBlock(NamedTuple):
 
 
 class Schedule:
-    """The condition of each frame of a stream."""
+    """The condition of each frame in a stream."""
 
     def __init__(self, condition: str):
         self.changes = [(0, condition)]
 
     @classmethod
     def of_parts(cls, conditions: Sequence[str], lengths: Sequence[int]) -> Self:
-        """Returns the schedule of consecutive parts, whose `lengths` are in frames."""
+        """Returns the schedule for consecutive parts with the given `lengths` in frames."""
         schedule, begin = cls(conditions[0]), 0
         for condition, length in zip(conditions[1:], lengths, strict=False):
             begin += length
@@ -285,7 +285,7 @@ class Schedule:
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames from a frame to the next change, if any."""
+        """Returns the number of frames until the next change, or None if there is none."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 
@@ -313,7 +313,8 @@ class Streams(Iterator[list[Motion]]):
             blocks. If a condition has no entry, the condition itself is used.
         frames: number of frames in each stream so far.
         targets: positions that a single stream should reach, or None. Guidance leads the motion to
-            them. If the model was trained with targets, they are also part of its condition.
+            these positions. If the model was trained with targets, the positions are also part of
+            its condition.
         waypoints: waypoints along which a single stream without targets is led.
     """
 
@@ -380,7 +381,7 @@ class Streams(Iterator[list[Motion]]):
         self.waypoints = waypoints
 
     def go_back(self, frame: int) -> None:
-        """Drops all frames from `frame` on, and later changes of the text, in a single stream.
+        """Drops all frames from `frame` on and all later text changes in a single stream.
 
         Raises:
             UserError: If the frame is not in one of the last `HELD` blocks.
@@ -407,7 +408,10 @@ class Streams(Iterator[list[Motion]]):
         self.frames = [frame]
 
     def take(self, lengths: Sequence[int]) -> list[Tensor]:
-        """Returns the next `lengths` normalized frames (F, D) of each stream."""
+        """Returns the next normalized frames (F, D) of each stream.
+
+        `lengths` contains the number of frames for each stream.
+        """
         ends = [frame + length for frame, length in zip(self.frames, lengths, strict=True)]
         parts: list[list[Tensor]] = [[] for _ in ends]
         while self.frames != ends:
@@ -426,12 +430,15 @@ class Streams(Iterator[list[Motion]]):
         ]
 
     def _until_change(self, row: int) -> int:
-        """Returns the number of frames in the next block of a stream, which may end at a change."""
+        """Returns the number of frames in the next block of a stream.
+
+        A block may end early, at a change.
+        """
         change = self.schedules[row].until_change(self.frames[row])
         return self.block if change is None else min(self.block, change)
 
     def _advance(self, kept: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Samples the next block, of which each stream keeps the first `kept` frames.
+        """Samples the next block. `kept` contains the number of frames that each stream keeps.
 
         Returns the normalized features (B, P, D) and the float64 world joint positions (B, P, J,
         3).
@@ -499,7 +506,7 @@ class Streams(Iterator[list[Motion]]):
     def _encode(self, conditions: list[str]) -> Condition:
         """Returns the encoded conditions.
 
-        They are encoded again only if they have changed.
+        Conditions are encoded again only if they have changed.
         """
         if self._encoded is None or self._encoded[0] != conditions:
             model, device = self.model, self.model.device
@@ -597,7 +604,7 @@ def starting_point(
     """Returns the normalized frames (1, C, D) that precede a stream, and the stream's placement.
 
     Raises:
-        UserError: If the model cannot stream, or the motion cannot be read or is too short.
+        UserError: If the model cannot stream, or if the motion cannot be read or is too short.
     """
     check_streams(model)
     context, representation = model.denoiser.context_frames, model.representation

@@ -54,7 +54,7 @@ class JointTarget(Timed):
 
 
 class PoseTarget(Timed):
-    """A frame of a motion file whose pose should be reached, at a given position or anywhere.
+    """A frame of a motion file, whose pose should be reached at a given position or anywhere.
 
     `heading` is in degrees.
     """
@@ -141,9 +141,9 @@ class Targets:
         """Returns the targets in the window of `frames` frames that starts at `begin`.
 
         Frames are counted from the beginning of the window. If the root has a target after the
-        window, a target is added at the end of the window. It is the point that the root reaches by
-        then if it moves toward the later target at a constant speed. This movement starts at the
-        root's last target in the window or, if there is none, at `here`.
+        window, a target is added at the end of the window. This added target is the point that the
+        root reaches by then if the root moves toward the later target at a constant speed. This
+        movement starts at the root's last target in the window or, if there is none, at `here`.
 
         Args:
             begin: first frame of the window.
@@ -226,7 +226,7 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
-    """Reads targets from a JSON file or from its content; see docs/targets.md.
+    """Reads targets from a JSON file or from the content of such a file; see docs/targets.md.
 
     Raises:
         UserError: If the targets are invalid.

@@ -174,7 +174,7 @@ class Route:
         return self.points[len(self.reached) :]
 
     def follow(self, begin: int, roots: np.ndarray) -> None:
-        """Records which waypoints the root (F, 3) reaches; `begin` is the index of its first frame."""
+        """Records the waypoints that the root (F, 3) reaches, starting at the frame `begin`."""
         for frame, (x, _, z) in enumerate(roots, begin):
             while self.left and math.dist(self.left[0], (x, z)) < NEAR:
                 self.reached.append(frame)

@@ -20,8 +20,7 @@ FLOOR_WINDOW = 1.6
 
 
 def pair(name: str) -> list[int]:
-    """Returns the indices of the left and right joints: "wrist" means left_wrist and right_wrist.
-    """
+    """Returns the indices of a pair of joints: "wrist" means left_wrist and right_wrist."""
     return [JOINT[f"left_{name}"], JOINT[f"right_{name}"]]
 
 

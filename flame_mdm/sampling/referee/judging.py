@@ -65,7 +65,7 @@ class Verdict:
         return f"{self.answer}: {self.claim}; {self.evidence}"
 
     def marks(self, fps: float, frames: int) -> list[tuple[int, int, str, str]]:
-        """Returns the time spans of the evidence as marks for a player's timeline, in frames."""
+        """Returns the time spans of the evidence, in frames, as marks for a player's timeline."""
         marks = []
         for start, end in self.reading.spans[:3]:
             first = min(max(0, round(start * fps)), frames - 1)
@@ -80,8 +80,8 @@ class Judgment:
 
     Attributes:
         text: the sentence.
-        verdicts: one verdict per claim, in the order in which the sentence states the claims. The
-            list is empty if no claim in the sentence can be checked.
+        verdicts: one verdict per claim, in the order of the claims in the sentence. The list is
+            empty if no claim in the sentence can be checked.
     """
 
     text: str
@@ -113,8 +113,8 @@ def judge(
 ) -> Judgment:
     """Judges whether a motion does what a sentence says.
 
-    Reads the claims in the sentence and checks each of them by measuring the motion. The answer to
-    each is "yes", "no" or "cannot tell". docs/referee.md lists the claims that can be checked.
+    Reads the claims in the sentence and checks each of them by measuring the motion. Each answer is
+    "yes", "no" or "cannot tell". docs/referee.md lists the claims that can be checked.
 
     Args:
         motion: a motion of SMPL's 22 joints, or joint positions (F, 22, 3) in meters, with y up.
@@ -168,7 +168,7 @@ def evidence_marks(motion: Motion) -> list[tuple[int, int, str, str]]:
 
 
 def claim_score(motions: Sequence[Motion]) -> list[float]:
-    """Returns the number of true claims minus the number of false claims for each motion.
+    """Returns, for each motion, the number of true claims minus the number of false claims.
 
     The claims are read from the motion's own text. If the text contains no claims, the score is 0.
     """
@@ -257,8 +257,8 @@ def _at_an_end(body: Body, claim: Claim) -> Reading:
 def _duration(body: Body, claim: Claim) -> Reading:
     """Measures how long a claim is true, including interruptions of up to `BREAK` seconds.
 
-    The score is -|log2(measured / claimed)|. The claim is undecided if it is not true even without
-    its duration.
+    The score is -|log2(measured / claimed)|. The claim is undecided unless it is true without its
+    duration.
     """
     verdict = decide(body, replace(claim, seconds=None))
     reading = verdict.reading

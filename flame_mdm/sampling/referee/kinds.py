@@ -1,9 +1,9 @@
 """All kinds of claims: their measurements, groups and thresholds.
 
 A kind consists of a function in `postures.py` or `movements.py`, a row in `KINDS` and a pattern in
-`sentences.yaml`. Its thresholds, which `tools/referee.py` calibrates on captioned motions, are in
-`thresholds.yaml`. If they are missing or were calibrated on too few motions, the values `no` and
-`yes` in the row are used.
+`sentences.yaml`. The thresholds of a kind, which `tools/referee.py` calibrates on captioned
+motions, are in `thresholds.yaml`. If the thresholds are missing or were calibrated on too few
+motions, the `no` and `yes` values in the row are used.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ class Kind:
         no, yes: thresholds that were set by hand. A claim is false for scores up to `no`, true for
             scores from `yes` on, and undecided in between.
         is_timed: whether the spans of the reading show when the claimed event happens. Only such
-            events can be part of an order.
+            events can be part of a claim about order.
     """
 
     group: str
@@ -144,7 +144,7 @@ def group_of(claim: Claim) -> str:
 
 
 def threshold_key(claim: Claim) -> str:
-    """Returns the name of the thresholds for a claim.
+    """Returns the name under which the thresholds for a claim are stored.
 
     The name consists of the kind and the speed that the claim states. If the claim states no speed,
     the name indicates whether the claim has a side or a direction.
@@ -160,12 +160,12 @@ def threshold_key(claim: Claim) -> str:
 
 @cache
 def thresholds() -> dict[str, Any]:
-    """Returns the calibrated thresholds and numbers of motions, keyed by `threshold_key`."""
+    """Returns the calibrated thresholds and their numbers of motions, keyed by `threshold_key`."""
     return read_package_yaml(FILE)["thresholds"] if FILE.exists() else {}
 
 
 def band(claim: Claim) -> tuple[float, float]:
-    """Returns the two thresholds of a claim; scores between them leave it undecided.
+    """Returns the two thresholds of a claim; for scores between them, the claim is undecided.
 
     The thresholds do not depend on whether the claim is about the start, the end or any time.
     """

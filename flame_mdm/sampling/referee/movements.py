@@ -60,8 +60,8 @@ def veer(body: Body, claim: Claim) -> Reading:
 
     The larger of two displacements is used: the displacement from the start, relative to the
     initial heading, and the sum of all sideways steps, relative to the current heading. The reading
-    is unclear if this displacement exceeds 0.2 m and the displacement to the other side exceeds
-    half of it.
+    is unclear if this displacement exceeds 0.2 m and the displacement to the other side is more
+    than half as large.
     """
     ground = (body.joints[:, PELVIS] - body.joints[0, PELVIS])[:, [0, 2]]
     sign = 1.0 if claim.direction == "left" else -1.0
@@ -85,7 +85,8 @@ def turn(body: Body, claim: Claim) -> Reading:
     """Measures the largest turn in degrees.
 
     If a direction is claimed, only turns in this direction count. The reading is then unclear if
-    the largest turn in the other direction exceeds 60 % of the turn in the claimed one.
+    the largest turn in the other direction exceeds 60 % of the largest turn in the claimed
+    direction.
     """
     left, right = _turn(body.yaw, "left"), _turn(-body.yaw, "right")
     if not claim.direction:
@@ -108,7 +109,7 @@ def turn_amount(body: Body, claim: Claim) -> Reading:
 def _turn(yaw: np.ndarray, direction: str) -> Reading:
     """Measures the largest rise of an angle (F,) in degrees.
 
-    The span of the reading covers the time in which the angle completes 10 % to 90 % of this rise.
+    The span of the reading covers the time from 10 % to 90 % of this rise.
     """
     lowest = np.minimum.accumulate(yaw)
     end = int((yaw - lowest).argmax())
@@ -140,7 +141,7 @@ def circle(body: Body, claim: Claim) -> Reading:
 
 
 def gait_speed(body: Body) -> float:
-    """Returns the highest mean speed of the pelvis, in m/s, over any 0.8 seconds."""
+    """Returns the highest mean speed of the pelvis, in m/s, over any period of 0.8 seconds."""
     window = min(len(body), round(0.8 * RATE))
     return float(uniform_filter1d(body.speed, window, mode="nearest").max())
 
@@ -295,7 +296,7 @@ def count_spins(body: Body, claim: Claim) -> Reading:
 
 
 def kick(body: Body, claim: Claim) -> Reading:
-    """Measures the speed of an ankle relative to the pelvis while its foot is the higher one."""
+    """Measures the ankle speed relative to the pelvis while the foot is the higher of the two."""
     higher = body.joints[:, ANKLES, 1] - body.joints[:, ANKLES[::-1], 1]
     speed = np.where(higher > 0.12, body.foot_speed, 0.0)
     readings = [existence(speed[:, side], "m/s", f"{SIDES[side]} foot", 0.06) for side in (0, 1)]
@@ -313,7 +314,7 @@ def strike(body: Body, claim: Claim) -> Reading:
 def _dominance(activity: np.ndarray, claim: Claim, limb: str, least: float) -> Reading:
     """Compares the movements of a limb and its counterpart on the other side.
 
-    The score is the binary logarithm of the ratio of their movements.
+    The score is the binary logarithm of the ratio of the two movements.
     """
     total = activity.mean(0)
     chosen = SIDES.index(claim.side)

@@ -128,7 +128,7 @@ def get_down(body: Body, claim: Claim) -> Reading:
 def _change(signal: np.ndarray) -> Reading:
     """Returns a reading of the largest rise of a signal (F,), in meters.
 
-    The span of the reading is the time of the rise.
+    The span of the reading covers the rise.
     """
     lowest = np.minimum.accumulate(signal)
     end = int((signal - lowest).argmax())
@@ -150,7 +150,7 @@ def stand_still(body: Body, claim: Claim) -> Reading:
 
 
 def return_pose(body: Body, claim: Claim) -> Reading:
-    """Measures the distances between the joints of the first and the last pose.
+    """Measures the distance of each joint between the first and the last pose.
 
     Distances are measured in body coordinates, and the largest one is used.
     """
@@ -164,7 +164,7 @@ def return_pose(body: Body, claim: Claim) -> Reading:
 
 
 def return_place(body: Body, claim: Claim) -> Reading:
-    """Measures the final distance from the start, relative to the largest distance from it."""
+    """Measures the final distance from the starting point, relative to the largest distance."""
     ground = body.joints[:, PELVIS][:, [0, 2]]
     away = np.linalg.norm(ground - ground[0], axis=-1)
     farthest, last = float(away.max()), float(away[-1])

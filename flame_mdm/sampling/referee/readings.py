@@ -1,4 +1,4 @@
-"""`Reading`: the evidence for or against a claim, with functions that find it in signals."""
+"""`Reading`: the evidence for or against a claim, and functions that find evidence in signals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -65,8 +65,8 @@ def existence(
 ) -> Reading:
     """Returns a reading of the highest value that a signal (F,) holds for `seconds` seconds.
 
-    Its spans consist of the frames above a level, which is the fraction `share` of the way from the
-    signal's 20th percentile to this value.
+    The spans consist of the frames above a level. The level lies between the signal's 20th
+    percentile (for `share` = 0) and this value (for `share` = 1).
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))
@@ -128,8 +128,9 @@ def counted(
     """Returns a reading of the number of repetitions, counted as peaks of a signal.
 
     Peaks are counted twice, with a lower and a higher minimum depth. The score is 0 if both counts
-    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, it is the
-    negative distance from the claimed count to the nearer of the two counts, and thus at most -1.
+    equal the claimed count, and -0.5 if the claimed count lies between them. Otherwise, the score
+    is minus the difference between the claimed count and the nearer of the two counts, so it is at
+    most -1.
     """
     loose, strict = (cycles(signal, depth) for depth in depths)
     few, many = sorted((len(strict), len(loose)))
@@ -148,7 +149,7 @@ def counted(
 def _is_cut(signal: np.ndarray, depth: float) -> bool:
     """Returns whether a signal (F,) begins in the middle of a repetition.
 
-    This is the case if the signal falls by `depth` before it rises by `depth`.
+    A signal begins in the middle of a repetition if it falls by `depth` before it rises by `depth`.
     """
     falls = np.flatnonzero(signal < signal[0] - depth)
     rises = np.flatnonzero(signal > signal[0] + depth)

@@ -1,4 +1,4 @@
-"""Rules that read the claims in a sentence. Parts that are not understood are ignored.
+"""Rules for reading the claims in a sentence. Parts that are not understood are ignored.
 
 The rules aim at precision rather than completeness. The patterns are in `sentences.yaml`, and the
 verb forms are in `flame_mdm.conditions.language`. Sentences with a negation, an alternative or
@@ -68,7 +68,7 @@ DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Clause:
-    """A clause, and whether its events happen after the events of the previous clause."""
+    """A clause, with a flag for events that happen after the events of the previous clause."""
 
     text: str
     is_later: bool
@@ -153,7 +153,7 @@ def _of_clause(text: str) -> list[Claim]:
 
 
 def _at_ends(clause: Clause, *, is_last: bool) -> list[Claim]:
-    """Returns a clause's claims about the start or the end, as in "ends seated"."""
+    """Returns a clause's claims about the start or end of the motion, as in "ends seated"."""
     text, returns = clause.text, _content()["returns"]
     for kind in ("return pose", "return place"):
         if re.search(rf"\b(?:{returns[kind]})\b", text):
@@ -181,7 +181,7 @@ def _has(text: str, key: str) -> bool:
 
 
 def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
-    """Adds the duration that a clause states ("stands still for three seconds") to its claims."""
+    """Returns the claims with the duration that a clause states, as in "stands for two seconds"."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)
@@ -349,7 +349,7 @@ def _consistent(claims: Sequence[Claim], plain: str) -> list[Claim]:
     """Removes the claims that the rest of the sentence makes doubtful.
 
     A body that also travels does not stand still all the time, and a person who stands up after a
-    bow was already standing. A sentence that names both sides does not claim that one of them moves
+    bow was already standing. A sentence that names both sides does not claim that one side moves
     more.
     """
     doubtful: set[str] = set()

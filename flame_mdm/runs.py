@@ -25,7 +25,7 @@ A run of a million steps that logs every 50 steps takes about 20 MiB.
 
 
 class RunConfig(Schema):
-    """The keys of a run's configuration that the report pages use."""
+    """The keys that the report pages use from a run's configuration."""
 
     experiment: str | None
     name: Annotated[str | Int | Number, Field(validation_alias=AliasPath("run", "name"))] = (
@@ -68,7 +68,7 @@ class FaultyBatch(Schema):
 
 
 class Fault(Schema):
-    """The batch whose loss stopped a run, with each rank's part of it."""
+    """The batch whose loss stopped a run, with one part per rank."""
 
     step: Int
     usual_loss: str
@@ -159,7 +159,9 @@ def read_run(folder: Path) -> Run:
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the training curves, keyed by name. Each curve maps steps to values, in order.
+    """Returns the training curves, keyed by name.
+
+    Each curve maps steps to values, in the order of the steps.
 
     Raises:
         UserError: If the file is damaged.

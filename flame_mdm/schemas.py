@@ -1,4 +1,4 @@
-"""Typed schemas of files, and readers whose error messages name the file and the key."""
+"""Typed schemas for files, and readers with error messages that name the file and the key."""
 
 import functools
 import json

@@ -92,7 +92,8 @@ def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
 def normal(keys: Tensor, frames: int, features: int) -> Tensor:
     """Returns float32 standard normal noise (B, F, D) for int64 keys (B,).
 
-    Element (f, d) of the noise for a key does not depend on B or F (Box and Muller 1958).
+    The noise is computed as in Box and Muller 1958. Element (f, d) of the noise for a key does not
+    depend on B or F.
 
     Example:
         >>> keys = torch.tensor([key("a"), key("b")])

@@ -57,7 +57,7 @@ def raise_received() -> None:
 
 
 class StopRequest:
-    """Records a signal that asks training to stop at the end of a training step.
+    """Records a signal that requests a stop at the end of a training step.
 
     `signum` is the signal number; 0 = no signal. A second SIGINT stops immediately. So does a
     second SIGTERM, unless it arrives within one second of the first one: `timeout` sends two at

@@ -112,8 +112,9 @@ class Task(Model, LightningModule):
     def report(self, values: Mapping[str, Tensor | float]) -> None:
         """Stores named values of the current training step, to be logged after the step.
 
-        `Measurements` writes them to the loggers. Lightning's `log` would take as long per value as
-        a forward pass of a small network, and would keep the host busy in all later steps.
+        `Measurements` writes them to the loggers. For each value, Lightning's `log` would take as
+        long as a forward pass of a small network, and it would keep the host busy in all later
+        steps.
         """
         if self.is_reported:
             for name, value in values.items():
@@ -127,7 +128,7 @@ class Task(Model, LightningModule):
         """Returns the optimizer and its learning-rate schedule.
 
         The learning rate rises linearly over the first `lr_warmup` steps. Over the last fraction
-        `lr_decay` of the training run, it falls linearly to 0.
+        `lr_decay` of the training run, the learning rate falls linearly to 0.
         """
         optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
@@ -155,8 +156,8 @@ class Task(Model, LightningModule):
     def on_train_start(self) -> None:
         """Allows gradient clipping with fused optimizers in bfloat16.
 
-        Lightning does not allow it, because such an optimizer may unscale gradients itself. In
-        bfloat16, however, gradients are not scaled.
+        Lightning does not allow this combination, because such an optimizer may unscale gradients
+        itself. In bfloat16, however, gradients are not scaled.
         """
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:

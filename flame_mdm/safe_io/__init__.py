@@ -78,11 +78,11 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
     Args:
         path: file to write.
         within: folder that contains `path` and may contain files from other people. Links must not
-            lead out of this folder.
+            point outside this folder.
 
     Raises:
-        UserError: If a link leads out of `within`, if `path` is a pipe or a device, or if the file
-            cannot be written, for example because the disk is full.
+        UserError: If a link points outside `within`, if `path` is a pipe or a device, or if the
+            file cannot be written, for example because the disk is full.
     """
     path = Path(path)
     if within is not None:
@@ -102,7 +102,7 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
 
     Either all files are moved, or none are. If `path` exists, files with the same names are
     replaced, and all other files are kept. Temporary folders left behind by killed processes are
-    removed. Links must not lead out of the folder `within`. Raises the same errors as
+    removed. Links must not point outside the folder `within`. Raises the same errors as
     `atomic_write`.
     """
     path = Path(path)
@@ -161,7 +161,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Describes why a file could not be written; states the free space if the disk may be full."""
+    """Explains why a file could not be written, including the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in FULL:
         return reason
@@ -189,7 +189,7 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 
 def write_text(path: str | Path, text: str, *, within: str | Path | None = None) -> None:
-    """Writes a UTF-8 text file atomically. Links must not lead out of the folder `within`."""
+    """Writes a UTF-8 text file atomically. Links must not point outside the folder `within`."""
     with atomic_write(path, within=within) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -197,9 +197,9 @@ def write_text(path: str | Path, text: str, *, within: str | Path | None = None)
 def write_json(
     path: str | Path, content: Any, indent: int | None = 2, *, within: str | Path | None = None
 ) -> None:
-    """Writes a JSON file atomically. NaN and infinity raise `ValueError`.
+    """Writes a JSON file atomically.
 
-    Links must not lead out of the folder `within`.
+    NaN and infinity raise `ValueError`. Links must not point outside the folder `within`.
     """
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n", within=within)
 
@@ -412,7 +412,7 @@ def read_npz(
 
     Args:
         source: the path or an open, seekable file.
-        skip: names of arrays not to read.
+        skip: names of the arrays to skip.
         only: names of the arrays to read; None = all arrays.
 
     Raises:
@@ -473,7 +473,7 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
 
 
 def _check_array(file: IO[bytes], size: int, name: str) -> int:
-    """Returns the number of elements of the array in an .npy file.
+    """Returns the number of elements in the array of an .npy file.
 
     The header must match the file's `size` in bytes.
     """

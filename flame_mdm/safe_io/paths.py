@@ -1,7 +1,7 @@
 """Checked and temporary paths for writing to a folder that may contain files from other people.
 
-Links must not lead out of the folder. A file that is written in place must not have a second name
-(a hard link). The names of temporary files are unique.
+Links must not point outside the folder. A file that is written in place must not have additional
+hard links. The names of temporary files are unique.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _tokens: set[str] = set()
 
 
 def check_within(path: str | Path, root: str | Path) -> None:
-    """Raises `UserError` if any link along a path leads out of the folder `root`."""
+    """Raises `UserError` if any link along a path points outside the folder `root`."""
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
@@ -48,8 +48,8 @@ def check_tree(folder: Path) -> None:
     """Checks a folder from another person before libraries write to it.
 
     Libraries open files in place, so they could change files outside the folder. Raises `UserError`
-    if the folder contains a pipe, a device, a link that leads out of the folder, or a file with a
-    second name (a hard link).
+    if the folder contains a pipe, a device, a link that points outside the folder, or a file with
+    additional hard links.
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -72,8 +72,8 @@ def open_in_place(path: Path) -> IO[str]:
     """Opens a text file for reading and appending, and creates it if it does not exist.
 
     Writing in place would change the target of a link, so links are not followed. Raises
-    `UserError` if the path is a link or is not a regular file, or if the file has a second name (a
-    hard link).
+    `UserError` if the path is a link or is not a regular file, or if the file has additional hard
+    links.
     """
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:

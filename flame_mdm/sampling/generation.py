@@ -153,7 +153,7 @@ class _Row:
 
 
 def _rows(resolved: ResolvedRequest) -> list[_Row]:
-    """Returns the motions to sample, starting with those for the first prompt."""
+    """Returns the motions to sample, in the order of the prompts."""
     copies = resolved.request.samples * resolved.request.candidates
     counts: Counter[str] = Counter()
     rows = []
@@ -289,7 +289,7 @@ class _First(list[Tensor]):
 def _stages(model: MotionGenerator, trajectory: Sequence[Tensor], result: Motion) -> list[Motion]:
     """Returns up to `STAGES` clean estimates of the first motion, followed by the motion.
 
-    The estimates come from equally spaced calls of the denoiser.
+    The estimates come from equally spaced calls to the denoiser.
     """
     count, stages = len(trajectory), []
     for call in sorted({index * count // STAGES for index in range(STAGES)}):

@@ -55,7 +55,10 @@ def summary(folder: Path, motions: Sequence[Motion], *, mp4: bool) -> str:
 
 
 def degenerate_notes(motions: Sequence[Motion]) -> list[str]:
-    """Returns a warning if features in some frames do not determine rotations; otherwise, []."""
+    """Returns a warning if the features in some frames do not determine rotations.
+
+    Without such frames, the result is [].
+    """
     degenerate = sum(motion.degenerate for motion in motions)
     if not degenerate:
         return []
@@ -78,7 +81,7 @@ def write_motions(
 
     Either all files are written or none, and files that remain from an earlier request are removed.
     The pictures show only the first eight motions, and `trajectory.png` shows the stages of a
-    sampling run. `facts` are added to each `.npz`. Links must not lead out of `within`; see
+    sampling run. `facts` are added to each `.npz`. Links must not point outside `within`; see
     `flame_mdm.safe_io.atomic_folder`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]

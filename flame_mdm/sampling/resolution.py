@@ -69,9 +69,9 @@ class ResolvedRequest:
         targets: positions and poses to reach.
         edit: an edit that keeps part of a motion in all sampled motions. `known` and `keep` have
             the shape (1, F, D).
-        warnings: warnings for the user. They concern the motion to continue (what was omitted from
-            its file or looks wrong), differences between a text and what is sampled, and words that
-            the model does not know or does not read.
+        warnings: warnings for the user. The warnings concern the motion to continue (what was
+            omitted from its file or looks wrong), differences between a text and what is sampled,
+            and words that the model does not know or does not read.
     """
 
     request: SamplingRequest

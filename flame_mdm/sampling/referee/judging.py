@@ -147,7 +147,7 @@ def judge(
 
 
 def try_judge(motion: Motion) -> Judgment | None:
-    """Judges a motion by its own text.
+    """Judges a motion against its own text.
 
     Returns None if the motion cannot be judged or if its text contains no claim.
     """

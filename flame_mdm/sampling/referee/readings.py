@@ -66,7 +66,7 @@ def existence(
     """Returns a reading of the highest value that a signal (F,) holds for `seconds` seconds.
 
     The spans consist of the frames above a level. The level lies between the signal's 20th
-    percentile (for `share` = 0) and this value (for `share` = 1).
+    percentile (for `share` = 0) and the highest value (for `share` = 1).
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))

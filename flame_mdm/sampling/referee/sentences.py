@@ -181,7 +181,7 @@ def _has(text: str, key: str) -> bool:
 
 
 def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
-    """Returns the claims with the duration that a clause states, as in "stands for two seconds"."""
+    """Returns the claims about a duration in a clause, as in "stands still for three seconds"."""
     numbers = {word: int(value) for word, value in phrases()["numbers"].items()}
     number = "|".join([r"\d{1,2}", *numbers])
     match = re.search(rf"\bfor (?:\w+ )?({number}) (?:\w+ )?(?:seconds?|secs?|s)\b", text)

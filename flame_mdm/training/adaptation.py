@@ -54,15 +54,16 @@ OF_BASE = (
 
 
 class AdaptationTask(GeneratorTask):
-    """Continues to train a model on the user's clips and clips from its original training data."""
+    """Continues training on the user's clips and some of the model's original training data."""
 
     def pretrain(self) -> None:
         """Does nothing, because the text encoder is already trained."""
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Draws the captions to drop, but never drops the captions of the user's clips.
+        """Draws which captions to drop, but never drops the captions of the user's clips.
 
-        If these clips had the null condition, guidance would lead away from their motions.
+        If these clips were trained with the null condition, guidance would steer samples away from
+        their motions.
         """
         is_kept = torch.tensor([name.startswith(KEPT) for name in batch.ids])
         return super().dropped(batch) & sent(is_kept, self.device)
@@ -97,7 +98,7 @@ def adapt(
         name: name of the style, a single word of letters and digits.
         out: run directory. Default: runs/adapt/NAME.
         action: whether the clips show an action that is new to the model, rather than a style.
-        full: whether to train all weights. The result is then a model file instead of an adapter.
+        full: whether to train all weights. If so, the result is a model file instead of an adapter.
         force: whether to accept clips that drift upward or float.
         rank: rank of the low-rank updates of the weights, at least 1. Increase it for motions that
             differ greatly from the model's training data.
@@ -200,7 +201,7 @@ def _recipe(
 ) -> Config:
     """Returns the recipe of an adaptation.
 
-    Raises `UserError` if an override changes a part that the base model determines.
+    Raises `UserError` if an override changes a part that is taken from the base model.
     """
     if fixed := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(
@@ -288,7 +289,7 @@ class _Samples(MotionSource):
 def _comparison(name: str, data: LessonData, *tasks: GeneratorTask) -> str:
     """Returns the body of a page that compares the base model and the adapted model.
 
-    The page shows the motions and the losses of both.
+    The page shows motions and losses of both models.
     """
     data.setup("fit")
     before, after = (task.generator for task in tasks)

@@ -14,18 +14,18 @@ from flame_mdm.errors import UserError
 class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, for validation and for the saved model.
 
-    By default, it computes the same average as Lightning's `EMAWeightAveraging`, but with a single
-    call for all parameters, whereas Lightning's class iterates over all modules in every step and,
-    on CUDA, waits for the device. Buffers are not averaged.
+    By default, it computes the same average as Lightning's `EMAWeightAveraging`, but updates all
+    parameters with a single call. Lightning's class iterates over all modules in every step and, on
+    CUDA, waits for the device. Buffers are not averaged.
 
     Args:
         decay: the factor, from 0 to 1, in the update
             `average = decay * average + (1 - decay) * weights`.
         update_every_n_steps: number of steps between updates of the average.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging
-            them. The first update always copies.
+            them. The first update always copies the weights, unless `from_initial_weights` is true.
         from_initial_weights: whether the average starts from the weights before the first step, as
-            in MDM's code. The first update then averages instead of copying.
+            in MDM's code. If so, the first update averages the weights instead of copying them.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class MovingAverage(WeightAveraging):
         return self._average_model.module
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Collects the parameters of the model and of the average once, because collecting takes time."""
+        """Collects the parameters of the model and the average once, to save time in every step."""
         self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
         for copy, module in zip(self.averaged().modules(), pl_module.modules(), strict=True):
@@ -71,7 +71,7 @@ class MovingAverage(WeightAveraging):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Before the first step, copies the initial weights.
 
-        Pretraining or a teacher may have set these weights.
+        These weights may come from pretraining or from a teacher.
         """
         if self.from_initial_weights and not self.begun:
             self._copy_weights()

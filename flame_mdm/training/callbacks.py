@@ -63,10 +63,10 @@ class Interrupted(Exception):
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step, and when training is interrupted.
 
-    `keep_every_n_steps` is the number of steps between the checkpoints that are kept. Signals stop
-    training at the end of the current step (`StopRequest`) or, with several ranks, at the end of
-    the next step. Validation is never interrupted, because the averaged weights replace the trained
-    weights while it runs.
+    `keep_every_n_steps` is the number of steps between checkpoints that are kept permanently.
+    Signals stop training at the end of the current step (`StopRequest`) or, with several ranks, at
+    the end of the next step. Validation is never interrupted, because the averaged weights replace
+    the trained weights while it runs.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -121,13 +121,13 @@ class Checkpoints(Checkpoint):
 class Measurements(Callback):
     """Logs the gradient norm, learning rate and speed every `trainer.log_every_n_steps` steps.
 
-    The values that the task reports are logged at the same steps, and no other step is slowed down.
-    The norm of all gradients is measured before clipping. The seconds per step do not include
-    validation.
+    The values that the task reports are logged at the same steps, so logging slows down no other
+    step. The gradient norm includes all gradients and is measured before clipping. The seconds per
+    step do not include validation.
 
     Adds `facts.training` to checkpoints: `hours` (duration of training so far, including
     validation), `processes` (number of processes), `device`, `speed`, `precision`, and `memory_gib`
-    (peak memory: of tensors on CUDA, of the first process on other devices).
+    (peak memory of the tensors on CUDA, or of the first process on other devices).
     """
 
     def __init__(self) -> None:
@@ -281,7 +281,7 @@ def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric])
 
 
 class Progress(Callback):
-    """Progress bar over the steps of a run, with remaining time and losses."""
+    """Progress bar over the steps of a run, which shows the remaining time and the losses."""
 
     bar: ProgressBar | None = None
 
@@ -298,7 +298,7 @@ class Progress(Callback):
         )
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Advances the bar and shows the last values."""
+        """Advances the bar and shows the latest values."""
         assert self.bar is not None
         steps = trainer.global_step - self.bar.n
         if self.bar.disable or not steps:  # or gradients are still being accumulated
@@ -339,7 +339,7 @@ class SampleMotions(Callback):
     """Generates samples for fixed prompts and noise, writes them to files, and logs a video.
 
     Args:
-        folder: folder of the samples. The samples of each step are in a subfolder such as
+        folder: folder of the samples. The samples of each step are written to a subfolder such as
             `step_0001000`.
         every_n_steps: minimum number of steps between samples. Samples are generated when the model
             is validated, and after training.
@@ -347,7 +347,7 @@ class SampleMotions(Callback):
             `UNCONDITIONED` motions without prompts. If a model is conditioned on actions and no
             prompt is an action, the model's first actions are used instead.
         seconds: length of the motions in seconds.
-        metrics: torchmetrics metrics, keyed by name. Their `update` methods take some of the
+        metrics: torchmetrics metrics, keyed by name. Their `update` methods accept any of the
             arguments joints (B, F, J, 3), mask (B, F), keys and requested.
     """
 
@@ -375,7 +375,7 @@ class SampleMotions(Callback):
         return [text for text, _ in self.prompts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Schedules the first samples, and chooses the conditions of models without text."""
+        """Schedules the first samples. If the model needs actions, replaces text prompts."""
         self.next = trainer.global_step + self.every_n_steps
         assert isinstance(pl_module, GeneratorTask)
         actions = pl_module.facts["actions"]
@@ -400,7 +400,10 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Writes samples of the final model, and prints the metrics of these and of real motions."""
+        """Writes samples of the final model.
+
+        Also prints the metrics of these samples and of real motions.
+        """
         # The last validation may already have written the samples of this step.
         if self.written[0] != trainer.global_step:
             self.write(trainer, pl_module)
@@ -487,7 +490,7 @@ class SampleMotions(Callback):
         return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> Values:
-        """Returns all metrics for motions (F, J, 3) in meters, except those that cannot be computed."""
+        """Returns all metrics that can be computed for motions (F, J, 3) in meters."""
         values: dict[str, float] = {}
         for name, metric in self.metrics.items():
             metric.reset()

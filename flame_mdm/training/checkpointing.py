@@ -161,7 +161,7 @@ def _misfits(content: dict[str, Any], optimizer: torch.optim.Optimizer) -> Itera
 
 
 def _is_alike(value: Any, usual: Any) -> bool:
-    """Returns whether a saved option of an optimizer has the same type as its usual value."""
+    """Returns whether a saved optimizer option has the same type as the option's usual value."""
     if isinstance(usual, bool) or usual is None:
         return value is None or isinstance(value, bool)
     if isinstance(usual, int | float):

@@ -1,5 +1,5 @@
 # pyright: standard
-"""Distillation: a teacher with many steps trains models that sample in one to four steps."""
+"""Distillation: a many-step teacher trains models to sample in one to four steps."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from flame_mdm.training.averaging import MovingAverage
 class DistillationTask(GeneratorTask):
     """Trains a student to sample in one to four steps, with built-in guidance.
 
-    The student starts with its teacher's weights and has the same parts, data and captions. The
+    The student starts with its teacher's weights and uses the same parts, data and captions. The
     teacher is needed only during training. The text encoder is not trained, and dropout is
     disabled. `experiments/distillation/consistency.yaml` explains the section `distillation`.
     """
@@ -104,7 +104,7 @@ class DistillationTask(GeneratorTask):
             )
 
     def on_fit_start(self) -> None:
-        """Moves the teacher to the device, because it is not a submodule."""
+        """Moves the teacher to the device, because Lightning only moves submodules."""
         super().on_fit_start()
         self.teacher[0].to(self.device)
 
@@ -131,7 +131,7 @@ class DistillationTask(GeneratorTask):
     ) -> dict[str, Tensor]:
         """See `GeneratorTask.loss_terms`.
 
-        Validation, which passes `u`, always uses the grid of times with which training ends.
+        Validation passes `u`, and always uses the time grid of the last part of training.
         """
         trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None

@@ -47,11 +47,11 @@ def only_run(folder: Path) -> Iterator[None]:
 
 
 class BadLoss(Callback):
-    """Stops training if a loss is not finite or explodes, before any checkpoint is written.
+    """If a loss is not finite or explodes, stops training before a checkpoint is written.
 
-    A loss explodes if it exceeds `factor` times the median loss of the previous log interval. The
-    first bad batch is described in `bad_batch.json` in the run directory, with the step and, for
-    each rank, the batch index, the clip ids and the loss.
+    A loss explodes if it exceeds `factor` times the median loss of the previous log interval.
+    `bad_batch.json` in the run directory describes the first bad batch: the step and, for each
+    rank, the batch index, the clip ids and the loss.
 
     Args:
         folder: the run directory.
@@ -73,7 +73,7 @@ class BadLoss(Callback):
         batch: MotionBatch,
         batch_idx: int,
     ) -> None:
-        """Stores the loss of the batch on its device. Checks all losses once per log interval."""
+        """Stores the loss of each batch on the device. Checks all losses once per log interval."""
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach().float()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
@@ -123,7 +123,7 @@ class BadLoss(Callback):
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns an error message if `error` means that a data loading process died, or else None."""
+    """Returns an error message if `error` means that a data loading process died, else None."""
     # If a worker dies while a checkpoint is being written, its error is the cause of another error.
     message = f"{error} {error.__cause__ or ''}"
     lost = re.search(
@@ -140,7 +140,7 @@ def lost_worker(error: BaseException) -> UserError | None:
 
 
 def out_of_memory(error: BaseException, step: int) -> UserError | None:
-    """Returns an error message if `error` means that memory is exhausted, or else None."""
+    """Returns an error message if `error` means that memory is exhausted, else None."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
     return UserError(

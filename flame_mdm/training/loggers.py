@@ -22,8 +22,8 @@ from flame_mdm.schemas import read_json
 class History(Logger):
     """Appends all logged values to `metrics.jsonl` in the run directory.
 
-    Lightning counts steps from 0. A run that resumes after `step` steps keeps the lines of steps 0
-    ... `step` - 1, and drops later lines.
+    Lightning counts steps from 0. A run that resumes after `step` steps keeps the lines for steps 0
+    to `step` - 1 and drops the later lines.
     """
 
     def __init__(self, folder: str | Path, step: int = 0):
@@ -49,7 +49,7 @@ class History(Logger):
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Appends a line of metrics.
 
-        A resumed run first drops the lines of steps that it repeats.
+        A resumed run first drops the lines for the steps that it repeats.
         """
         if not self.begun:
             kept = [line for line in records(self.path) if line["step"] < self.step]
@@ -138,7 +138,7 @@ def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None
 def log_table(
     logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int
 ) -> None:
-    """Logs a table under the given name at a step."""
+    """Logs a table with the given name and step."""
     if isinstance(logger, TensorBoardLogger):
         lines = [head, ["---"] * len(head), *rows]
         logger.experiment.add_text(
@@ -149,7 +149,7 @@ def log_table(
 
 
 def log_video(logger: Logger, name: str, gif: Path, step: int) -> None:
-    """Logs an animated GIF under the given name at a step."""
+    """Logs an animated GIF with the given name and step."""
     if isinstance(logger, TensorBoardLogger):
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]

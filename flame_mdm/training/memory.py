@@ -28,8 +28,8 @@ FLOAT = 4
 class TrainingMemory:
     """Memory needed for training in float32, in bytes per process.
 
-    The text encoder and the data are not included. Frozen encoders run before training, and data
-    sets that are too large stay on disk.
+    The text encoder and the data are not included, because frozen encoders run before training, and
+    data sets that are too large for memory stay on disk.
 
     Attributes:
         parameters: number of weights of the denoiser.
@@ -123,7 +123,7 @@ def _fused_attention(query: Tensor, key: Tensor, value: Tensor, **_: Any) -> Ten
 
 
 class _FusedAttention(torch.autograd.Function):
-    """Saves the inputs and the result, but no attention weights, like a fused attention kernel."""
+    """Like a fused attention kernel, saves the inputs and the result, but no attention weights."""
 
     @staticmethod
     def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Skips work that Lightning does in every step although this framework does not need it.
+"""Skips work that Lightning does in every step but that this framework does not need.
 
 A training step of a small network takes about 2 ms. A third of this time is Lightning's
 bookkeeping, during which a GPU waits for the host.
@@ -35,10 +35,10 @@ class NoProfiler(PassThroughProfiler):
 
 
 def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
-    """Sets hooks that do nothing to None, so that Lightning does not call them in every step.
+    """Sets empty hooks to None, so that Lightning does not call them in every step.
 
-    There are six hooks per step, and callbacks do not override most of them. Calling a hook takes
-    longer than many of torch's operations.
+    Lightning calls six hooks per step, and callbacks override only some of them. Calling a hook
+    takes longer than many of torch's operations.
     """
     owners: list[tuple[object, type]] = [(task, LightningModule)]
     owners += [(callback, Callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
@@ -51,8 +51,8 @@ def skip_empty_hooks(trainer: Trainer, task: LightningModule) -> None:
 def skip_exchange_of_signals(trainer: Trainer) -> None:
     """Prevents Lightning from asking all processes in every step whether one of them received SIGTERM.
 
-    Each such request waits until the device has finished the previous step. `Checkpoints` replaces
-    Lightning's SIGTERM handler and exchanges signals without waiting.
+    For each such request, the processes wait until the device has finished the previous step.
+    `Checkpoints` replaces Lightning's SIGTERM handler and exchanges signals without waiting.
     """
     trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
 

@@ -33,8 +33,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     steps, it also uses a compiled denoiser.
 
     On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights) and,
-    if the CPU has instructions for bfloat16 products, bfloat16. Compilation made no difference on
-    CPUs.
+    if the CPU has instructions for bfloat16 products, bfloat16. The denoiser is not compiled,
+    because compilation made no difference on CPUs.
 
     If the recipe sets a precision other than 32-true, this precision is kept.
     """
@@ -82,7 +82,7 @@ class CheapDropout(nn.Module):
     """Dropout that uses a single 64-bit random number for four elements.
 
     The probability is rounded to a multiple of 2^-16. On a CPU, torch's dropout draws one random
-    number per element in a single thread, which takes a fifth of a training step.
+    number per element in a single thread, which takes a fifth of the time of a training step.
     """
 
     def __init__(self, p: float):
@@ -108,8 +108,8 @@ def attention(
 ) -> Tensor:
     """Computes `scaled_dot_product_attention` with two matrix products. Ignores `dropout_p`.
 
-    On a CPU, torch's fused attention takes up to twice as long in float32, and 3 to 5 times as
-    long in bfloat16.
+    On a CPU, torch's fused attention takes up to twice as long as this function in float32, and 3
+    to 5 times as long in bfloat16.
     """
     weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
     if attn_mask is not None:

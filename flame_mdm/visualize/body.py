@@ -107,9 +107,9 @@ class Mesh:
     Attributes:
         points: (V, 3), vertices in meters.
         normals: (V, 3), unit normals of the vertices.
-        colors: (V, 3), colors of the vertices, from 0 to 255.
-        weights: (V, 28), weights of SMPL's 22 joints and of `HELPERS`. At most four weights per
-            vertex are nonzero.
+        colors: (V, 3), vertex colors from 0 to 255.
+        weights: (V, 28), skinning weights for SMPL's 22 joints and the `HELPERS`. At most four
+            weights per vertex are nonzero.
         triangles: (T, 3), counterclockwise as seen from outside.
         turns: (28, 3, 3), world rotation of each bone, from SMPL's rest pose to the stored pose.
         rest: (22, 3), position of each joint relative to its parent in SMPL's rest pose.
@@ -138,7 +138,7 @@ class Mesh:
 def largest_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the four bones (V, 4) with the largest weights, and their integer weights (V, 4).
 
-    `weights` have the shape (V, B). The integer weights of each vertex add up to 255.
+    `weights` has the shape (V, B). The integer weights of each vertex add up to 255.
     """
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     most = np.take_along_axis(weights, bones, 1)

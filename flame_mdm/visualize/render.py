@@ -67,7 +67,7 @@ def write_gif(
 def write_mp4(
     path: str | Path, motions: Sequence[Figure], size: int = 384, body: Mesh | None = None
 ) -> None:
-    """Writes the animation of `write_gif` as an H.264 video (yuv420p) with any frame rate."""
+    """Writes the animation of `write_gif` as an H.264 video (yuv420p) at any frame rate."""
     path = target(path, motions)
     try:
         av = import_module("av")
@@ -295,9 +295,9 @@ def _rasterize(
     """Draws triangles on an image. Each pixel shows the triangle nearest to the camera.
 
     Colors are interpolated between the corners. The image has the shape (height, width, 3) and the
-    type uint8. `at` (V, 2) are the pixel coordinates of the vertices, y down, `depth` (V,) are
-    their distances from the camera, and `colors` (V, 3) range from 0 to 255. Triangles (T, 3) whose
-    corners appear clockwise are seen from inside, so they are not drawn.
+    type uint8. `at` (V, 2) contains the pixel coordinates of the vertices, y down. `depth` (V,)
+    contains their distances from the camera, and `colors` (V, 3) contains values from 0 to 255.
+    Triangles (T, 3) whose corners appear clockwise are seen from inside, so they are not drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
@@ -350,7 +350,7 @@ def _draw_skeleton(
     project: Callable[[np.ndarray], np.ndarray],
     rim: float,
 ) -> None:
-    """Draws a figure with joints (J, 3), from far to near, with dark rims of `rim` pixels."""
+    """Draws a figure with joints (J, 3) from back to front, with dark rims of `rim` pixels."""
     at, skeleton = project(joints), motion.skeleton
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []

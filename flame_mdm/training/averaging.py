@@ -50,8 +50,8 @@ class MovingAverage(WeightAveraging):
     def averaged(self) -> Any:
         """Returns the copy of the task that contains the averaged weights.
 
-        During validation, the copy contains the trained weights instead, because the task uses the
-        averaged ones.
+        During validation, the weights are swapped: the task contains the averaged weights, and the
+        copy contains the trained weights.
         """
         assert self._average_model is not None
         return self._average_model.module

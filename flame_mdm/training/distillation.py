@@ -42,7 +42,7 @@ class DistillationTask(GeneratorTask):
         actions: Sequence[str] = (),
         facts: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Builds the task of a recipe without training its text encoder."""
+        """Builds the task of a recipe with a text encoder that is not trained."""
         task = super().build(config, representation, actions=actions, facts=facts)
         task.generator.condition.requires_grad_(False)
         task.grids = {}

@@ -79,7 +79,7 @@ def _simplify(network: nn.Module) -> None:
 
 
 class CheapDropout(nn.Module):
-    """Dropout that uses a single 64-bit random number for four elements.
+    """Dropout that uses a single 64-bit random number for every four elements.
 
     The probability is rounded to a multiple of 2^-16. On a CPU, torch's dropout draws one random
     number per element in a single thread, which takes a fifth of the time of a training step.

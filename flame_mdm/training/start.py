@@ -49,7 +49,7 @@ def train(config: Config) -> None:
 
 
 def recipe_changes(config: Config) -> list[str]:
-    """Returns "key=value" for each key that a configuration sets differently from its recipe.
+    """Returns "key=value" for each key whose value in a configuration differs from its recipe.
 
     Some keys are not compared: the seed, keys that may differ when a run is resumed, and keys that
     are missing from the configuration because a different version wrote it. If the class of a part

@@ -41,7 +41,7 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
 
 @dataclass(eq=False, repr=False)
 class Figure:
-    """Moving joints that players and images show, such as a `flame_mdm.formats.motion.Motion`.
+    """A moving skeleton to show in players and images, such as a `flame_mdm.formats.motion.Motion`.
 
     Attributes:
         joints: (F, J, 3), joint positions in meters, y up, with the floor at y = 0.

@@ -403,7 +403,7 @@ def _lines(motion: Figure, body: FittedBody | None, width: int, size: int) -> li
 
 
 def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:
-    """Draws lines of text on an image that has room for `lines` lines."""
+    """Draws each text on a separate line of an image that has room for `lines` lines."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)

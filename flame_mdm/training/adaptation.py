@@ -100,7 +100,7 @@ def adapt(
         action: whether the clips show an action that is new to the model, rather than a style.
         full: whether to train all weights. If so, the result is a model file instead of an adapter.
         force: whether to accept clips that drift upward or float.
-        rank: rank of the low-rank updates of the weights, at least 1. Increase it for motions that
+        rank: rank of the low-rank weight updates, at least 1. Increase it for motions that
             differ greatly from the model's training data.
         data_root: folder of the prepared data sets. If the base model's data set is not in this
             folder, 300 motions sampled from the base model are used instead.

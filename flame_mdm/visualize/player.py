@@ -62,7 +62,7 @@ def player_page(
     Args:
         motions: the motions. Their skeletons, lengths and frame rates may differ.
         title: heading of the page.
-        about: HTML of a collapsible section below the heading of the page. Any text in this HTML
+        about: HTML for a collapsible section below the heading of the page. Any text in this HTML
             must already be escaped.
         columns: number of motions per row; 0 = as many as fit into the window.
         groups: for each motion, a name to filter by, such as its split; "" = none.

@@ -27,6 +27,7 @@ from evaluators.scene import Scene, Text, text_of
 from flame_mdm.__main__ import main
 from flame_mdm.data.store import Entry
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
 from flame_mdm.records import AuditCard, AuditedPerturbation
 from flame_mdm.reporting.audit_cards import (
     CitedCard,
@@ -335,6 +336,12 @@ def test_agreement_with_exact_attributes_depends_on_whether_lower_is_better():
     )
 
 
+def refuse_inputs(folders: set[Path], evaluator: Evaluator, file: Path, *rest: object) -> None:
+    """Takes the place of `_inputs`: records the folder and stops the audit."""
+    folders.add(file.parent)
+    raise UserError("stopped")
+
+
 @pytest.mark.slow
 def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys):
     names = (
@@ -382,6 +389,13 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert main(words) == 0
     assert len(passes) == first + 1
     assert json.loads(path.read_text()) == before
+    folders: set[Path] = set((tmp_path / "out" / "cache").iterdir())
+    monkeypatch.setattr("evaluators.audit._inputs", partial(refuse_inputs, folders))
+    protocol = (ROOT / "experiments" / "evaluation" / "synthetic.yaml").read_text()
+    for number, text in enumerate((protocol, protocol.replace("pairs: 300", "pairs: 200"))):
+        (tmp_path / "synthetic.yaml").write_text(text)
+        assert main([*words, f"protocol={tmp_path / 'synthetic.yaml'}"]) == 1
+        assert len(folders) == 1 + number, "another protocol has its own inputs"
     assert main([*words[:-2], "extractor=missing.ckpt", words[-1]]) == 1
     assert main(["audit", "data=synthetic"]) == 1
     assert "extractor=none" in capsys.readouterr().err

@@ -450,6 +450,13 @@ def test_a_sweep_runs_each_combination(capsys):
 
     assert run_jobs(fail, Example, ["rate=1,2", "-m"]) == 1
     assert capsys.readouterr().err == "error: failed at 1\nerror: failed at 2\n"
+
+    def fail_first(job: Example) -> None:
+        if job.rate == 1:
+            fail(job)
+
+    assert run_jobs(fail_first, Example, ["rate=1,2", "-m"]) == 1, "the last job succeeds"
+    assert capsys.readouterr().err == "error: failed at 1\n"
     assert run_jobs(lambda _: pytest.fail("it ran"), Example, ["rate=1,x", "-m"]) == 1
     assert "rate=x: must be a finite number" in one_error(capsys)
     assert run_jobs(seen.append, Example, ["rate=3"]) == 0

@@ -416,6 +416,23 @@ def test_facing_backwards_costs_nothing_in_the_authors_loss_alone(modulo_pi, cos
             )
 
 
+def test_the_weight_of_targets_applies_to_coordinates_and_heading():
+    """A slot at rest that is 0.3 m away has 3 equal coordinates; the body faces 0.2 rad away from the target."""
+    moved = turned(0.2)
+    moved[0, 0, SMPL22.joints.index("left_wrist")] += 0.3
+    for slots, expected in (
+        (["left_wrist"], 0.09),
+        (["heading"], 0.04),
+        (["left_wrist", "heading"], 0.13),
+    ):
+        for weight in (1.0, 2.5):
+            aims = TargetConditions(SMPL22.joints, SMPL22.facing, choices=[slots], weight=weight)
+            target = aims.draw(turned(0.0), torch.zeros(1))
+            torch.testing.assert_close(
+                aims.error(moved, target), torch.tensor([weight * expected]), rtol=1e-4, atol=0
+            )
+
+
 def test_each_choice_of_targets_is_drawn_equally_often():
     choices = [["pelvis", "heading"], ["traj", "heading"], []]
     aims = TargetConditions(SMPL22.joints, SMPL22.facing, choices=choices)

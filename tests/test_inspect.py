@@ -1,6 +1,7 @@
 """Faults of motions, the command that shows them, and perturbations of real motions against closed forms."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from support.motions import Page, posed, synthetic
 from evaluators import perturbations as p
 from evaluators.encoding import encode
 from flame_mdm.__main__ import main
+from flame_mdm.commands import FileSettings, read_motions
 from flame_mdm.formats.faults import LIMITS, _away, _stretched, depths, find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
@@ -398,3 +400,21 @@ def test_encoding_keeps_frames_heights_and_features(subtests):
             np.testing.assert_allclose(
                 offset, np.broadcast_to([0, meters, 0], joints.shape), atol=1e-4
             )
+
+
+def test_the_selected_animation_is_read_from_each_file_of_a_folder(tmp_path, monkeypatch):
+    motion = synthetic("kick")
+    for name in ("a", "b"):
+        motion.save(tmp_path / f"{name}.glb", rig="mixamo")
+    selected: list[str | None] = []
+
+    def read(path: Path, *keys: object, animation: str | None = None) -> Motion:
+        selected.append(animation)
+        return motion
+
+    monkeypatch.setattr("flame_mdm.formats.readers.read", read)
+    settings = FileSettings(animation="Wave")
+    for source, count in ((tmp_path, 2), (tmp_path / "a.glb", 1)):
+        _, total, motions = read_motions(str(source), settings, [])
+        assert (total, len(list(motions))) == (count, count)
+    assert selected == ["Wave"] * 3

@@ -18,6 +18,7 @@ from support.usd import opened
 
 import flame_mdm
 from flame_mdm.__main__ import main
+from flame_mdm.commands.sample import SampleSettings
 from flame_mdm.data.synthetic import Attributes, example
 from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
 from flame_mdm.formats.cleanup import bend
@@ -617,6 +618,22 @@ def test_keys_that_do_not_fit_a_set_are_refused(
     monkeypatch.chdir(tmp_path)
     assert message in error_of(capsys, "sample", "quickstart", *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_sets_of_different_requests_are_written_to_different_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    loaded = SimpleNamespace(model=flame_mdm.load("quickstart"), body=mannequin())
+    monkeypatch.setattr(SampleSettings, "load", lambda settings: loaded)
+    empty = SimpleNamespace(clips=[], left_out={})
+    monkeypatch.setattr(motion_sets, "make_set", lambda *args, **options: empty)
+    folders: list[Path] = []
+    monkeypatch.setattr(motion_sets, "write_set", lambda folder, *args: folders.append(folder))
+    changes = ("seed=1", "guidance_scale=2", "adapter=a", "adapter=b", "adapter_strength=0.5")
+    for change in ("seed=0", *changes):
+        assert main(["sample", "quickstart", "set=locomotion", change]) == 0
+    assert len(set(folders)) == len(changes) + 1, folders
+    assert main(["sample", "quickstart", "set=locomotion"]) == 0
+    assert folders[-1] == folders[0], "the same request"
 
 
 @pytest.fixture(scope="session")

@@ -617,6 +617,28 @@ def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evalu
     assert "††: Reported in their repository. Measured with a corrected evaluator." in text
 
 
+def test_rows_of_a_source_without_real_motions_are_ranked_by_the_real_row_of_another_source(
+    folder, monkeypatch
+):
+    published = folder / "published.yaml"
+    theirs = {"source": "their repository", "evaluator": "the same evaluator"}
+    printed = [
+        {"label": "Real", "real": True, "values": {"Diversity": "9.5"}},
+        {"label": "near", "values": {"Diversity": "9.4"}, **theirs},
+        {"label": "far", "values": {"Diversity": "12.1"}, **theirs},
+    ]
+    part = {"evaluator": "an evaluator", "source": "a paper", "rows": printed}
+    published.write_text(json.dumps({"spec": {"Text-to-motion": part}}))
+    monkeypatch.setattr(builder, "PUBLISHED", published)
+    index = 2  # of the column Diversity
+    ranked = {
+        line.label: cell.rank
+        for line in rows(folder).values()
+        if line.kind == "reported" and (cell := line.cells[index])
+    }
+    assert ranked == {"near": 1, "far": 2}
+
+
 def test_a_legend_names_the_rows_that_are_not_ranked(folder, subtests):
     legend = "of the rows with the same mark"
     table = made(folder)

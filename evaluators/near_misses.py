@@ -32,7 +32,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip. Their values in the action are replaced with placeholders.
+    """Returns the attributes of a clip, with placeholders for their values in the action's name.
 
     For example, "wave-left-hand" becomes "wave-{side}-hand".
     """

@@ -50,7 +50,7 @@ class MotionCLIP(nn.Module):
         blind_features: number of features that are set to 0 at the beginning of each frame. FLAME's
             code sets the first 3 features (the translation of the root) to 0, so that scores do not
             depend on position and height.
-        roughness: whether the absolute second differences over time are added to the input, so that
+        roughness: whether the absolute second differences over time are additional inputs, so that
             noise is easier to detect.
     """
 
@@ -128,8 +128,8 @@ def info_nce(
         logit_scale: scalar tensor, logarithm of the inverse temperature.
         meaning: (B, M) int64. Two pairs with the same value in a column are not negatives of each
             other.
-        wrong_text: (B, K, E) features of K wrong texts for each motion. The texts are negatives for
-            this motion only.
+        wrong_text: (B, K, E) features of K wrong texts for each motion. Each of these texts is a
+            negative for this one motion only.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)

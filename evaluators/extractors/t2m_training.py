@@ -64,9 +64,10 @@ def matching_loss(
 
     The formula is eq. 4 of Hadsell et al. 2006, without its factor 1/2. Each text is compared with
     its own motion and with a wrong motion. To find a wrong motion, the rows before the text's row
-    are searched backward for the first motion that the text does not describe. The wrong motion
-    adds no loss if its distance from the text is larger than `margin`. The authors shift the
-    motions by a random number of rows instead, which also pushes matching pairs apart.
+    are searched backward, wrapping around to the last row, for the first motion that the text does
+    not describe. The wrong motion adds no loss if its distance from the text is larger than
+    `margin`. The authors shift the motions by a random number of rows instead, which also pushes
+    matching pairs apart.
 
     Args:
         motion: (B, E) features of the motions.

@@ -112,7 +112,7 @@ class ClaimAccuracy(Timed, MotionMean):
         return {"positions": positions, "frames": frames}
 
     def per_sample(self, rows: Rows) -> dict[str, Tensor]:
-        """Returns the numbers (N, 2) of true and decided claims in each motion, keyed by value."""
+        """Returns the numbers (N, 2) of true and decided claims per motion, keyed by value name."""
         pairs: dict[str, list[list[float]]] = {name: [] for name in self.names}
         for packed, frames, caption in zip(
             rows["positions"], rows["frames"], rows["captions"], strict=True

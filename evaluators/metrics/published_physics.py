@@ -158,10 +158,10 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
     `feet` (F, 2, 3) contains the positions of the two feet, and `contact` (F, 2) bool states
     whether each foot is in contact.
 
-    Returns three numbers of frames, one for each kind. In the first kind, the movement of the feet
-    on the ground does not match the movement of the body. In the second kind, a foot in the air
-    moves much less than the body; these frames have half the weight in the score. In the third
-    kind, both feet swing to and fro in the air.
+    Returns the numbers of frames of three kinds. In the first kind, the movement of the feet on the
+    ground does not match the movement of the body. In the second kind, a foot in the air moves much
+    less than the body; these frames have half the weight in the score. In the third kind, both feet
+    swing to and fro in the air.
     """
     root = _speed(motion[:, 0])
     rate = _speed(feet - motion[:, :1]) / (root[:, None] + 1e-6)

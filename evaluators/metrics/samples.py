@@ -22,7 +22,7 @@ Rows = Mapping[str, Any]
 
 
 class Declared:
-    """Base class for a metric's declared properties and its values for samples and resamples.
+    """Base class for a metric's properties and its values for single samples and resamples.
 
     Attributes:
         unit: unit of the values; "" = a number without a unit.

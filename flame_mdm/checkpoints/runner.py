@@ -336,7 +336,7 @@ class Sampler:
         return x
 
     def _sample(self, inputs: dict[str, np.ndarray], frames: int, number: int) -> np.ndarray:
-        """Samples `frames` frames and returns their normalized features (F, D).
+        """Samples `frames` frames together and returns their normalized features (F, D).
 
         `number` seeds the noise.
         """

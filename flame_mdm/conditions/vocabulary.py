@@ -206,11 +206,11 @@ def in_parts(text: str, verbs: Collection[str]) -> list[str]:
 
     For example, "walks, turns left and waves. Then she sits" has four parts.
 
-    Text is split at sentence boundaries and at "then". With `verbs`, it is also split at each comma
-    that is followed by a verb. If the text contains such a comma, it is also split at each "and"
-    that is followed by a verb. Otherwise, "and" does not split the text: "raises both hands and
-    waves" is one action. A part without a verb is joined with a neighboring part. A style at the
-    end, such as "in limp style", is added to all parts. Adapters teach such styles.
+    Text is split at sentence boundaries and at "then". With `verbs`, each of these pieces is also
+    split at each comma that is followed by a verb. A piece that contains such a comma is also split
+    at each "and" that is followed by a verb. Otherwise, "and" does not split the text: "raises both
+    hands and waves" is one action. A part without a verb is joined with a neighboring part. A style
+    at the end, such as "in limp style", is added to all parts. Adapters teach such styles.
 
     Args:
         text: the sentence.

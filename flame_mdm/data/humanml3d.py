@@ -158,7 +158,7 @@ class HumanML3D(T2MFolder):
         return {file.stem: file for file in folder.rglob("*.npy")}
 
     def _beside(self, *names: str) -> Path:
-        """Returns the path of the first name for which a file exists in the folder or next to it.
+        """Returns the path of the first of `names` that exists in the folder or next to it.
 
         If none of them exists, returns the path that the first name would have in the folder.
         """

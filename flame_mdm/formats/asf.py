@@ -182,7 +182,7 @@ def _order(lines: Lines, words: list[str]) -> str:
 
 
 def _angles(lines: Lines, bones: dict[str, Bone], joints: int) -> dict[str, np.ndarray]:
-    """Returns each bone's angles (F, N) in degrees, where N is the number of degrees of freedom.
+    """Returns each bone's angles (F, N) in degrees, where N is its number of degrees of freedom.
 
     Raises:
         UserError: If the file has too many frames for this number of `joints`.

@@ -206,7 +206,7 @@ def read(path: Path) -> Glb:
     """Reads a .glb file.
 
     Raises:
-        UserError: If the file is too large or damaged, or if it is not a single glTF 2.0 file.
+        UserError: If the file is too large or damaged, or if it is not glTF 2.0 in a single file.
     """
     regular_file(path, LIMIT)
     content = path.read_bytes()

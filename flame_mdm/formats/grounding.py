@@ -183,7 +183,7 @@ def planted(
 ) -> GroundedMotion:
     """Returns a copy of the motion in which the toes stay in place during contacts.
 
-    The toes also stay above the floor. If a leg is too short to reach the planted foot, the body is
+    The toes also stay above the floor. If a leg is too short to reach its footprint, the body is
     lowered. With `fixed_start`, the first pose does not change; with `fixed_end`, the last pose
     does not change. A foot that is planted in such a fixed pose keeps its position from this pose.
     """

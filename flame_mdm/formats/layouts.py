@@ -58,7 +58,7 @@ Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """A map from the joints in files to SMPL's 22 joints, with positions in meters, y up.
+    """A map from the joints in files to SMPL's 22 joints, whose positions are in meters, y up.
 
     The fields are the keys of `skeleton.yaml`.
     """

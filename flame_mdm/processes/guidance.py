@@ -140,7 +140,7 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Makes the smallest changes with which the joints reach the requested world positions.
+    """Changes motions as little as possible, so that joints reach the requested world positions.
 
     Each Gauss-Newton step changes the normalized features as little as possible to reach the
     positions. A Gaussian-process prior keeps the change smooth in time. In frames with a requested

@@ -212,8 +212,8 @@ def blended(
     """Samples with an edit in mode "x_t".
 
     At each step, the kept part is replaced by the known motion with the current amount of noise.
-    If `edit.blend` is "after", the kept part is also replaced by the known motion with the initial
-    noise before the first step. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each
+    If `edit.blend` is "after", the kept part is also replaced before the first step, by the known
+    motion with the initial noise. RePaint (Lugmayr et al. 2022, algorithm 1) adds the noise of each
     step again and repeats the step.
 
     Args:

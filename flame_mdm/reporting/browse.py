@@ -78,7 +78,7 @@ def write_page(
     title: str,
     body: Mesh | None,
 ) -> None:
-    """Writes a page that plays clips by split, with mirrored copies next to their originals."""
+    """Writes a page that plays clips, grouped by split, with mirrored copies next to originals."""
     write_player(
         path,
         [motion(store, representation, clip) for clip in clips],

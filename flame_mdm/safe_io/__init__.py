@@ -1,7 +1,7 @@
 """Atomic writes, hashes, locks, and safe reading of files from other people.
 
 Files that may come from other people are always read or checked by this module first. Such a file
-must be a regular file of limited size, and the sizes that it declares must match its content.
+must be a regular file of limited size, and the sizes that it declares must match its actual size.
 Functions that read a file raise `FileNotFoundError` if it does not exist, and `UserError` if it is
 not a regular file or if its content is rejected.
 """

@@ -48,8 +48,8 @@ def generate(
     Args:
         model: the model, from `flame_mdm.load`.
         texts: what the person does, as one string or several.
-        score: function that scores the `candidates` without faults. The candidate with the highest
-            score is kept. By default, the candidate with the fewest faulty frames is kept.
+        score: function that scores those `candidates` that have no faults. The candidate with the
+            highest score is kept. By default, the candidate with the fewest faulty frames is kept.
         edit: an edit that keeps part of a motion in every sample. The motion is as long as the
             samples; `known` and `keep` have the shape (1, F, D).
         stages: list that receives clean estimates of the first motion, taken at equal intervals

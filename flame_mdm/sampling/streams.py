@@ -285,7 +285,7 @@ class Schedule:
         self.changes = [entry for entry in self.changes if entry[0] < max(frame, 1)]
 
     def until_change(self, frame: int) -> int | None:
-        """Returns the number of frames until the next change, or None if there is none."""
+        """Returns the number of frames from `frame` to the next change, or None without one."""
         return next((begin - frame for begin, _ in self.changes if begin > frame), None)
 
 

@@ -281,7 +281,7 @@ def explain_metrics(values: Values, real: Values, metrics: Mapping[str, Metric])
 
 
 class Progress(Callback):
-    """Progress bar over the steps of a run, which shows the remaining time and the losses."""
+    """Progress bar over the steps of a run, with the remaining time and the losses."""
 
     bar: ProgressBar | None = None
 
@@ -347,7 +347,7 @@ class SampleMotions(Callback):
             `UNCONDITIONED` motions without prompts. If a model is conditioned on actions and no
             prompt is an action, the model's first actions are used instead.
         seconds: length of the motions in seconds.
-        metrics: torchmetrics metrics, keyed by name. Their `update` methods accept any of the
+        metrics: torchmetrics metrics, keyed by name. Their `update` methods take some of the
             arguments joints (B, F, J, 3), mask (B, F), keys and requested.
     """
 

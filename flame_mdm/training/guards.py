@@ -82,7 +82,7 @@ class BadLoss(Callback):
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Checks the losses, so that no checkpoint contains weights from after a bad loss."""
+        """Checks the losses, so that no checkpoint contains weights updated after a bad loss."""
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:

@@ -39,7 +39,7 @@ A caption that states the value contains one of these parts.
 class Abilities:
     """Actions and attributes that a model knows.
 
-    The model must use captions that each name one action from a list.
+    Each of the model's captions must name one action from a list.
 
     Args:
         facts: the model's "actions", "vocabulary" and, if known, "captions".

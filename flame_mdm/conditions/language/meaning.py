@@ -26,7 +26,7 @@ def nearest_actions(word: str) -> list[tuple[str, float]]:
 
 
 def nearest_to(words: list[str]) -> list[tuple[str, float]]:
-    """Returns the actions with their similarities to a mean of words, most similar first."""
+    """Returns the actions with their similarities to the mean of `words`, most similar first."""
     vector = word_table().mean(words)
     return [] if vector is None else _ranked(vector)
 

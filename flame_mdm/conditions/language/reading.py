@@ -64,7 +64,7 @@ class Reading:
 class Reader:
     """Reads sentences for a model.
 
-    The model must use captions that each name one action from a list.
+    Each of the model's captions must name one action from a list.
 
     Args:
         facts: the model's "actions", "vocabulary" and, if known, "captions".

@@ -70,9 +70,9 @@ def falsified(claim: Claim) -> list[tuple[str, Claim]]:
     """Returns changed versions of a claim, each with its kind of change.
 
     If the claim is true, all changed versions are false. The kinds of change are "side",
-    "direction", "speed", "count" (one more or one fewer), "duration" (twice or half as long),
-    "start or end" (the other end), "posture" (one that is impossible together with the claimed
-    posture) and "order".
+    "direction", "speed", "count" (one more, and one fewer), "duration" (twice as long, and half as
+    long), "start or end" (the other end), "posture" (one that the body cannot have at the same time
+    as the claimed posture) and "order".
     """
     if claim.parts:
         return [("order", replace(claim, parts=claim.parts[::-1]))]

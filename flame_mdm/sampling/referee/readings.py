@@ -65,8 +65,8 @@ def existence(
 ) -> Reading:
     """Returns a reading of the highest value that a signal (F,) holds for `seconds` seconds.
 
-    The spans consist of the frames above a level. The level lies between the signal's 20th
-    percentile (for `share` = 0) and the highest value (for `share` = 1).
+    The spans consist of the frames above a level. This level is the fraction `share` of the way
+    from the signal's 20th percentile to that highest value.
     """
     score = held(signal, seconds)
     low = float(np.percentile(signal, 20))

@@ -116,9 +116,9 @@ def hyperparameters_page() -> str:
 
 {HEAD}
 The tables show the values in the recipes. A value is bold if the paper states the same value. If the paper states a
-different value, both values are shown. All other values are not in the papers; most of them come from the authors'
-code. "–" means that the recipe has no such value. If a paper names only the type of a text encoder (MFM: CLIP, T5; MDM:
-sentence-BERT), the checkpoint is our choice.
+different value, both values are shown. The remaining values do not appear in the papers; most of them come from the
+authors' code. "–" means that the recipe has no such value. If a paper names only the type of a text encoder (CLIP and
+T5 in MFM's paper, sentence-BERT in MDM's paper), we chose the checkpoint.
 """
     for title, published in TABLES.items():
         columns = {name: hyperparameters(name) for name in published}
@@ -322,11 +322,12 @@ SIZES: dict[str, tuple[str, list[str]]] = {
 MEMORY = """# Memory for training
 
 {head}
-This table is computed from the recipes. Sizes are in GiB per process, for float32 and for the recipe's batch size and
-longest motions. The state consists of the weights, their gradients, Adam's two states and, if the recipe averages
-weights, the averaged weights. Its size does not depend on the batch size. Activations are the tensors that the forward
-pass keeps for the backward pass. Their size grows with `data.batch_size`, and on a GPU, `speed=fast` halves it. Frozen
-text encoders are not on the device during training. Libraries and kernels take additional memory.
+The table below is computed from the recipes. Sizes are in GiB per process and assume float32, the recipe's batch size
+and motions of the recipe's maximum length. The state consists of the weights, their gradients, Adam's two states and,
+if the recipe averages weights, the averaged weights. The size of the state does not depend on the batch size.
+Activations are the tensors that the forward pass keeps for the backward pass. The size of the activations grows with
+`data.batch_size`. On a GPU, `speed=fast` halves this size. Frozen text encoders are not included, because they are not
+on the device during training. Libraries and kernels require additional memory.
 
 | model | parameters, M | batch | state | activations | with `task.checkpoint_activations` |
 |---|---:|---:|---:|---:|---:|

@@ -20,16 +20,16 @@ this folder.
 ## Right verdicts on real motions
 
 The thresholds were set on one half of the recordings, and these figures were measured on the other half. Each claim in
-the caption of a motion counts as true. Falsified claims count as false. They state the other side, direction or speed,
-one repetition more or less, the reverse order, another duration, or the other end of the motion. If a caption
-is wrong, this also counts as an error of the referee. We corrected patterns and measurements after we had seen errors
+a motion's caption is counted as true, so a wrong caption is also counted as a referee error. Falsified claims are
+counted as false. A falsified claim states the other side, direction or speed, one repetition more or less, the reverse
+order, another duration, or the other end of the motion. We corrected patterns and measurements after we had seen errors
 on both halves, so expect lower figures on other data. The last correction concerns CMU: "kicking his legs" was read as
 kicking with both legs at once, so one of 30 decided claims was judged false. Without this correction, 96.7 % of the
 verdicts on CMU's claims would be right.
 
 CMU's captions come from HumanML3D's test split and from KIT-ML, and cover only the recordings that were available.
-Bandai-Namco's captions are filled-in templates, so its many clips have only a few different sentences. The figures for
-the sets should therefore be considered separately.
+Bandai-Namco's captions are filled-in templates, so only a few different sentences describe its many clips. The figures
+for each set should therefore be considered separately.
 """
 
 
@@ -123,12 +123,12 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns a table for the constructed claims about the duration, the start and the end, as lines."""
     lines = [
         "",
-        "Captions hardly ever state a duration or describe the start or the end of a motion, so claims about these",
-        "were constructed. If the captions of a recording only state that the person walks, runs or stands still,",
-        "clips of two, three and four seconds are cut from the recording. Falsified claims state twice or half the",
-        "duration. In recordings of walks, the person is assumed to be standing upright at the start and at the end.",
-        "The claims that the person is lying at the start or at the end are therefore false. The other tables do not",
-        "contain the constructed claims.",
+        "Captions hardly ever state a duration or describe the start or the end of a motion, so claims about",
+        "durations, starts and ends were constructed. If the captions of a recording only state that the person",
+        "walks, runs or stands still, clips of two, three and four seconds are cut from the recording. Falsified",
+        "claims state twice or half the duration. In recordings of walks, the person is assumed to be standing",
+        "upright at the start and at the end. The claims that the person is lying at the start or at the end are",
+        "therefore false. The other tables do not contain the constructed claims.",
         "",
         "| claim | true claims judged true | falsified claims judged false |",
         "|---|---:|---:|",
@@ -145,7 +145,7 @@ def built_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns a paragraph that lists the kinds of claims that miss the targets.
 
-    The targets are right verdicts on 97 % of the true claims and on 90 % of the falsified claims.
+    The targets are correct verdicts on 97 % of the true claims and on 90 % of the falsified claims.
     """
     missed = [
         f"{row['group'].removeprefix('kind ')} ({side}: {share(right, decided)})"
@@ -157,8 +157,8 @@ def below_the_targets(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
     return [
         "",
-        "The targets are right verdicts on 97 % of the true claims and on 90 % of the falsified claims. The following "
-        f"kinds of claims miss the targets: {', '.join(missed)}.",
+        "The targets are correct verdicts on 97 % of the true claims and on 90 % of the falsified claims. The "
+        f"following kinds of claims miss the targets: {', '.join(missed)}.",
     ]
 
 
@@ -172,13 +172,14 @@ def systems_table(content: Mapping[str, Any]) -> list[str]:
     lines = ["", "## Systems", ""]
     both = sum(row["top3"] is not None for row in content["rows"])
     lines += [
-        "The table shows the share of decided claims that are true, and R-precision (`MotionsForText`, top 3, with",
-        f"the package's motion-CLIP) on the same motions. Each row covers at most {content['motions']} motions.",
-        f"Over the {both} rows with both values, the rank correlation is {content['rank_correlation']:.2f}. Generated",
-        "motions are at most three seconds long, which is too short for some turns. The model for Bandai-Namco is",
-        "small and was trained for eleven minutes on one thread. There is no model for CMU, because only 23 training",
-        "clips were available. [Another page](bandai_small.md) shows both values for FLAME, MDM, MFM and DiP models",
-        "that were trained on Bandai-Namco for the same time.",
+        "The table shows two values for the same motions: the share of decided claims that are true, and",
+        "R-precision (`MotionsForText`, top 3, with the package's motion-CLIP). Each row covers at most",
+        f"{content['motions']} motions. Over the {both} rows that have both values, the rank correlation between the",
+        f"two values is {content['rank_correlation']:.2f}. Generated motions are at most three seconds long, which is",
+        "too short for some turns. The model for Bandai-Namco is small and was trained for eleven minutes on one",
+        "thread. There is no model for CMU, because only 23 training clips were available. [Another",
+        "page](bandai_small.md) shows both values for FLAME, MDM, MFM and DiP models that were trained on",
+        "Bandai-Namco for the same time.",
     ]
     groups = ("all", "side", "direction", "count", "movement", "posture", "contact")
     lines += ["", f"| data | motions | {' | '.join(groups)} | decided | R-precision |"]
@@ -195,8 +196,8 @@ def eye_table(verdicts: list[dict[str, Any]]) -> list[str]:
     lines = ["", "## Verdicts checked by eye", ""]
     lines.append(
         f"We checked {len(verdicts)} verdicts on motions from the second half against twelve pictures of each motion. "
-        f"The verdicts are spread over the kinds of claims, with at most one per motion. Of these, {agreed} verdicts "
-        "agree with the pictures."
+        "The verdicts cover most kinds of claims, with at most one verdict per motion. The pictures confirm "
+        f"{agreed} of the verdicts."
     )
     lines += ["", "| motion | verdict | agrees | |", "|---|---|---|---|"]
     for verdict in verdicts:

@@ -236,7 +236,7 @@ def _conditions(result: Result, timed: bool, shows_multimodality: bool) -> dict[
     return {
         "protocol": f"Protocol {protocol.name}, version {protocol.version}.",
         "data": f"Data: {result.split} split of {data.dataset} (fingerprint {data.fingerprint}).",
-        "limits": "Motions have {} to {} frames.".format(*data.frames) if data.frames else "",
+        "limits": _frame_counts(data.frames) if data.frames else "",
         "metrics": _numbers(result),
         "time": f"Timed in batches of {cost.batch_size or 0:g} on {result.device}."
         if timed and cost
@@ -276,6 +276,11 @@ def _numbers(result: Result) -> str:
     if sets is not None and sets != first.n:
         text += f", compared with sets of {sets} real motions"
     return f"{text}."
+
+
+def _frame_counts(frames: Sequence[int]) -> str:
+    shortest, longest = frames
+    return f"Motions have {'' if shortest == longest else f'{shortest} to '}{longest} frames."
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:

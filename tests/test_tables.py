@@ -280,7 +280,7 @@ def test_a_recipe_changed_in_place_is_not_ranked_beside_the_recipe(folder):
     changes = (
         "The model differs from the recipe synthetic/mdm: denoiser._target_=my_package.MyDenoiser."
     )
-    assert ("b", f"Same as footnote a, except: {changes}") in part.notes
+    assert ("b", f"Same as footnote a, except for the following: {changes}") in part.notes
 
 
 def test_changes_of_a_recipe_are_found_in_the_configuration_of_a_model(subtests):
@@ -383,7 +383,7 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
     )
     assert [note for note in notes if note[0]] == [
         ("a", conditions),
-        ("b", "Same as footnote a, except: Seed 1."),
+        ("b", "Same as footnote a, except for the following: Seed 1."),
     ]
     labels = "MDM (guidance scale 1.0), MDM (guidance scale 2.5)"
     assert ("", f"{labels}: NOT VALID: real motions have fid 3, expected 0.002 +- 0.02") in notes
@@ -453,7 +453,7 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder, subtests):
         ["1", "1.000", "velocity", "12.2", "7.5"],
     ]
     assert [line.marks for line in lines] == ["a", "b", "a"]
-    assert "Same as footnote a, except: Timed in batches of 64 on cpu." in [
+    assert "Same as footnote a, except for the following: Timed in batches of 64 on cpu." in [
         note for _, note in part.notes
     ]
     assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]

@@ -160,7 +160,7 @@ def _condition_notes(
             text or f"No {name}." for name, text in facts.items() if text != conditions[0][name]
         ]
         text = (
-            f"Same as footnote a, except: {' '.join(different)}"
+            f"Same as footnote a, except for the following: {' '.join(different)}"
             if 0 < len(different) <= 3
             else " ".join(filter(None, facts.values()))
         )

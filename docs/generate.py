@@ -45,10 +45,11 @@ def recipes_page() -> str:
 {HEAD}
 This project reproduces three papers: FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
 arXiv:2209.14916) and Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895). Every table row that a paper reports for
-its own model has a recipe, such as `make train EXP=humanml3d/mdm`. Recipes that mention no table do not correspond to a
-row in any paper. Their files list the deviations from the paper. "As in humanml3d/mdm" means that all deviations listed
-for that recipe also apply. Three deviations apply to all recipes: a batch contains motions of about the same length,
-every sample in a batch has the same weight, and checkpoints are selected on validation clips.
+its own model has a recipe, such as `make train EXP=humanml3d/mdm`. If the description of a recipe mentions no table,
+the recipe does not correspond to a row in any paper. The file of each recipe lists the deviations from the paper. "As
+in humanml3d/mdm" means that all deviations listed for that recipe also apply. Three deviations apply to all recipes: a
+batch contains motions of about the same length, every sample in a batch has the same weight, and checkpoints are
+selected on validation clips.
 """
     page += "\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):

@@ -55,9 +55,9 @@ INTRODUCTION = """# Long streams, measured
 [Streams](../streams.md) explains how a stream works. `python tools/stream_drift.py {model}` computes the figures on
 this page.
 
-In each of {streams} streams of {minutes} minutes, the text changes every ten seconds, so a stream has {texts} texts.
-The texts are captions for single synthetic actions. The last minute repeats the texts of the first minute, so that both
-can be compared. Unless stated otherwise, the motions are not cleaned up.
+The measurements use {streams} streams of {minutes} minutes each. The text changes every ten seconds, so each stream has
+{texts} texts. The texts are captions for single synthetic actions. The last minute repeats the texts of the first
+minute, so that the two minutes can be compared. Unless stated otherwise, the motions are not cleaned up.
 
 ## Drift
 
@@ -66,13 +66,13 @@ can be compared. Unless stated otherwise, the motions are not cleaned up.
 {periods}
 
 FID compares two-second windows of the streams with two-second windows of synthetic motions that the model has not
-seen. It is computed with the package's motion-CLIP. For comparison, a second set of such motions has an FID of
-{real_fid}.
-The jitter is {first} m/s³ in the first minute and {last} m/s³ in the last minute, which is {ratio} times as much.
-In 99.9 % of the frames, no toe is more than {low} cm below the floor,
-and the lowest toe in any frame is {lowest} cm below it. With `cleanup=true`, the lowest toe
-in the same streams is {cleaned_lowest} cm below the floor, and in {cleaned_deep} of {cleaned_frames} frames, a toe is
-more than 3 cm below it.
+seen. It is computed with the package's motion-CLIP. For comparison, a second set of unseen synthetic motions has an FID
+of {real_fid}.
+The jitter is {first} m/s³ in the first minute and {last} m/s³ in the last minute ({ratio} times as high).
+
+In 99.9 % of the frames, no toe is more than {low} cm below the floor. At most, a toe sinks {lowest} cm below
+the floor. In the same streams with `cleanup=true`, a toe sinks at most {cleaned_lowest} cm below the floor, and in
+{cleaned_deep} of {cleaned_frames} frames, a toe is more than 3 cm below the floor.
 
 ## Seams
 
@@ -83,9 +83,9 @@ meters:
 
 ## Texts
 
-Of {changes} actions, {in_time} ({in_time_share} %) are recognized in the first two seconds after the text changes, and
-{right} ({share} %) are recognized in at least one window of two, three or four seconds that ends at most four seconds
-after the change. These actions are not always recognized: {actions}.
+Of {changes} actions, {in_time} ({in_time_share} %) are recognized in the first two seconds after the text changes. In
+the first four seconds after the change, {right} ({share} %) are recognized in at least one window of two, three or four
+seconds. The following actions were not recognized every time: {actions}.
 """
 
 

@@ -57,9 +57,6 @@ selected on validation clips.
         what = re.sub(
             r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what
         ).replace(" ()", "")
-        what = re.sub(
-            r" (Not a (row of (the|a) paper|benchmark row)|Trains in [\w ']+)\.", "", what
-        )
         deviations = re.sub(
             r"^Deviations(:| from)\s*", lambda m: "" if m[1] == ":" else "from ", deviations
         )

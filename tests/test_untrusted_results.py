@@ -96,6 +96,21 @@ def test_table_specs(attacked, bad):
     attacked("tables", "table=mdm_9", says="unknown table 'mdm_9'. Did you mean mdm_")
 
 
+@pytest.mark.parametrize("part", ["denoiser", "process", "representation"])
+def test_a_recipe_that_a_spec_names_runs_no_code(attacked, bad, part: str):
+    recipe = f"defaults: [quickstart, _self_]\n{part}: {{_target_: logging.basicConfig}}\n"
+    (bad / "recipe.yaml").write_text(recipe)
+    settings = {"recipes": {"a": str(bad / "recipe.yaml")}, "keys": {"T": "parameters"}}
+    spec = {"title": "t", "parts": {"P": settings}}
+    (bad / "spec.yaml").write_text(json.dumps(spec))
+    attacked(
+        "tables",
+        f"table={bad / 'spec.yaml'}",
+        "evaluate=false",
+        says=f"names logging.basicConfig at {part}. Its code is run only if you trust it",
+    )
+
+
 def huge(path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(2**40)

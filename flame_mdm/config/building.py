@@ -186,12 +186,16 @@ def save(config: Config, path: Path, head: str = "") -> None:
     write_text(path, f"# {head}\n{content}" if head else content)
 
 
-def trust(config: Config) -> None:
-    """Checks that a checkpoint's configuration names only permitted classes and arguments.
+def trust(config: Config, owner: str = "the checkpoint's configuration") -> None:
+    """Checks that a configuration from someone else names only permitted classes and arguments.
 
     A class is permitted for a part if `MODULES` lists its module for this part, or if a file in the
     part's folder in `experiments/` names the class. The environment variable FLAME_MDM_TRUST lists
     additional permitted packages, separated by commas. The check does not import the classes.
+
+    Args:
+        config: the parts of the configuration, by name.
+        owner: the configuration, as it is called in the error message.
     """
     names = [name.strip() for name in os.environ.get("FLAME_MDM_TRUST", "").split(",")]
     added = [name for name in names if name]
@@ -204,8 +208,8 @@ def trust(config: Config) -> None:
         package = str(target).partition(".")[0]
         if package not in added:
             raise UserError(
-                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is run only if "
-                f"you trust it. To trust it, set FLAME_MDM_TRUST={package}"
+                f"{owner} names {target} at {'.'.join(path)}. Its code is run only if you trust it."
+                f" To trust it, set FLAME_MDM_TRUST={package}"
             )
     check(config)
 

@@ -6,7 +6,8 @@ from typing import Any
 
 from hydra.utils import get_class
 
-from flame_mdm.config import Config, compose, instantiate, parameters
+from flame_mdm.config import Config, compose, instantiate, parameters, trust
+from flame_mdm.config.building import MODULES
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.reporting.tables.format import Cell, Line, Part
 from flame_mdm.reporting.tables.specs import LABELS
@@ -19,8 +20,13 @@ def hyperparameters(name: str) -> dict[str, Any]:
     """Returns the `HYPERPARAMETERS` of a recipe, keyed by name.
 
     Unset keys have the default values of their classes.
+
+    Raises:
+        UserError: If the recipe does not exist, or if it names a class that is not part of this
+            project and that the user does not trust (see `flame_mdm.config.trust`).
     """
     config = compose(name)
+    trust({part: config[part] for part in MODULES if part in config}, f"recipe {name}")
     settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | _sizes(config)
     return {key: setting for key, setting in settings.items() if setting is not None}
 

@@ -369,7 +369,7 @@ class Blocks:
         if prefix is None or tuple(prefix.shape) != expected:
             shape = None if prefix is None else tuple(prefix.shape)
             raise UserError(
-                f"the prefix has shape {shape}, but this model continues frames of shape {expected}. Pass "
+                f"the prefix has shape {shape}, but this model requires shape {expected}. Pass "
                 "frames of this shape"
             )
         self.model, self.ids, self.prefix, self.options = model, list(ids), prefix, options

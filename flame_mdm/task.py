@@ -288,7 +288,8 @@ class GeneratorTask(Task):
         if context >= shortest:
             advice = "Increase data.crop.min_frames, or decrease denoiser.context_frames"
             raise UserError(
-                f"data.crop: a sample of {shortest} frames has no frames after a prefix of {context}. {advice}"
+                f"data.crop: a sample of {shortest} frames has no frames left after a prefix of {context} frames. "
+                f"{advice}"
             )
         if self.generator.conditioned_on == "text":
             clips, may_share = data.train.clips, data.source.may_share_captions

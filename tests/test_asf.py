@@ -108,7 +108,7 @@ def test_rotations_are_applied_in_the_order_of_the_axes_however_the_freedoms_are
         (
             MOTION,
             "version https://git-lfs.github.com/spec/v1\n",
-            "a Git LFS pointer instead of the file",
+            "a Git LFS pointer, not the file",
         ),
         (
             "dof rx rz",

@@ -199,7 +199,7 @@ def test_a_motion_that_no_body_fits_says_why(subtests):
     for motion, reason in (
         (
             posed(scale=3.0),
-            r"left_knee is 1\.17 m long, but the body's bone is 0\.392 m\. Is the unit right\?",
+            r"left_knee is 1\.17 m long, but in the body model, this bone is 0\.392 m long\. Is the unit right\?",
         ),
         (sway(3, skeleton=KIT21), "computed only for SMPL's 22 joints"),
         (Motion(np.zeros((3, 22, 3)), 20), "has no length"),

@@ -822,7 +822,7 @@ def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path, subtes
         ("nobody/model.ckpt", "no such checkpoint"),
         (
             "nobody/model@v1",
-            r"^nobody/model@v1: no such file or folder, and .* cannot be downloaded.*$",
+            r"^nobody/model@v1: no such file or folder, and no model .* can be downloaded.*$",
         ),
     ):
         with subtests.test(message=message), one_line_error(message):
@@ -882,6 +882,6 @@ def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):
     (tmp_path / "x" / "default" / "checkpoints").mkdir(parents=True)
     with pytest.raises(
         UserError,
-        match=r"x: not a run directory, but it contains some\. Use one of them: .*x/default$",
+        match=r"x: not a run directory, but it contains run directories\. Use one of them: .*x/default$",
     ):
         find(tmp_path / "x")

@@ -139,7 +139,7 @@ def test_trains_and_samples(denoiser, process, condition, subtests):
     # Such a denoiser reads tokens instead of the pooled vector.
     if condition == "none" and DENOISERS[denoiser].get("max_tokens"):
         with pytest.raises(
-            ValueError, match="needs condition tokens, but the condition encoder has none"
+            ValueError, match="needs condition tokens, but the condition encoder returns none"
         ):
             generated(task, motions)
         return

@@ -347,7 +347,7 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
                     subtests.test(part=part),
                     pytest.raises(
                         UserError,
-                        match=rf"names .* at {part}.*\. Its code is run only if you trust it",
+                        match=rf"names .* at {part}.*\. Code from this package is run only if you trust it",
                     ),
                 ):
                     trust({part: hidden})
@@ -365,7 +365,7 @@ def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch, s
     ):
         with subtests.test(module=module):
             assert source_file(module) is None
-            with pytest.raises(UserError, match="Its code is run only if you"):
+            with pytest.raises(UserError, match="Code from this package is run only if you"):
                 trust({"denoiser": {"_target_": f"{module}.MDMEncoder"}})
 
 

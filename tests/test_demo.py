@@ -190,7 +190,7 @@ def test_the_python_lines_and_the_files_give_the_same_motions(
             assert studio.file(EDITED, 1, ".fbx", rig).startswith(b"Kaydara FBX Binary")
     for wrong, says in (
         ((2, ".bvh"), "there are 2 motions"),
-        ((0, ".exe"), "does not offer this format"),
+        ((0, ".exe"), "this format is not available"),
         ((0, ".bvh", "no"), "no"),
     ):
         with subtests.test(wrong=wrong, says=says), pytest.raises(UserError, match=says):

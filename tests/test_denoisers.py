@@ -293,7 +293,7 @@ def test_the_prefix_acts_on_every_frame_and_has_no_output(subtests) -> None:
             subtests.test(prefix=prefix, frames=frames),
             pytest.raises(
                 UserError,
-                match=f"the prefix has {frames} frames, but this denoiser continues 3 clean frames",
+                match=f"the prefix has {frames} frames, but this denoiser requires 3 clean frames",
             ),
         ):
             decoder(x_t, t, mask, replace(cond, prefix=prefix))
@@ -324,7 +324,7 @@ def test_bad_options_are_named(subtests) -> None:
             "requires latent_dim=12",
         ),
         (lambda: MDMUNet(D, D, C, **unet, num_groups=3), r"num_groups \(3\)"),
-        (lambda: decoder(*batch(tokens=0)), "the condition encoder has none"),
+        (lambda: decoder(*batch(tokens=0)), "the condition encoder returns none"),
         (lambda: MDMDecoder(D, D, C, **TRANSFORMER, memory="concat"), "Set token_memory=true"),
         (
             lambda: MDMDecoder(D, D, C, **TRANSFORMER, context_frames=-1),

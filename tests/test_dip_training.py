@@ -269,8 +269,9 @@ def test_clips_without_a_frame_to_predict_are_refused_before_training(tmp_path, 
         "denoiser.context_frames=40",
     ]
     assert main(["train", "synthetic/dip", *words]) == 1
-    assert "data.crop: a sample of 40 frames has no frames after a prefix of 40" in one_error(
-        capsys
+    assert (
+        "data.crop: a sample of 40 frames has no frames left after a prefix of 40 frames"
+        in one_error(capsys)
     )
 
 

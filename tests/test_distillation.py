@@ -421,7 +421,7 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(
         (["untrained.ckpt"], "not trained with this framework"),
         (
             [*own, "distillation.teacher=representation.ckpt"],
-            "has representation.fps=30, but the student has 20. Both",
+            "the teacher has representation.fps=30, but the student has 20. Both",
         ),
         (
             [*own, "distillation.teacher=gone.ckpt"],
@@ -554,7 +554,7 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
     with safe_open(taught / "limp.safetensors", "pt") as file:
         about = json.loads(file.metadata()["flame_mdm_adapter"])
     for change, message in (
-        ({"base": "0" * 64}, "a model whose weights have the hash 000000000000"),
+        ({"base": "0" * 64}, r"a model with other weights \(hash 000000000000"),
         ({"rank": "2"}, "rank"),
         ({"rows": [10**6]}, "does not fit the weights"),
         (None, "not an adapter"),

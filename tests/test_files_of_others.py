@@ -260,7 +260,7 @@ def test_every_entrance_checks_sides_size_and_orientation(tmp_path: Path, capsys
         replace(walk(), joints=swapped(walk())),
         replace(walk(), joints=0.4 * walk().joints),
     )
-    for motion, words in ((mirrored, "the toes point backwards"), (small, "people's legs are")):
+    for motion, words in ((mirrored, "the toes point backwards"), (small, "human legs are")):
         write_bvh(path, motion)
         for name, enter in entrances.items():
             with subtests.test(words=words, entrance=name):

@@ -293,5 +293,5 @@ def test_legs_of_adults_and_children_have_limits(leg: float, children: bool, fit
     if fits:
         check_size(joints, 1.0, children)
         return
-    with pytest.raises(UserError, match=r"people's legs are (0\.25|0\.6) to 1\.2 m"):
+    with pytest.raises(UserError, match=r"human legs are (0\.25|0\.6) to 1\.2 m long"):
         check_size(joints, 1.0, children)

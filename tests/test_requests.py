@@ -421,7 +421,7 @@ def test_a_sample_is_written_as_a_motion_file(tmp_path, monkeypatch, capsys):
     [
         (
             ["rig=unreal"],
-            "rig=unreal: motions in a folder are not converted. Set an output file, such as out=walk.fbx",
+            "rig=unreal applies only to a single file, not to a folder. Set an output file, such as out=walk.fbx",
         ),
         (
             ["walk.glb", "mp4=true"],

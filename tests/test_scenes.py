@@ -361,7 +361,7 @@ def test_a_file_keeps_its_unit_if_the_folder_maps_its_joints(ending: str, tmp_pa
     (tmp_path / "skeleton.yaml").write_text(json.dumps({"map": mapped}))
     again = read(tmp_path / f"a{ending}")
     assert np.abs(again.joints - motion.joints).max() < 0.04
-    with pytest.raises(UserError, match=r"people's legs are 0\.6 to 1\.2 m"):
+    with pytest.raises(UserError, match=r"human legs are 0\.6 to 1\.2 m"):
         read(tmp_path / f"a{ending}", unit=0.02 if ending == ".fbx" else 2.0)
 
 

@@ -578,7 +578,7 @@ def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
         (lambda: stream(model, " "), "expected a description of what happens"),
         (
             lambda: generate(model, "a person walks", loop=True),
-            "loop=true: this model continues frames",
+            "loop=true: this model only extends a motion",
         ),
         (
             lambda: generate(model, "a person walks", stages=[]),

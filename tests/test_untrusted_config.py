@@ -240,14 +240,14 @@ def test_files_that_are_no_files(attacked, trained, bad):
     for name in ("pipe.ckpt", "pipe.yaml"):
         os.mkfifo(bad / name)
     for name in ("zero.safetensors", "pipe.ckpt"):
-        refuses(bad / name, "not a file")
-        attacked("import", "flame", str(bad / name), "out=x", says="not a file")
+        refuses(bad / name, "not a regular file")
+        attacked("import", "flame", str(bad / name), "out=x", says="not a regular file")
     attacked(
         "evaluate",
         f"ckpt={trained}",
         "extractor=none",
         f"protocol={bad / 'pipe.yaml'}",
-        says="not a file",
+        says="not a regular file",
     )
     attacked("train", str(bad / "pipe.yaml"), says="pipe.yaml")
 

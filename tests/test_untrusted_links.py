@@ -332,7 +332,7 @@ def test_a_link_at_the_name_of_a_folder_does_not_lead_to_the_files_of_somebody_e
     for file in contents:
         (victim / file).write_bytes(VICTIM)
     (folder / name).symlink_to(victim)
-    with one_line_error("a link leads out of|is not a prepared data set"):
+    with one_line_error("a link points outside|is not a prepared data set"):
         write(folder)
     assert {path.name: path.read_bytes() for path in victim.iterdir()} == dict.fromkeys(
         contents, VICTIM
@@ -522,7 +522,7 @@ def test_an_evaluation_stays_in_the_run(tmp_path, trained, data_root, name, caps
         f"data_root={data_root}",
     ]
     assert main(["evaluate", *words]) == 1
-    assert "a link leads out of" in capsys.readouterr().err
+    assert "a link points outside" in capsys.readouterr().err
     assert not list(victim.iterdir())
 
 

@@ -107,7 +107,7 @@ def test_a_recipe_that_a_spec_names_runs_no_code(attacked, bad, part: str):
         "tables",
         f"table={bad / 'spec.yaml'}",
         "evaluate=false",
-        says=f"names logging.basicConfig at {part}. Its code is run only if you trust it",
+        says=f"names logging.basicConfig at {part}. Code from this package is run only if you trust it",
     )
 
 
@@ -117,12 +117,12 @@ def huge(path: Path) -> None:
 
 
 UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "pipe": (os.mkfifo, "a pipe, a socket or a device, not a file"),
+    "pipe": (os.mkfifo, "a pipe, a socket or a device, not a regular file"),
     "endless": (
         lambda path: path.symlink_to("/dev/zero"),
-        "a pipe, a socket or a device, not a file",
+        "a pipe, a socket or a device, not a regular file",
     ),
-    "folder": (Path.mkdir, "a folder, not a file"),
+    "folder": (Path.mkdir, "a folder, not a regular file"),
     "huge": (huge, "the file is 1 TiB, but at most"),
     "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
 }
@@ -278,7 +278,7 @@ def test_a_sample_folder_is_whole_or_absent(attacked, bad, trained, monkeypatch)
             patch.setattr(f"flame_mdm.sampling.output.{name}", full)
             attacked(*words, "out=new/folder", says="No space left on device")
     (bad / "file").write_text("mine")
-    attacked(*words, f"out={bad / 'file'}", says="file: a file, not a folder")
+    attacked(*words, f"out={bad / 'file'}", says="file is a file, not a folder")
 
 
 def test_a_failed_write_keeps_what_was_there(tmp_path):

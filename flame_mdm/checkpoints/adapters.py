@@ -210,8 +210,8 @@ def read_merged(
         about, changes = _read(Path(file))
         if about["base"] != base:
             raise UserError(
-                f"adapter={file}: trained for a model whose weights have the hash {about['base'][:12]}, not "
-                f"{base[:12]}. Use the model that it was trained for"
+                f"adapter={file}: trained for a model with other weights (hash {about['base'][:12]}, not "
+                f"{base[:12]}). Use the model that the adapter was trained for"
             )
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):

@@ -193,7 +193,7 @@ class _CallLimit(TorchFunctionMode):
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.left -= 1
         if self.left < 0:
-            raise UserError("its recipe describes a larger model than the weights saved with it")
+            raise UserError("the recipe saved with these weights describes a larger model")
         # On the meta device, random draws would import torch's compiler, which takes longer than
         # building the model.
         if func is torch.nn.init.normal_:

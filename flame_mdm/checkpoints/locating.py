@@ -49,8 +49,8 @@ def find(source: str | Path, which: Which = "last") -> Path:
     # The client raises many kinds of errors: no network, no such repository, no permission, ...
     except Exception as error:
         raise UserError(
-            f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
-            f"hub: {first_line(error)}"
+            f"{source}: no such file or folder, and no model with this name can be downloaded from the hub "
+            f"({FILE}: {first_line(error)})"
         ) from error
 
 
@@ -71,7 +71,7 @@ def _find_in_folder(folder: Path, which: Which) -> Path:
     if len(weights) != 1:
         if runs := [run for run in sorted(folder.iterdir()) if (run / "checkpoints").is_dir()]:
             raise UserError(
-                f"{folder}: not a run directory, but it contains some. Use one of them: "
+                f"{folder}: not a run directory, but it contains run directories. Use one of them: "
                 f"{', '.join(map(str, runs))}"
             )
         names = ", ".join(file.name for file in weights) or "no .safetensors file"

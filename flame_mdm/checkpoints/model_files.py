@@ -171,7 +171,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
     }
     check_plain(metadata, _Metadata, path)
     if not isinstance(content["state_dict"], dict):
-        raise UserError(f"{path} is damaged: its weights are not a mapping of tensors")
+        raise UserError(f"{path} is damaged: its weights are not a mapping of names to tensors")
     check_weights(content["state_dict"], path)
     return content | {"config": renamed(content["config"])}
 
@@ -194,8 +194,8 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
         if not is_dense or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
             shown = f"{str(name)[:80]} is {getattr(value, 'dtype', type(value).__name__)}"
             raise UserError(
-                f"{path} is damaged: its weights are not a mapping of names to dense tensors of real "
-                f"numbers: {shown}"
+                f"{path} is damaged: its weights must map names to dense tensors of real numbers, "
+                f"but {shown}"
             )
     # The factor 2 allows for tensors that have two names but are stored only once.
     size = sum(value.numel() * value.element_size() for value in weights.values())

@@ -223,8 +223,8 @@ def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
         raise UserError(
-            f"sampler={options.sampler} draws noise with the learned variance of this model, which exported graphs do "
-            "not contain. Set task.sampler to ddim or dpm_solver_pp_2m"
+            f"sampler={options.sampler} draws noise with the variance that this model has learned, but exported graphs "
+            "do not contain this variance. Set task.sampler to ddim or dpm_solver_pp_2m"
         )
     return plans[0].tolist()
 

@@ -68,7 +68,7 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
         isinstance(value, Tensor) for value in state.values()
     ):
         raise UserError(
-            f"{path}: contains no weights{f' under {key!r}' if key else ''}, but {_listed(content)}"
+            f"{path}: contains no weights{f' under {key!r}' if key else ''}, only {_listed(content)}"
         )
     return dict(state)
 

@@ -47,7 +47,7 @@ def check_torch(path: Path) -> None:
             or sum(m.file_size for m in members) > size
         ):
             raise UserError(
-                "damaged: its parts are compressed or overlap, unlike in files from torch.save"
+                "damaged: its parts are compressed or overlap, unlike the parts that torch.save writes"
             )
         if (spoiled := archive.testzip()) is not None:
             raise UserError(f"damaged: the checksum of {spoiled} is wrong")

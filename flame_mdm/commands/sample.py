@@ -135,7 +135,7 @@ class SampleSettings(OutputSettings, WritingSettings):
                 if value := getattr(self, key):
                     advice = "Set an output file, such as out=walk.fbx"
                     raise UserError(
-                        f"{key}={str(value).lower()}: motions in a folder are not converted. "
+                        f"{key}={str(value).lower()} applies only to a single file, not to a folder. "
                         f"{advice}"
                     )
             return
@@ -339,7 +339,7 @@ def claims_score(model: MotionGenerator) -> Score:
     if skeleton != SMPL22:
         raise UserError(
             f"scorer={CLAIMS}: this model's skeleton is {skeleton.name}, but the referee requires "
-            f"{SMPL22.name}. Use a motion-CLIP"
+            f"{SMPL22.name}. Set scorer to a motion-CLIP checkpoint"
         )
     return claim_score
 

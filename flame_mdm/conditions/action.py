@@ -38,8 +38,8 @@ class ActionLabels(ConditionEncoder):
         super().__init__()
         if num_actions < 1:
             raise UserError(
-                "condition=action requires a data set with action labels, but this one has none, or is not "
-                "prepared yet. Run make prepare first, or choose another data set"
+                "condition=action requires a data set with action labels, but this data set has none or "
+                "is not prepared yet. Run make prepare first, or choose another data set"
             )
         self.features = features
         self.table = nn.Parameter(torch.randn(num_actions, features))

@@ -130,7 +130,7 @@ class PretrainedText(ConditionEncoder):
         if batch.text is None:
             name = self._pretrained.model
             raise UserError(
-                f"text encoder {name}: this batch has no captions. Add some, or choose another condition"
+                f"text encoder {name}: this batch has no captions. Add captions, or choose another condition"
             )
         captions = [*batch.text, ""] if self.encode_null else batch.text
         if self.freeze:

@@ -143,7 +143,7 @@ class LearnedTokens(ConditionEncoder):
         """
         if batch.text is None:
             raise UserError(
-                "condition=learned: this batch has no captions. Add some, or choose another condition"
+                "condition=learned: this batch has no captions. Add captions, or choose another condition"
             )
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}

@@ -208,8 +208,8 @@ def trust(config: Config, owner: str = "the checkpoint's configuration") -> None
         package = str(target).partition(".")[0]
         if package not in added:
             raise UserError(
-                f"{owner} names {target} at {'.'.join(path)}. Its code is run only if you trust it."
-                f" To trust it, set FLAME_MDM_TRUST={package}"
+                f"{owner} names {target} at {'.'.join(path)}. Code from this package is run only if you "
+                f"trust it. To trust it, set FLAME_MDM_TRUST={package}"
             )
     check(config)
 

@@ -48,7 +48,9 @@ def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str
 def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[int]) -> None:
     name, *words = words
     if name.startswith("-") or "=" in name:
-        raise UserError(f"the first word must be an experiment, such as quickstart, not '{name}'")
+        raise UserError(
+            f"the first word must be the name of an experiment, such as quickstart, but is '{name}'"
+        )
     recipe = composition.find_recipe(name)
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in SWEEP]:

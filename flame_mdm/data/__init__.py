@@ -217,7 +217,8 @@ class MotionSource(ABC):
         """
         if fps != published:
             raise UserError(
-                f"{self.name} has {published:g} frames per second, not {fps:g}. Set representation.fps"
+                f"{self.name} has {published:g} frames per second, not {fps:g}. Set "
+                f"representation.fps={published:g}"
             )
 
 

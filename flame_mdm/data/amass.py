@@ -67,7 +67,7 @@ class Recording(NamedTuple):
         step = int(self.fps / fps)
         if step < 1:
             raise UserError(
-                f"recorded at {self.fps:g} frames per second, which is fewer than the requested {fps:g}"
+                f"recorded at {self.fps:g} frames per second, but at least {fps:g} are required"
             )
         return self.cut(slice(None, None, step))
 
@@ -121,8 +121,8 @@ def read(file: Path | bytes, name: str) -> Recording:
             or gender.size != 1
         ):
             raise UserError(
-                f"{RELEASE}: poses has shape {poses.shape} and trans has shape "
-                f"{translation.shape}, not (F, 156) and (F, 3)"
+                f"{RELEASE}: expected poses of shape (F, 156) and trans of shape (F, 3), but found "
+                f"shapes {poses.shape} and {translation.shape}"
             )
         if any(
             array.dtype.kind not in "fiu" or not np.isfinite(array).all()

@@ -333,7 +333,7 @@ class CMU(MotionSource):
                     yield replace(clip, action=action)
         if len(self._errors) == len(tasks):
             raise UserError(
-                f"{self.path}: no recording can be read. The first error is: {self._errors[0]}"
+                f"{self.path}: none of the recordings can be read. The first error is: {self._errors[0]}"
             )
 
     def counts(self) -> Mapping[str, float]:
@@ -376,8 +376,8 @@ def _parts(table: Path) -> dict[str, _Part]:
         bare = [name for name, part in parts.items() if not getattr(part, kind)]
         if 0 < len(bare) < len(parts):
             raise UserError(
-                f"{table}: {len(bare)} of {len(parts)} parts have no {kind.removesuffix('s')}, such as {bare[0]}. Add "
-                "one to each, or leave these parts out"
+                f"{table}: {len(bare)} of {len(parts)} parts have no {kind.removesuffix('s')} (for example, "
+                f"{bare[0]}). Add one to each, or leave these parts out"
             )
     return parts
 

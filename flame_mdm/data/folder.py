@@ -319,8 +319,8 @@ class Folder(MotionSource):
             bare = [name for name, note in notes.items() if not getattr(note, values)]
             if 0 < len(bare) < len(notes):
                 raise UserError(
-                    f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}. Add one to "
-                    "each, or leave these motions out with data.source.exclude"
+                    f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind} (for example, {bare[0]}). Add "
+                    "one to each, or leave these motions out with data.source.exclude"
                 )
         _put_prefixes(self.prefixes, notes.values(), self.path / TABLE)
         return notes
@@ -404,7 +404,9 @@ def _add(notes: dict[str, Note], cells: dict[str, str]) -> None:
     """Adds the cells of a table row to the note of its motion."""
     name, split = cells["id"], cells.get("split")
     if name not in notes:
-        raise UserError(f"unknown motion {name!r}. Ids are paths in the folder, without extension")
+        raise UserError(
+            f"unknown motion {name!r}. Ids are the paths of files in the folder, without extensions"
+        )
     if split:
         known_split(split)
     note = notes[name]

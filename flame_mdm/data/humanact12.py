@@ -98,7 +98,8 @@ class HumanAct12(MotionSource):
                 label = int(action)
                 if pose.shape[1:] != (72,) or joint.shape != (len(pose), 24, 3) or not len(pose):
                     raise UserError(
-                        f"poses have shape {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
+                        f"expected poses of shape (F, 72) and joints of shape (F, 24, 3), but found shapes "
+                        f"{pose.shape} and {joint.shape}"
                     )
                 if not 0 <= label < len(self.actions):
                     raise UserError(

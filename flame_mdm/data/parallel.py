@@ -103,7 +103,7 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         if isinstance(error, BrokenProcessPool):
             raise UserError(
                 "a worker process was killed, perhaps because memory ran out. Use fewer processes. "
-                "With data.source.workers=1, the error message also names the file"
+                "With data.source.workers=1, the error message also names the file that was being read"
             ) from error
         raise
     finally:

@@ -104,7 +104,7 @@ class UESTC(MotionSource):
             if match is None or int(match[2]) >= len(self.actions):
                 row = f"{self.poses.parent}/info/names.txt, line {index + 1}"
                 raise UserError(
-                    f"{row}: {name!r} is not the name of a video that shows one of the {len(self.actions)} actions"
+                    f"{row}: {name!r} does not name a video of one of the {len(self.actions)} actions"
                 )
             videos.append(Video(index, match[1], *(int(match[k]) for k in range(2, 6))))
         return videos

@@ -178,7 +178,7 @@ class Studio:
         """
         if extension not in FORMATS:
             raise UserError(
-                f"{one_line(extension[:20])}: the page does not offer this format. Use "
+                f"{one_line(extension[:20])}: this format is not available. Use "
                 f"one of {', '.join(FORMATS)}"
             )
         motions = None
@@ -188,7 +188,7 @@ class Studio:
                 motions = self._made.get((request.model, repr(steps)))
         if model is None or motions is None:
             raise UserError(
-                "this motion is no longer in memory. Open its link, and download it from there"
+                "this motion is no longer in memory. Open the link to the motion, and download the file there"
             )
         motion = _numbered(_cleaned(model, motions) if cleanup else motions, number)
         with tempfile.TemporaryDirectory() as folder:

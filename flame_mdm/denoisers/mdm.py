@@ -82,7 +82,7 @@ class MDMEncoder(Denoiser):
             if tokens.shape[1] > self.max_tokens:
                 raise UserError(
                     f"denoiser.max_tokens={self.max_tokens}: captions have up to {tokens.shape[1]} tokens. "
-                    f"Set it to at least {tokens.shape[1]}"
+                    f"Set denoiser.max_tokens to at least {tokens.shape[1]}"
                 )
             prefix = torch.cat(
                 [self.condition.time(t)[:, None], self.condition.projection(tokens)], 1
@@ -173,7 +173,7 @@ class MDMDecoder(Denoiser):
         if memory == "concat" and not token_memory:
             raise UserError(
                 "denoiser.memory=concat: the time token would precede the condition tokens, "
-                "but they are not in the memory. Set token_memory=true"
+                "but the memory contains no condition tokens. Set token_memory=true"
             )
         if type(context_frames) is not int or context_frames < 0:
             raise UserError(
@@ -232,7 +232,7 @@ class MDMDecoder(Denoiser):
         frames = 0 if cond.prefix is None else cond.prefix.shape[1]
         if cond.prefix is None or frames != self.context_frames:
             raise UserError(
-                f"the prefix has {frames} frames, but this denoiser continues {self.context_frames} clean frames"
+                f"the prefix has {frames} frames, but this denoiser requires {self.context_frames} clean frames"
             )
         return torch.cat([cond.prefix.to(x_t), x_t], 1)
 
@@ -257,6 +257,6 @@ def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
     """Returns the tokens (B, S, C) and their mask (B, S). Raises `UserError` if there are no tokens."""
     if cond.token_mask is None or not cond.tokens.shape[1]:
         raise UserError(
-            "this denoiser needs condition tokens, but the condition encoder has none. Choose another encoder"
+            "this denoiser needs condition tokens, but the condition encoder returns none. Choose another encoder"
         )
     return cond.tokens, cond.token_mask

@@ -74,7 +74,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         data["poses"] = _joined([data[name] for name in BODY])
     if not {"joints", "poses"} & data.keys():
         raise UserError(
-            "contains neither joints nor poses. A motion needs joints and fps, or poses, trans and a frame rate"
+            "contains neither joints nor poses. A motion needs either joints and fps, or poses, trans and a frame rate"
         )
     for name in {"joints", "poses", "trans"} & data.keys():
         check_numbers(name, data[name])
@@ -84,7 +84,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         data["poses"] = _axis_angles(data["poses"])
         if data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
             raise UserError(
-                "poses require trans with shape (frames, 3) and the same number of frames, as in AMASS"
+                "poses require trans, an array of shape (frames, 3) with the same number of frames, as in AMASS"
             )
     for key in RATES:
         if key in data:
@@ -155,8 +155,8 @@ def check_numbers(name: str, values: np.ndarray) -> None:
     check_frames(len(values))
     if (beyond := ~(np.abs(values.astype(float)) < 1e6)).any():
         raise UserError(
-            f"{name} in frame {np.argwhere(beyond)[0][0]} contain NaN, infinity, or numbers of "
-            "a million or more"
+            f"{name} in frame {np.argwhere(beyond)[0][0]} contain NaN, infinity or numbers "
+            "that are too large (a million or more)"
         )
 
 
@@ -172,7 +172,7 @@ def _read_json(path: Path) -> dict[str, Any]:
             data["unit"] = LENGTHS.get(str(content["unit"]).lower(), content["unit"])
     except (AttributeError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise UserError(
-            f"not a JSON motion, which must be an object with joints and fps: {error}"
+            f"not a JSON motion: expected an object with joints and fps ({error})"
         ) from error
     data["ours"] = "caption" in content and (data.get("up"), data.get("unit")) == ("y", 1.0)
     return data

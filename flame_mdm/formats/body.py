@@ -135,8 +135,8 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     for joint in LIMBS:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
             raise UserError(
-                f"the bone that ends at {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but the body's bone is "
-                f"{usual[joint]:.3g} m. Is the unit right? Motions like this are drawn without a body"
+                f"the bone that ends at {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, but in the body model, "
+                f"this bone is {usual[joint]:.3g} m long. Is the unit right? Motions like this are drawn without a body"
             )
     wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())
 

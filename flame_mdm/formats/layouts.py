@@ -433,8 +433,8 @@ def check_size(joints: np.ndarray, unit: float, children: bool = False, doubt: s
         else ""
     )
     raise UserError(
-        f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's legs are {shortest:g} to {LEG[1]:g} m.{small} "
-        f"{advice}. Set `unit` in skeleton.yaml, or unit=... in convert and edit{also}"
+        f"the legs are {leg:.3g} m long (unit {unit:.6g}), but human legs are {shortest:g} to {LEG[1]:g} m long."
+        f"{small} {advice}. Set `unit` in skeleton.yaml, or unit=... in convert and edit{also}"
     )
 
 

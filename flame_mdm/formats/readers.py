@@ -402,7 +402,7 @@ def _of_ours(
     """
     for key, value in said.items():
         raise UserError(
-            f"{key}={value} has no effect: this project wrote the file, in meters, y up. Remove {key}="
+            f"{key}={value} has no effect: this project wrote the file, so it is in meters, with y up. Remove {key}="
         )
     rate = _rate(data, rate, {})
     notes = ("skeleton.yaml does not apply: this project wrote the file",) if fields else ()
@@ -455,7 +455,7 @@ def _refuse(fields: Mapping[str, Any], without_effect: Collection[str], reason: 
     for key in without_effect:
         if key in fields:
             raise UserError(
-                f"{key} has no effect, because {reason}. Remove it from the command or from skeleton.yaml"
+                f"{key} has no effect, because {reason}. Remove this key from the command or from skeleton.yaml"
             )
 
 

@@ -84,8 +84,8 @@ def frame_pairs(
     count = math.floor((frames - 1) * fps / rate + slack) + 1
     if count * joints > max(frames * joints, MAX_RESAMPLED):
         raise UserError(
-            f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}. For {joints} joints, "
-            "this is too many. Check the frame rate, or cut the motion"
+            f"{frames:,} frames at {rate:g} frames per second would become {count:,} frames at {fps:g} frames per "
+            f"second, which is too many for {joints} joints. Check the frame rate, or cut the motion"
         )
     # Frames are counted from the first frame, so that rounding errors do not accumulate. A new
     # frame that is slightly past the last old frame takes the value of the last old frame.

@@ -254,7 +254,7 @@ def rest_pose(
     feet = [at[f"{side}_foot"] - at[f"{side}_ankle"] for side in SIDES if f"{side}_foot" in at]
     if feet and frame[2] @ np.sum(feet, 0) < 0:
         raise UserError(
-            f"{source}: the toes point backward. Are left and right swapped or mirrored?"
+            f"{source}: the toes point backward. Are left and right swapped, or is the character mirrored?"
         )
     sources = dict(joints)
     spine = [joint for joint in SPINE if joint in sources]

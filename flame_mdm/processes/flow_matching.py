@@ -145,7 +145,7 @@ class FlowMatching(Process):
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
             raise UserError(
-                f"num_inference_steps={count}: a flow takes equal steps. Set it to one whole number"
+                f"num_inference_steps={count}: a flow takes equal steps. Use one whole number"
             )
         if edit is not None:
             self.check_edit(edit, mask, options)

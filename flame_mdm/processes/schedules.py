@@ -175,7 +175,7 @@ def build_schedule(name: str, num_train_timesteps: int, noise_scale: float = 1.0
         )
     if not 0 < noise_scale < math.inf:
         raise UserError(
-            f"noise_scale={noise_scale}: expected a number above 0; 1 = the noise of the schedule, unchanged"
+            f"noise_scale={noise_scale}: expected a number above 0; 1 leaves the noise of the schedule unchanged"
         )
     betas = {"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps)
     return Schedule(betas if noise_scale == 1 else with_more_noise(betas, noise_scale))

@@ -54,7 +54,7 @@ class Motion272(Representation):
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError(
-                "the motion has only 1 frame, but encoding requires at least 2. Exclude it"
+                "the motion has only 1 frame, but encoding requires at least 2. Exclude the motion"
             )
         # Z up -> y up
         axes = torch.tensor(

@@ -40,7 +40,7 @@ def check_within(path: str | Path, root: str | Path) -> None:
     target = os.path.realpath(path)
     if not Path(target).is_relative_to(os.path.realpath(root)):
         raise UserError(
-            f"{path}: a link leads out of {root}, to {target}. Files are not written there. Remove the link"
+            f"{path}: a link points outside {root}, to {target}, so nothing is written there. Remove the link"
         )
 
 
@@ -63,9 +63,9 @@ def check_tree(folder: Path) -> None:
                 or stat.S_ISBLK(status.st_mode)
                 or stat.S_ISCHR(status.st_mode)
             ):
-                raise UserError(f"{path}: a pipe or a device. Remove it")
+                raise UserError(f"{path} is a pipe or a device. Remove it")
             elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
-                raise UserError(f"{path}: {SECOND_NAME}")
+                raise UserError(f"{path} is {SECOND_NAME}")
 
 
 def open_in_place(path: Path) -> IO[str]:
@@ -81,7 +81,7 @@ def open_in_place(path: Path) -> IO[str]:
     except OSError as error:
         if path.is_symlink():
             raise UserError(
-                f"{path}: this is a link, and links are not followed when writing. Remove it"
+                f"{path}: this is a link, and links are not followed when writing. Remove the link"
             ) from error
         raise
     status = os.fstat(descriptor)
@@ -90,9 +90,9 @@ def open_in_place(path: Path) -> IO[str]:
         kind = (
             SECOND_NAME
             if stat.S_ISREG(status.st_mode)
-            else "a pipe, a socket or a device, not a file. Remove it"
+            else "a pipe, a socket or a device, not a regular file. Remove it"
         )
-        raise UserError(f"{path}: {kind}")
+        raise UserError(f"{path} is {kind}")
     return os.fdopen(descriptor, "a+", encoding="utf-8")
 
 

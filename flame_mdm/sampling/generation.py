@@ -104,7 +104,8 @@ def sample(
         )
     if stages is not None and request.candidates > 1:
         raise UserError(
-            "trajectory shows estimates of a single motion. Omit candidates or trajectory"
+            "trajectory shows the estimates of a single motion and cannot be combined with candidates. "
+            "Omit one of the two"
         )
     rows = _rows(resolved)
     motions: list[Motion] = []

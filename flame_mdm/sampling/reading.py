@@ -106,9 +106,12 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     ):
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
-            raise UserError(
-                f"{name}features have shape {shape}, not (frames, {size}), or contain NaN or infinity"
+            fault = (
+                "contain NaN or infinite values"
+                if shape[1:] == (size,)
+                else f"have shape {shape}, not (frames, {size})"
             )
+            raise UserError(f"{name}features {fault}")
         return motion
     try:
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:

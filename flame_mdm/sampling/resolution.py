@@ -190,7 +190,7 @@ def _check_model(request: SamplingRequest, model: MotionGenerator) -> None:
         check_streams(model)
         if request.loop:
             raise UserError(
-                "loop=true: this model continues frames and cannot lead back to the first one. Omit loop"
+                "loop=true: this model only extends a motion and cannot return to its first frame. Omit loop"
             )
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]

@@ -185,8 +185,8 @@ class Stream(Iterator[Motion]):
         """
         if self._cleanup is not None:
             raise UserError(
-                "cleanup=true: a cleaned block depends on the next block, so frames cannot "
-                "be dropped. Omit cleanup"
+                "cleanup=true: a cleaned block depends on the next block, so the stream "
+                "cannot go back. Omit cleanup"
             )
         self._streams.go_back(round(at * self._streams.model.representation.fps))
 
@@ -390,7 +390,8 @@ class Streams(Iterator[list[Motion]]):
         is_end = frame == self.frames[0]
         if not is_end and (not blocks or frame > self.frames[0]):
             raise UserError(
-                f"frame {frame} is not in the last {HELD} blocks, which end at frame {self.frames[0]}. Use a later time"
+                f"frame {frame} is not in the last {HELD} blocks, which end at frame {self.frames[0]}. "
+                "Use a time in these blocks"
             )
         self.schedules[0].drop(frame)
         self.waypoints.go_back(frame)
@@ -571,8 +572,8 @@ def check_streams(model: MotionGenerator) -> None:
     if not model.representation.relative:
         name = model.representation.name
         raise UserError(
-            f"representation {name} contains world positions, and a stream would leave their range. Use "
-            "a model with humanml3d features"
+            f"representation {name} contains world positions, which would leave the range of the training data "
+            "in a stream. Use a model with humanml3d features"
         )
 
 

@@ -77,14 +77,14 @@ class DistillationTask(GeneratorTask):
         for key in sorted(theirs.keys() | ours.keys()):
             if theirs.get(key) != ours.get(key):
                 raise UserError(
-                    f"distillation.teacher={name}: has {key}={theirs.get(key)}, but the student has {ours.get(key)}. "
-                    f"Both need the same parts: use `flame-mdm distill {name}`"
+                    f"distillation.teacher={name}: the teacher has {key}={theirs.get(key)}, but the student has "
+                    f"{ours.get(key)}. Both must have the same parts. Use `flame-mdm distill {name}`"
                 )
         before, now = teacher.facts.get("fingerprint"), self.facts.get("fingerprint")
         if None not in (before, now) and before != now:
             raise UserError(
                 f"distillation.teacher={name}: trained on data with fingerprint {before}, but {self.facts['dataset']} "
-                f"has {now}. Use the teacher's data"
+                f"has fingerprint {now}. Use the teacher's data"
             )
         self.generator.load_state_dict(teacher.state_dict())
         self.facts["teacher"] = weights_sha256(path)

@@ -190,8 +190,8 @@ def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
     before, now = resumed.content["facts"].get("fingerprint"), data.open().fingerprint
     if before not in (None, now):
         raise UserError(
-            f"{resumed.path}: trained on data with fingerprint {before}, but {data.folder} has {now}. Start another "
-            "run with run.name=..., or prepare the original data again"
+            f"{resumed.path}: trained on data with fingerprint {before}, but {data.folder} has fingerprint {now}. "
+            "Start another run with run.name=..., or prepare the original data again"
         )
 
 

@@ -55,8 +55,8 @@ class WriteProvenance(Callback):
                 kind for name, kind in kinds.items() if getattr(before, name) != facts[name]
             ]:
                 say(
-                    f"resuming with different {' and '.join(different)}: results may differ from those of "
-                    "an uninterrupted run"
+                    f"resuming with different {' and '.join(different)}: results may differ from the results "
+                    "of an uninterrupted run"
                 )
         write_json(folder / PROVENANCE, facts)
         for logger in trainer.loggers:

@@ -129,7 +129,7 @@ def judge(
     if isinstance(motion, Motion):
         if motion.skeleton != SMPL22:
             raise UserError(
-                f"motion {motion.id!r} has the skeleton {motion.skeleton.name}. Use {SMPL22.name}"
+                f"motion {motion.id!r} has the skeleton {motion.skeleton.name}, but the referee requires {SMPL22.name}"
             )
         joints, fps = motion.joints, motion.fps
         text = motion.text if text is None else text

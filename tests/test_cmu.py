@@ -279,7 +279,7 @@ def test_captions_of_ones_own(folder, capsys):
         ("02_01,x,1,a,b,", "begin 'x', end '1': not times in seconds"),
         ("02_01,nan,1,a,b,", "begin 'nan', end '1': not times in seconds"),
         ("02_01,,,a,b,tset", "captions.csv, line 2: unknown split 'tset'"),
-        ("02_01,,,,b,\n02_02,,,a,b,", "1 of 2 parts have no text, such as 02_01"),
+        ("02_01,,,,b,\n02_02,,,a,b,", "1 of 2 parts have no text (for example, 02_01)"),
         (
             "02_01,,,a,b,\n02_01,,,a,c,",
             "captions.csv, line 3: 02_01 has conflicting values for split, source or action",

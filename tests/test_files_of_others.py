@@ -419,7 +419,7 @@ def test_pointers_of_git_lfs_are_named(tmp_path: Path, subtests):
     for name in ("a.bvh", "a.npz", "a.json", "a.npy", "a.amc", "a.glb"):
         with subtests.test(name=name):
             (tmp_path / name).write_text(POINTER)
-            with pytest.raises(UserError, match=r"a Git LFS pointer .*git lfs pull"):
+            with pytest.raises(UserError, match=r"a Git LFS pointer.*git lfs pull"):
                 (glb.read if name.endswith("glb") else read)(tmp_path / name)
 
 

@@ -223,7 +223,7 @@ BAD = {
     ),
     "no caption": (
         lambda f: (f / "one.txt").unlink(),
-        "1 of 3 motions have no caption (for example, one)",
+        r"1 of 3 motions have no caption \(for example, one\)",
     ),
     "unknown id": (
         lambda f: write_table(f, [{"id": "once", "text": "a"}]),

@@ -202,7 +202,9 @@ def test_links_pipes_and_folders(tmp_path: Path, folder: Callable):
             refuses(str(path), read, path, fps=20)
     for name in ("b.npz", "a.txt", "captions.csv", "skeleton.yaml"):
         refuses(
-            f"{name} is a pipe", of_folder, folder(lambda path, name=name: os.mkfifo(path / name))
+            f"{name}: this is a pipe",
+            of_folder,
+            folder(lambda path, name=name: os.mkfifo(path / name)),
         )
     of_folder(folder(lambda path: (path / "b.npz").mkdir()))  # is no motion
     refuses(

@@ -117,12 +117,12 @@ def huge(path: Path) -> None:
 
 
 UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "pipe": (os.mkfifo, "a pipe, a socket or a device, not a regular file"),
+    "pipe": (os.mkfifo, "this is a pipe, a socket or a device, not a regular file"),
     "endless": (
         lambda path: path.symlink_to("/dev/zero"),
-        "a pipe, a socket or a device, not a regular file",
+        "this is a pipe, a socket or a device, not a regular file",
     ),
-    "folder": (Path.mkdir, "a folder, not a regular file"),
+    "folder": (Path.mkdir, "this is a folder, not a regular file"),
     "huge": (huge, "the file is 1 TiB, but at most"),
     "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
 }
@@ -278,7 +278,7 @@ def test_a_sample_folder_is_whole_or_absent(attacked, bad, trained, monkeypatch)
             patch.setattr(f"flame_mdm.sampling.output.{name}", full)
             attacked(*words, "out=new/folder", says="No space left on device")
     (bad / "file").write_text("mine")
-    attacked(*words, f"out={bad / 'file'}", says="file is a file, not a folder")
+    attacked(*words, f"out={bad / 'file'}", says="file: this is a file, not a folder")
 
 
 def test_a_failed_write_keeps_what_was_there(tmp_path):

@@ -90,7 +90,7 @@ def atomic_write(path: str | Path, *, within: str | Path | None = None) -> Itera
     with _temporary(path) as temporary:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise UserError(
-                f"{path} is a pipe, a socket or a device, not a regular file. Choose another name"
+                f"{path}: this is a pipe, a socket or a device, not a regular file. Choose another name"
             )
         yield temporary
         temporary.replace(path)
@@ -109,7 +109,7 @@ def atomic_folder(path: str | Path, *, within: str | Path | None = None) -> Iter
     if within is not None:
         check_within(path, within)
     if path.exists() and not path.is_dir():
-        raise UserError(f"{path} is a file, not a folder. Choose another folder")
+        raise UserError(f"{path}: this is a file, not a folder. Choose another folder")
     remove_abandoned(path.parent, path)
     with _temporary(path) as temporary:
         temporary.mkdir()
@@ -293,14 +293,14 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
         ) from error
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
-        raise UserError(f"{path} is {kind}, not a regular file")
+        raise UserError(f"{path}: this is {kind}, not a regular file")
     if limit is not None and status.st_size > limit:
         raise UserError(
             f"{path}: the file is {_size(status.st_size)}, but at most {_size(limit)} is allowed"
         )
     if status.st_size < POINTER_LIMIT and _begins(path, GIT_LFS):
         raise UserError(
-            f"{path} is a Git LFS pointer, not the file itself. Run `git lfs pull` in its repository"
+            f"{path}: this is a Git LFS pointer, not the file itself. Run `git lfs pull` in its repository"
         )
     return status.st_size
 

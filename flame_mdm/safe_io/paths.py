@@ -63,9 +63,9 @@ def check_tree(folder: Path) -> None:
                 or stat.S_ISBLK(status.st_mode)
                 or stat.S_ISCHR(status.st_mode)
             ):
-                raise UserError(f"{path} is a pipe or a device. Remove it")
+                raise UserError(f"{path}: this is a pipe or a device. Remove it")
             elif stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
-                raise UserError(f"{path} is {SECOND_NAME}")
+                raise UserError(f"{path}: this is {SECOND_NAME}")
 
 
 def open_in_place(path: Path) -> IO[str]:
@@ -92,7 +92,7 @@ def open_in_place(path: Path) -> IO[str]:
             if stat.S_ISREG(status.st_mode)
             else "a pipe, a socket or a device, not a regular file. Remove it"
         )
-        raise UserError(f"{path} is {kind}")
+        raise UserError(f"{path}: this is {kind}")
     return os.fdopen(descriptor, "a+", encoding="utf-8")
 
 

@@ -34,7 +34,7 @@ from flame_mdm.training.speed import accelerate
 WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens per caption
 # On each batch of the full-size step, all implementations take turns, twice.
-ROUNDS, BATCHES = 2, 6
+ROUNDS, BATCHES = 2, 5
 BACKBONES = {
     "MDM, encoder": ["synthetic/mdm"],
     "MDM, decoder": ["synthetic/mdm_decoder"],
@@ -262,7 +262,7 @@ def measure(settings: Settings) -> Section:
     names = ["FLAME", "MFM"] if quick else list(BACKBONES)
     tables["small networks"] = backbones(names, 1 if quick else 15, device)
     if device == "cpu":
-        tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
+        tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 100, 2)
 
     authors = (
         "The authors' step runs their code with zeros instead of CLIP's features. "

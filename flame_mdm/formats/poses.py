@@ -44,6 +44,9 @@ SMOOTH = 0.1
 # Number of squarings. They result in the 4,096th power, in which only the dominant eigenvector
 # remains.
 SQUARINGS = 12
+# The power is divided by its largest entry after this many squarings. In between, its dominant
+# eigenvalue grows from at most 4 to at most 4^16, which float32 can represent.
+RESCALED_EVERY = 4
 
 
 @dataclass(eq=False)
@@ -212,9 +215,10 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
     power = torch.stack(rows, -2)
     size = torch.linalg.vector_norm(power, dim=(1, 2), keepdim=True)
     power = power / size.clamp_min(torch.finfo(bones.dtype).tiny) + torch.eye(4, dtype=bones.dtype)
-    for _ in range(SQUARINGS):
+    for squaring in range(1, SQUARINGS + 1):
         power = power @ power
-        power = power / power.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+        if squaring % RESCALED_EVERY == 0:
+            power = power / power.amax((1, 2), keepdim=True)
     largest = power.diagonal(dim1=1, dim2=2).argmax(-1)
     return F.normalize(power.gather(1, largest[:, None, None].expand(-1, 1, 4))[:, 0], dim=-1)
 

@@ -14,10 +14,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.core_plugins import file_config_source, importlib_resources_config_source
 from hypothesis import settings
 from support.distributed import GlooPool
-from support.fixtures import ParsedOnce, compositions_once, recipe
+from support.fixtures import compositions_once, parts_once, recipe
 from support.npm import node_modules as node_modules
 from support.refusals import Refused
 from support.runs import TINY
@@ -33,8 +32,7 @@ gc.disable()
 # Tests run on all cores: more processes would only import torch again
 parallel.PATIENCE = math.inf
 composition.compose_unchecked = compositions_once(composition.compose_unchecked)
-for source in (file_config_source, importlib_resources_config_source):
-    vars(source)["OmegaConf"] = ParsedOnce
+parts_once()
 # Pictures of samples have a sixteenth of their pixels; `test_visualize.py` looks at larger ones
 output.write_gif = partial(output.write_gif, size=64)
 output.contact_sheet = partial(output.contact_sheet, size=48)

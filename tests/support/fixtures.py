@@ -13,19 +13,25 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from copy import deepcopy
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
+from hydra._internal import config_loader_impl
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import IConfigRepository
+from hydra._internal.defaults_list import DefaultsList
+from hydra.core.default_element import ResultDefault
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig
 
 from flame_mdm.config import Config, compose, recipes
 from flame_mdm.config.composition import EXPERIMENTS, ConfigSource
-from flame_mdm.safe_io import read_package_yaml, write_json
+from flame_mdm.safe_io import write_json
 
 ROOT = Path(__file__).parent.parent.parent
 GOLDEN = Path(os.environ.get("FLAME_MDM_GOLDEN", ROOT / "tests" / "golden"))
@@ -98,22 +104,52 @@ def compositions_once(compose_unchecked: Callable[..., Config]) -> Callable[...,
     return once
 
 
-FIXED = (EXPERIMENTS, Path(hydra.__file__).parent)
-"""Folders of the YAML files of recipes and of Hydra's own configuration."""
+def parts_once() -> None:
+    """Makes Hydra find and merge the parts of a recipe once for each choice of parts.
 
+    This takes two thirds of a composition. Words that set single keys are then applied to a copy.
+    """
+    find: Callable[..., DefaultsList] = config_loader_impl.__dict__["create_defaults_list"]
+    merge = ConfigLoaderImpl._compose_config_from_defaults_list
+    lists: dict[tuple[object, ...], DefaultsList] = {}
+    merged: dict[tuple[str, ...], DictConfig] = {}
 
-class ParsedOnce(OmegaConf):
-    """OmegaConf for Hydra, which parses the files of a recipe again for every composition."""
+    def is_fixed(repo: IConfigRepository) -> bool:
+        """Whether all parts come from the package; somebody's own recipe may change."""
+        folders = {source.path for source in repo.get_sources() if source.scheme() == "file"}
+        return folders == {str(EXPERIMENTS)}
 
-    @staticmethod
-    def load(file_: Any) -> Any:
-        path = Path(file_.name)
-        if not any(path.is_relative_to(folder) for folder in FIXED):
-            return OmegaConf.load(file_)
-        return OmegaConf.create(_parsed(path) or {})
+    def find_once(
+        repo: IConfigRepository,
+        config_name: str | None,
+        overrides_list: list[Override],
+        **options: bool,
+    ) -> DefaultsList:
+        if not is_fixed(repo):
+            return find(repo, config_name, overrides_list, **options)
+        keys = [
+            word
+            for word in overrides_list
+            if isinstance(word.value(), dict) or not repo.group_exists(word.key_or_group)
+        ]
+        parts = [word for word in overrides_list if word not in keys]
+        key = (config_name, *options.values(), *(word.input_line for word in parts))
+        if key not in lists:
+            lists[key] = find(repo, config_name, parts, **options)
+        return replace(lists[key], config_overrides=keys)
 
+    def merge_once(
+        self: ConfigLoaderImpl, defaults: list[ResultDefault], repo: IConfigRepository
+    ) -> DictConfig:
+        if not is_fixed(repo):
+            return merge(self, defaults, repo)
+        key = tuple(map(repr, defaults))
+        if key not in merged:
+            merged[key] = merge(self, defaults, repo)
+        return deepcopy(merged[key])
 
-_parsed = cache(read_package_yaml)
+    config_loader_impl.__dict__["create_defaults_list"] = find_once
+    ConfigLoaderImpl._compose_config_from_defaults_list = merge_once
 
 
 @cache

@@ -34,10 +34,10 @@ class Evaluate(Callback):
     Args:
         protocol: the name of a protocol in experiments/evaluation, or the path of a protocol file.
         extractor: source of the protocol's extractor, as in `flame-mdm evaluate`: a file, a folder,
-            a model in the package or a run directory. None = the extractor named in the protocol;
-            "none" = skip metrics that need features.
+            a model in the package or a run directory. If None, the extractor named in the protocol
+            is used. If "none", metrics that need features are skipped.
         every_n_steps: number of training steps between evaluations.
-        samples: number of motions per replication. None = the number in the protocol.
+        samples: number of motions per replication, or None for the number in the protocol.
         replications: number of replications.
         batch_size: number of motions per batch.
     """

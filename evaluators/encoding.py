@@ -9,7 +9,7 @@ import torch
 from flame_mdm.representations.humanml import HumanML
 
 Joints = np.ndarray
-"""Joint positions (F, J, 3) in meters, y up."""
+"""Joint positions (F, J, 3) in meters, with y up."""
 
 
 def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:

@@ -105,7 +105,7 @@ class Evaluation:
         raises `UserError` before anything is generated, unless `force` is True.
 
         Args:
-            source: source of the motions; None = only real motions are measured.
+            source: source of the motions. If None, only real motions are measured.
             ground_truth: whether to measure real motions as well.
             force: whether to generate motions even if real motions do not have the expected values.
             resamples: number of bootstrap sets to draw from the motions of the first replication,

@@ -86,7 +86,7 @@ class Evaluator:
         ({'penetration': 0.0}, {})
     """
 
-    # Computes the features for metrics; None = no features
+    # Computes the features for metrics, or None for no features
     extractor: Extractor | None
     # Mappings with the `_target_` of a metric, by name
     metrics: Mapping[str, Config]
@@ -94,7 +94,8 @@ class Evaluator:
     batch_size: int = 64
     # Whether metrics that lack features are skipped instead of raising an error
     skip_features: bool = False
-    # Training motions, used to find copies of them among generated motions. None = not measured.
+    # Training motions, used to find copies of them among generated motions, or None if copies are
+    # not measured
     training: TrainingMotions | None = None
 
     @torch.no_grad()

@@ -1,9 +1,9 @@
 # pyright: standard
 """Graded perturbations of real motions for audits: changes that a metric should detect or ignore.
 
-Each function takes joint positions (F, J, 3) in meters, y up, and keeps the number of frames unless
-its docstring states otherwise. Random draws come from a generator that is passed as an argument, so
-that all grades of a perturbation can use the same draws.
+Each function takes joint positions (F, J, 3) in meters, with y up, and keeps the number of frames
+unless its docstring states otherwise. Random draws come from a generator that is passed as an
+argument, so that all grades of a perturbation can use the same draws.
 """
 
 from __future__ import annotations

@@ -36,8 +36,8 @@ class Plan:
             not come from a model, they are None, None and {}.
         clips, representation: the evaluated split of `data`, and the representation on its
             device.
-        skeleton: source of the bone lengths if joints are computed from SMPL's rotations.
-            None = the data contains joint positions.
+        skeleton: source of the bone lengths if joints are computed from SMPL's rotations, or None
+            if the data contains joint positions.
         protocol, changed: the protocol with the requested numbers of motions and replications, and
             the options that were changed.
         path: path of the result file.

@@ -78,7 +78,7 @@ class DrawnClip:
 class Multimodality(ClosedSchema):
     """Settings of a second evaluation, with several motions per prompt."""
 
-    #: Number of prompts; None = all prompts of the split.
+    #: Number of prompts, or None for all prompts of the split.
     prompts: Int | None
     #: Motions per prompt.
     samples: Int
@@ -112,9 +112,10 @@ class Protocol(ClosedSchema):
     metrics: dict[str, Config]
     #: Number of replications.
     replications: Count
-    #: Motions per replication, from randomly drawn clips. None = each clip once.
+    #: Motions per replication, from randomly drawn clips, or None to use each clip once.
     samples: Count | None = None
-    #: Real motions in comparisons of sets, from randomly drawn clips. None = each clip once.
+    #: Real motions in comparisons of sets, from randomly drawn clips, or None to use each clip
+    #: once.
     real_samples: Count | None = None
     #: A second evaluation with several motions per prompt.
     multimodality: Multimodality | None = None

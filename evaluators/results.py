@@ -32,7 +32,7 @@ from flame_mdm.training.start import recipe_changes
 class Scores:
     """Values of all metrics in one replication."""
 
-    # Values by name (`metric` or `metric/part`); None = the value cannot be computed
+    # Values by name (`metric` or `metric/part`), or None if the value cannot be computed
     values: Mapping[str, float | None]
     # Reasons for missing values, by metric
     reasons: Mapping[str, str]

@@ -52,7 +52,7 @@ class Scene:
 
     @cached_property
     def joints(self) -> list[np.ndarray]:
-        """Joint positions of each motion: float64 (F, J, 3) in meters, y up."""
+        """Joint positions of each motion: float64 (F, J, 3) in meters, with y up."""
         return [
             self.representation.decode(torch.from_numpy(x)).double().numpy() for x in self.features
         ]

@@ -21,7 +21,7 @@ class MotionBatch:
 
     Attributes:
         x: (B, F, D) float32, normalized features, with zeros after the end of each motion.
-        mask: (B, F) bool, True = real frame.
+        mask: (B, F) bool, True for real frames.
         ids: B names, each unique in the data set. A sample's name seeds its noise and identifies
             the sample in results.
         text: one caption per motion, or None if the data contains no captions.
@@ -71,7 +71,7 @@ class Condition:
     Attributes:
         pooled: (B, C), one vector per sample.
         tokens: (B, S, C), one vector per word piece, or S = 0 if the encoder returns no tokens.
-        token_mask: (B, S) bool, True = real token. If the null condition has no mask (None),
+        token_mask: (B, S) bool, True for real tokens. If the null condition has no mask (None),
             samples that receive the null condition keep their own masks.
         null: the null condition ("no condition"), with batch size 1, or None if the encoder has no
             null condition.
@@ -79,7 +79,7 @@ class Condition:
             no frames precede it.
         target: (B, 8, 4), where the motion should end (see `flame_mdm.conditions.target`), or None
             if it may end anywhere.
-        target_mask: (B,) bool, False = this sample has no target, or None if every sample has one.
+        target_mask: (B,) bool, False for samples without a target, or None if every sample has one.
 
     Example:
         >>> null = Condition(torch.zeros(1, 3), torch.zeros(1, 0, 3), None)
@@ -102,7 +102,7 @@ class Condition:
         Only the text or action is replaced, not the prefix or the target.
 
         Args:
-            drop: (B,) bool, True = replace this sample's condition.
+            drop: (B,) bool, True for samples whose condition is replaced.
         """
         if self.null is None:
             raise ValueError("there is no null condition with which to replace conditions")
@@ -179,7 +179,7 @@ class Edit:
 
     Attributes:
         known: (B, F, D) normalized features of the motion.
-        keep: (B, F, D) bool, True = keep this feature in this frame.
+        keep: (B, F, D) bool, True if this feature is kept in this frame.
         mode: how the kept features are imposed. "x0" overwrites them in the clean estimate (MDM).
             "x_t" overwrites them in the noisy sample with the known motion at the same noise level
             (FLAME, RePaint). "trajectory" overwrites the beginning of the flow's path (MFM).
@@ -191,7 +191,7 @@ class Edit:
         resample: for "x_t", how many times each sampling step is repeated. Noise is added again
             before each repetition (RePaint, algorithm 1).
         guide: for "x0", a guide that moves the clean estimate toward a goal at each sampling step,
-            before the kept features are imposed. None = no goal.
+            before the kept features are imposed. If None, there is no goal.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`,
             noised to the level of the first of these steps (SDEdit). MDM's code sets the number of
             skipped steps instead: for N steps, `skip_timesteps` = (1 - strength) N. If `strength`

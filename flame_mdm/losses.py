@@ -98,7 +98,7 @@ class MotionLosses(nn.Module):
         root_relative: whether to subtract the first joint from all joints, as in MDM's code.
         velocity_features: number of leading features that `velocity` uses. MDM's code omits the
             last row of the feature matrix. It therefore uses 144 of the 25 x 6 features, or 262 of
-            the 263 features. None = all features.
+            the 263 features. If None, all features are used.
 
     Example:
         >>> losses = MotionLosses(lambda x: x.unflatten(-1, (-1, 3)), feet=[1], joints=2.0)
@@ -138,7 +138,7 @@ class MotionLosses(nn.Module):
         Args:
             x0_hat: (B, F, D), the clean estimate.
             x: (B, F, D), the data.
-            mask: (B, F) bool, True = real frame.
+            mask: (B, F) bool, True for real frames.
         """
         # The first frame has no velocity. Padding is at the end, so a velocity is real if its
         # second frame is real.

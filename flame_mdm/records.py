@@ -271,8 +271,8 @@ class AuditCard(ClosedSchema):
     seed: Int
     resamples: Int
     packages: dict[str, str]
-    # Whether higher values are better, by metric. None = the closer to the value of real motions,
-    # the better
+    # Whether higher values are better, by metric, or None if values are better the closer they are
+    # to the value of real motions
     metrics: dict[str, bool | None]
     # Properties by metric. Files from earlier versions contain none
     facts: dict[str, AuditedMetric] = Field({})

@@ -186,8 +186,8 @@ class GeneratorTask(Task):
         checkpoint_activations: whether to store fewer activations for the backward pass and
             recompute the others; see `flame_mdm.denoisers.recomputation`. The resulting weights are
             the same, but training steps are slower.
-        targets: options of `TargetConditions`, required by a denoiser with a target encoder. None =
-            the model is trained without targets.
+        targets: options of `TargetConditions`, required by a denoiser with a target encoder. If
+            None, the model is trained without targets.
 
     If the denoiser has `context_frames`, the first `context_frames` frames of each training sample
     are its clean prefix, and only the later frames contribute to the losses.
@@ -348,7 +348,7 @@ class GeneratorTask(Task):
         return terms["loss"].mean()
 
     def dropped(self, batch: MotionBatch) -> Tensor:
-        """Returns a random bool mask (B,): True = this motion receives the null condition."""
+        """Returns a random bool mask (B,), True for motions that receive the null condition."""
         return torch.rand(len(batch), device=self.device) < self.cond_drop_prob
 
     def loss_terms(

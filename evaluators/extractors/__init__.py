@@ -49,7 +49,7 @@ class Extractor(ABC):
         """Returns "features" (B, E) and, for classifiers, "logits" (B, A).
 
         Motions are passed both as `features` (B, F, D) in the data's units and as joint positions
-        `joints` (B, F, J, 3) in meters, y up, with the mask (B, F).
+        `joints` (B, F, J, 3) in meters, with y up, together with the mask (B, F).
         """
 
     def texts(
@@ -64,7 +64,7 @@ class Extractor(ABC):
     def reference(self) -> Tensor | None:
         """Features (N, E) of the network's own real motions, with which sets are compared.
 
-        None = sets are compared with motions from the data set.
+        If None, sets are compared with motions from the data set.
         """
         return None
 

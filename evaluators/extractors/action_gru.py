@@ -36,7 +36,7 @@ class ActionGRU(nn.Module):
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
         """Computes features (B, 30), in (-1, 1), from joint positions (B, F, J, 3) and their mask (B, F).
 
-        The positions are in meters, y up.
+        The positions are in meters, with y up.
         """
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
         return self.published(joints - joints[:, :1, :1], mask, state)

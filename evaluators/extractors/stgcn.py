@@ -130,9 +130,9 @@ class Unconstrained(STGCN):
         super().__init__(UNCONSTRAINED_PARENTS, 12, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Computes features (B, 256) from joint positions (B, F, 24, 3) in meters, y up.
+        """Computes features (B, 256) from joint positions (B, F, 24, 3) in meters, with y up.
 
-        The network itself expects y down.
+        The network itself expects y to point down.
         """
         return self.published(
             x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask

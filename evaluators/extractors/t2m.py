@@ -136,7 +136,8 @@ class T2MEvaluator(nn.Module):
     are normalized with the `mean` and `std` (D,) of the released weights. After normalization,
     motions are padded with zeros to `max_frames`, as the authors' code does for real motions.
     Therefore, the convolutions read 3 frames past the end. The network reads the first
-    `used_features` features (67 for MARDM, 64 for KIT); None = all features except the contacts.
+    `used_features` features (67 for MARDM, 64 for KIT), or all features except the contacts if it
+    is None.
     """
 
     mean: Tensor

@@ -73,7 +73,7 @@ def matching_loss(
         motion: (B, E) features of the motions.
         text: (B, E) features of the texts.
         margin: distance beyond which a wrong motion adds no loss.
-        fits: (B, B) bool, True = the text of the row describes the motion of the column. None =
+        fits: (B, B) bool, True if the text of the row describes the motion of the column. If None,
             each text describes only its own motion.
     """
     count = len(motion)

@@ -16,13 +16,13 @@ real motions.
 | requested | B mappings | requested attributes; see `attributes` |
 | sides | B pairs of strings | requested content and side (Bandai set only); see `attributes` |
 | joints | (B, F, J, 3) | joint positions of generated motions in meters, y up, floor at y = 0 |
-| mask | (B, F) bool | True = real frame of a generated motion |
+| mask | (B, F) bool | True for real frames of a generated motion |
 | contacts | (B, F, 4) bool | generated contacts of `skeleton.feet`, if the features contain them |
-| kept | (B, F, J) bool | for edits: True = the edit must keep this joint in this frame |
+| kept | (B, F, J) bool | for edits: True if the edit must keep this joint in this frame |
 | keys | (B,) int64 | unique keys of generated motions |
 | real | (R, E) | features of real motions |
 | real_joints | (B, F, J, 3) | joint positions of real motions in meters, y up, floor at y = 0 |
-| real_mask | (B, F) bool | True = real frame of a real motion |
+| real_mask | (B, F) bool | True for real frames of a real motion |
 | real_keys | (R,) int64 | unique keys of real motions |
 | nearest, real_nearest | (B, 1 or 2) | distances to the nearest training motion; see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |

@@ -64,7 +64,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     whole-body actions, and gestures of the arms and the head.
 
     Args:
-        joints: (F, 22, 3) positions of SMPL's joints in meters, y up. The body may have any
+        joints: (F, 22, 3) positions of SMPL's joints in meters, with y up. The body may have any
             position and heading.
         fps: frames per second.
 
@@ -362,8 +362,8 @@ class AttributeAccuracy(Timed, MotionMean):
         """Adds B motions.
 
         Args:
-            joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
-            mask: (B, F) bool, True = real frame.
+            joints: (B, F, 22, 3) positions of SMPL's joints in meters, with y up.
+            mask: (B, F) bool, True for real frames.
             requested: B mappings from names of `ATTRIBUTES` to values, such as {"action": "walk",
                 "speed": "slow"}. Requests for which there is no rule are not counted.
             keys: (B,) int64, unique keys of the motions.
@@ -384,7 +384,7 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     above its shoulder determines the side. The side in the content's name is not used.
 
     Args:
-        joints: (F, 22, 3) positions of SMPL's joints in meters, y up.
+        joints: (F, 22, 3) positions of SMPL's joints in meters, with y up.
         content: content of the motion, such as "walk-turn-left" or "wave-left-hand".
         fps: frames per second.
     """
@@ -428,8 +428,8 @@ class SideAccuracy(Timed, MotionMean):
         """Adds B motions.
 
         Args:
-            joints: (B, F, 22, 3) positions of SMPL's joints in meters, y up.
-            mask: (B, F) bool, True = real frame.
+            joints: (B, F, 22, 3) positions of SMPL's joints in meters, with y up.
+            mask: (B, F) bool, True for real frames.
             sides: B pairs of requested content and side. Only requests for the left or right side
                 are counted.
             keys: (B,) int64, unique keys of the motions.

@@ -66,7 +66,7 @@ class View:
 
     @classmethod
     def of(cls, smooth: np.ndarray, fps: float) -> "View":
-        """Creates the view from smoothed joint positions (F, 22, 3) in meters, y up."""
+        """Creates the view from smoothed joint positions (F, 22, 3) in meters, with y up."""
         forward, left, turned = heading_of(smooth)
         return cls(smooth, fps, forward, left, turned, float(np.percentile(smooth[:, TOES, 1], 10)))
 

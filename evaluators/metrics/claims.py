@@ -58,8 +58,8 @@ class ClaimAccuracy(Timed, MotionMean):
         """Adds B motions.
 
         Args:
-            joints: (B, F, J, 3) positions in meters, y up.
-            mask: (B, F) bool, True = real frame.
+            joints: (B, F, J, 3) positions in meters, with y up.
+            mask: (B, F) bool, True for real frames.
             captions: B captions.
             keys: (B,) int64, unique keys of the motions.
 

@@ -232,7 +232,7 @@ class JointVariance(SampleMetric):
 
         Args:
             joints: (B, F, J, 3) positions in meters.
-            mask: (B, F) bool, True = real frame.
+            mask: (B, F) bool, True for real frames.
             groups: (B,) int64, keys of the texts.
             keys: (B,) int64, unique keys of the motions.
 

@@ -39,7 +39,7 @@ class PublishedPhysics(Timed, JointMean):
 
     higher_is_better = False
     summary = None
-    # The only frame rate at which the values are defined; None = any frame rate
+    # The only frame rate at which the values are defined, or None for any frame rate
     required_fps: float | None = None
 
     def __init__(self, fps: float, feet: Sequence[int] = FEET):
@@ -236,8 +236,8 @@ class KimodoQuality(PublishedPhysics):
         """Adds B motions.
 
         Args:
-            joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
-            mask: (B, F) bool, True = real frame.
+            joints: (B, F, J, 3) positions in meters, with y up and the floor at y = 0.
+            mask: (B, F) bool, True for real frames.
             keys: (B,) int64, unique keys of the motions.
             contacts: (B, F, 4) bool, predicted contacts of the feet. If None, the values that
                 require contacts are not computed.
@@ -319,10 +319,10 @@ class KimodoConstraints(MotionMean):
         """Adds B edits.
 
         Args:
-            joints: (B, F, J, 3) edited motions in meters, y up.
+            joints: (B, F, J, 3) edited motions in meters, with y up.
             real_joints: (B, F', J, 3) motions before editing, in the same order, F' >= F.
-            mask: (B, F) bool, True = real frame.
-            kept: (B, F, J) bool, True = the edit kept this joint in this frame.
+            mask: (B, F) bool, True for real frames.
+            kept: (B, F, J) bool, True if the edit kept this joint in this frame.
             keys: (B,) int64, unique keys of the edits.
 
         Raises:
@@ -447,8 +447,8 @@ class TransitionJerk(SampleMetric):
 
         Args:
             joints: (B, F, J, 3) positions in meters.
-            mask: (B, F) bool, True = real frame.
-            kept: (B, F, J) bool, True = the edit kept this joint in this frame.
+            mask: (B, F) bool, True for real frames.
+            kept: (B, F, J) bool, True if the edit kept this joint in this frame.
             keys: (B,) int64, unique keys of the motions.
 
         Raises:

@@ -84,8 +84,8 @@ class PositionErrors(MotionMean):
         """Compares B pairs of motions, each up to the end of the shorter motion.
 
         Args:
-            joints: (B, F, J, 3) generated motions in meters, y up.
-            mask: (B, F) bool, True = real frame.
+            joints: (B, F, J, 3) generated motions in meters, with y up.
+            mask: (B, F) bool, True for real frames.
             real_joints: (B, F', J, 3) real motions for the same texts, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the generated motions.
@@ -316,12 +316,12 @@ class DisplacementErrors(EditErrors):
 
         Args:
             joints: (B, F, J, 3) generated motions in meters.
-            mask: (B, F) bool, True = real frame.
+            mask: (B, F) bool, True for real frames.
             real_joints: (B, F', J, 3) real motions, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the generated motions.
-            kept: (B, F, J) bool, True = the edit kept this joint in this frame. None = everything
-                was generated.
+            kept: (B, F, J) bool, True if the edit kept this joint in this frame. If None,
+                everything was generated.
 
         Raises:
             UserError: If a motion contains NaN or infinity, or has no generated frames.
@@ -369,11 +369,11 @@ class KeptDrift(EditErrors):
 
         Args:
             joints: (B, F, J, 3) edited motions in meters.
-            mask: (B, F) bool, True = real frame.
+            mask: (B, F) bool, True for real frames.
             real_joints: (B, F', J, 3) motions before editing, in the same order.
             real_mask: (B, F') bool.
             keys: (B,) int64, unique keys of the edited motions.
-            kept: (B, F, J) bool, True = the edit kept this joint in this frame.
+            kept: (B, F, J) bool, True if the edit kept this joint in this frame.
 
         Raises:
             UserError: If a motion contains NaN or infinity.

@@ -58,8 +58,8 @@ def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> di
 
     Args:
         similarity: (N, N) similarities between texts (rows) and motions (columns).
-        correct: (N, N) bool, symmetric, True = correct pair. If there are several correct
-            candidates, the best one counts. None = only the diagonal is correct.
+        correct: (N, N) bool, symmetric, True for correct pairs. If there are several correct
+            candidates, the best one counts. If None, only the diagonal is correct.
 
     Returns:
         For retrieval of motions by text: the recall at several ranks (`t2m_top1` etc., in [0, 1])
@@ -97,7 +97,7 @@ class CaptionMetric(SampleMetric):
     `encoder`, if the cosine of their embeddings exceeds `SAME`.
 
     Args:
-        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
+        encoder: mapping with the `_target_` of a text encoder. If None, captions are compared as
             text.
         seed: seed of the random draws.
     """
@@ -153,7 +153,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     - `positives`: the mean number R of correct motions.
 
     Args:
-        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
+        encoder: mapping with the `_target_` of a text encoder. If None, captions are compared as
             text.
         pool: number of motions in a pool, as in `MotionsForText`.
         seed: seed of the pools.
@@ -258,7 +258,7 @@ class TMRRetrieval(CaptionMetric):
     complete.
 
     Args:
-        encoder: mapping with the `_target_` of a text encoder; None = captions are compared as
+        encoder: mapping with the `_target_` of a text encoder. If None, captions are compared as
             text.
         seed: seed of the batches.
         ids: file with the ids of the dissimilar motions, one per line, such as TMR's

@@ -15,7 +15,7 @@ from torchmetrics.utilities import dim_zero_cat
 from flame_mdm.errors import UserError
 
 Value = float | dict[str, float | None] | None
-"""Result of `compute`: a number, or numbers by name. None = there are no samples."""
+"""Result of `compute`: a number, numbers by name, or None if there are no samples."""
 
 Rows = Mapping[str, Any]
 """Inputs for N motions by their names in `evaluators.metrics`, such as tensors with N rows."""
@@ -28,10 +28,10 @@ class Declared:
         unit: unit of the values; "" = a number without a unit.
         units: units of the values whose unit differs from `unit`, keyed by name.
         directions: whether higher is better, keyed by name, for values to which `higher_is_better`
-            does not apply; None = neither direction is better.
+            does not apply. A value is None if neither direction is better.
         summary: name of the value that summarizes the other values, or None if there is no such
             value.
-        audited: names of the values that audits show; None = all values.
+        audited: names of the values that audits show, or None for all values.
         sees_meaning: whether the metric may detect that a motion does not show what was requested.
         exact: name of the value that evaluates the requested attributes without a network, or None
             if there is no such value.
@@ -55,7 +55,8 @@ class Declared:
     def direction_of(self, name: str) -> bool | None:
         """Returns whether higher is better for the value with this name.
 
-        None = neither direction is better, or the value for real motions is the best value.
+        The result is None if neither direction is better, or if the value for real motions is the
+        best value.
         """
         return self.directions.get(name, self.higher_is_better)
 
@@ -327,8 +328,8 @@ class JointMean(MotionMean):
         """Adds B motions.
 
         Args:
-            joints: (B, F, J, 3) positions in meters, y up, floor at y = 0.
-            mask: (B, F) bool, True = real frame.
+            joints: (B, F, J, 3) positions in meters, with y up and the floor at y = 0.
+            mask: (B, F) bool, True for real frames.
             keys: (B,) int64, unique keys of the motions.
 
         Raises:

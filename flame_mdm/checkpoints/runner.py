@@ -359,7 +359,7 @@ class Sampler:
         return x
 
     def decode(self, x: np.ndarray) -> np.ndarray:
-        """Converts normalized features (F, D) to joint positions (F, J, 3) in meters, y up."""
+        """Converts normalized features (F, D) to joint positions (F, J, 3) in meters, with y up."""
         shape = (1, len(x), len(self.content["skeleton"]["joints"]), 3)
         return self._run("joints", {"x": x[None]}, [shape])[0][0]
 

@@ -251,7 +251,7 @@ class WritingSettings:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """A model to sample from, and the body to draw (None = the mannequin)."""
+    """A model to sample from, and the body to draw (None for the mannequin)."""
 
     model: MotionGenerator
     body: Mesh | None

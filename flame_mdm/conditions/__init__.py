@@ -33,7 +33,7 @@ class ConditionEncoder(nn.Module, ABC):
     features: int
     #: Input of the encoder: captions ("text") or action labels ("action").
     reads: Literal["text", "action"] = "text"
-    #: Maximum number of words per caption; None = no limit.
+    #: Maximum number of words per caption, or None for no limit.
     max_words: int | None = None
     #: Words of the training captions, or None before they are known.
     seen: Collection[str] | None = None

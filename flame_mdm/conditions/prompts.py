@@ -50,7 +50,7 @@ def read_prompt(
         parts: for each part of a prompt such as "walks @3 | sits", its words and its duration in
             seconds. The duration is None if the prompt does not specify it.
         facts: facts about the model, such as its "vocabulary", "actions" and "captions".
-        max_words: maximum number of words that the model reads in a caption; None = no limit.
+        max_words: maximum number of words that the model reads in a caption, or None for no limit.
         splits: whether a sentence with several actions is split into one part per action. This
             applies only to prompts with a single part.
         check_words: whether to replace words for actions with the model's own words, and whether to

@@ -181,7 +181,7 @@ class LearnedTokens(ConditionEncoder):
         Args:
             rows: (T, 2), indices of the two table rows for each real token.
             index: (T,), positions of the tokens in the flattened `token_mask`.
-            token_mask: (N, S) bool, True = real token.
+            token_mask: (N, S) bool, True for real tokens.
         """
 
         def pad(y: Tensor) -> Tensor:

@@ -82,8 +82,8 @@ def vocabulary(
 
     Args:
         captions: all captions of the training clips.
-        shared: the captions that may be included in a checkpoint under the license of their data.
-            None = no captions.
+        shared: the captions that may be included in a checkpoint under the license of their data,
+            or None for no captions.
 
     Returns:
         "vocabulary" contains all words in the captions, sorted. Unless `shared` is None, "captions"
@@ -125,7 +125,7 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
         text: the prompt.
         facts: facts about the model, including its vocabulary. For imported models, whose
             vocabulary is unknown, words are not checked.
-        max_words: maximum number of words that the model reads; None = no limit.
+        max_words: maximum number of words that the model reads, or None for no limit.
     """
     lines = []
     if unknown := unknown_words(text, facts):

@@ -77,7 +77,7 @@ class ConfigSource(NamedTuple):
     """Location and kind of a configuration."""
 
     folder: Path
-    # Name of the file in `folder`, without suffix; None = an empty configuration
+    # Name of the file in `folder`, without suffix, or None for an empty configuration
     stem: str | None
     # Whether the configuration is already resolved, so that its parts cannot be replaced
     saved: bool = False

@@ -135,7 +135,7 @@ def hydra_sweep(
     Args:
         job: function that is called with the composed configuration of each job.
         folder: folder of the configuration.
-        stem: name of the configuration file, without suffix; None = an empty configuration.
+        stem: name of the configuration file, without suffix, or None for an empty configuration.
         words: Hydra overrides, which may contain several values to sweep over.
     """
     sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]

@@ -49,7 +49,7 @@ class Clip:
     # `motion` (F, D) then consists of these features and is stored unchanged. The name is empty if
     # `motion` is raw.
     encoded: str = ""
-    # First frame and length of the part of the motion that forms the clip. None = the entire
+    # First frame and length of the part of the motion that forms the clip, or None for the entire
     # motion. Consecutive clips with the same array object share its frames in the store. Windows
     # require a representation with one row per frame.
     window: tuple[int, int] | None = None

@@ -55,7 +55,7 @@ class Denoiser(nn.Module, ABC):
         Args:
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time, given as a row index into the sinusoidal table.
-            mask: (B, F) bool, True = real frame. See also `mask_padding`.
+            mask: (B, F) bool, True for real frames. See also `mask_padding`.
             cond: the condition. For samples whose condition was dropped, `cond` already contains
                 the null condition.
 

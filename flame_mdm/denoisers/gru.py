@@ -23,10 +23,10 @@ class MDMGRU(Denoiser):
         dropout: probability of dropout after the positional encoding.
         project_condition: whether to project the condition before it is added to the time
             embedding.
-        recur_over_batch: whether to recur from sample to sample instead of from frame to frame.
-            MDM's released code recurs from sample to sample because its axes are swapped. This
-            option is intended only for reproduction, because results then depend on the order of
-            the samples in the batch.
+        recur_over_batch: whether the recurrence runs over the samples of the batch instead of over
+            the frames. In MDM's released code, it runs over the samples because the axes are
+            swapped. This option is intended only for reproduction, because results then depend on
+            the order of the samples in the batch.
 
     Example:
         >>> denoiser = MDMGRU(6, 6, 4, latent_dim=8, num_layers=1, dropout=0.0)

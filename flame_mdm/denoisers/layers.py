@@ -51,7 +51,7 @@ class Attention(nn.Module):
 
         Args:
             x: (B, N, C), the queries.
-            mask: (B, S) bool, True = real entry; None = all entries are real.
+            mask: (B, S) bool, True for real entries, or None if all entries are real.
             memory: (B, S, C), the keys and values. Default: x.
         """
 
@@ -110,9 +110,9 @@ class TransformerLayer(nn.Module):
 
         Args:
             x: (B, N, C), the sequence.
-            mask: (B, N) bool, True = real entry; None = all entries are real.
+            mask: (B, N) bool, True for real entries, or None if all entries are real.
             memory: (B, S, C), the keys and values of cross-attention.
-            memory_mask: (B, S) bool, True = real entry; None = all entries are real.
+            memory_mask: (B, S) bool, True for real entries, or None if all entries are real.
         """
         x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
         if self.cross_attention is not None and self.cross_norm is not None:
@@ -151,9 +151,9 @@ class Transformer(nn.Module):
 
         Args:
             x: (B, N, C), the sequence.
-            mask: (B, N) bool, True = real entry; None = all entries are real.
+            mask: (B, N) bool, True for real entries, or None if all entries are real.
             memory: (B, S, C), the memory of a decoder. Encoders have none.
-            memory_mask: (B, S) bool, True = real entry; None = all entries are real.
+            memory_mask: (B, S) bool, True for real entries, or None if all entries are real.
         """
         for layer in self.layers:
             x = layer(x, mask, memory, memory_mask)

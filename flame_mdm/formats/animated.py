@@ -24,7 +24,7 @@ class AnimatedNodes:
     Attributes:
         names: names of the N nodes.
         parents: index of each node's parent, smaller than the node's own index, or -1 for a root.
-        positions: (F, N, 3), world positions of the nodes in meters, y up.
+        positions: (F, N, 3), world positions of the nodes in meters, with y up.
         fps: frames per second.
         animation: the name of the animation.
         humanoid: node index of each SMPL joint. Empty if the file does not declare which nodes form
@@ -46,7 +46,7 @@ def choose(animations: Sequence[tuple[str, Item]], requested: str | int | None) 
 
     Args:
         animations: name and content of each animation.
-        requested: the name or 1-based number of an animation. None = the first animation.
+        requested: the name or 1-based number of an animation, or None for the first animation.
 
     Raises:
         UserError: If there is no such animation.

@@ -75,7 +75,7 @@ def fit_body(motion: PosedFigure, body: Mesh | None = None) -> FittedBody:
     Args:
         motion: the clip. If the clip contains no rotations, they are computed from the joint
             positions.
-        body: the mesh; None = the mannequin.
+        body: the mesh, or None for the mannequin.
 
     Raises:
         UserError: If the skeleton is not SMPL's, if a limb is much longer or shorter than a

@@ -50,7 +50,7 @@ def bone_poses(
     Args:
         tree: the tree of joints in the file.
         layout: the skeleton of the file.
-        joints: (F, 22, 3), positions of SMPL's joints in meters, y up.
+        joints: (F, 22, 3), positions of SMPL's joints in meters, with y up.
         worlds: (F, J, 3, 3), world rotations of the J joints in the file.
         in_front: (J, 3, 3), the rest pose that precedes the motion, as rotations relative to the
             parents; None if there is no such pose.

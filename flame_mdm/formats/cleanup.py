@@ -58,7 +58,7 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 
     Args:
         motion: the motion.
-        contacts: (F, N), probability that each of `skeleton.feet` is on the floor. None = the
+        contacts: (F, N), probability that each of `skeleton.feet` is on the floor. If None, the
             contacts are estimated from the joints.
 
     Example:
@@ -89,12 +89,12 @@ def cleanup(
     these heights, or at 0 if this percentile is positive.
 
     Args:
-        joints: (F, J, 3), joint positions in meters, y up. Motions with fewer than 4 frames are
-            returned unchanged.
+        joints: (F, J, 3), joint positions in meters, with y up. Motions with fewer than 4 frames
+            are returned unchanged.
         fps: frames per second.
         skeleton: skeleton of the joints.
         contacts: (F, N), probability that each of `skeleton.feet` stays on the floor until the next
-            frame. With some representations, models predict these probabilities. None = the
+            frame. With some representations, models predict these probabilities. If None, the
             contacts are estimated from the height and speed of the toes.
 
     Returns:

@@ -36,7 +36,7 @@ class RawMotion:
     """A motion in the form that `Representation.encode` accepts.
 
     Attributes:
-        values: joint positions (F, J, 3) in meters, y up, or SMPL rotations (F, 75) as in
+        values: joint positions (F, J, 3) in meters, with y up, or SMPL rotations (F, 75) as in
             `representations.smpl.read_pose`.
         note: a line for the user if a body with different proportions was used, or "" otherwise.
             The line states the error, and whether the rotations come from the file or were fitted
@@ -80,8 +80,8 @@ def raw_motion(motion: Motion, representation: Representation) -> RawMotion:
 def kit_joints(joints: np.ndarray) -> np.ndarray:
     """Converts SMPL's joints (F, 22 or more, 3) to KIT-ML's 21 joints (F, 21, 3).
 
-    The result is mirrored, as in KIT-ML. The joint that KIT-ML has in the middle of each foot is
-    placed halfway between the ankle and the toes.
+    The result is mirrored, as in KIT-ML. KIT-ML's mid-foot joints are placed halfway between the
+    ankle and the toes.
     """
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     feet = {

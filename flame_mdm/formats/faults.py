@@ -204,7 +204,7 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures how deep an arm penetrates the body.
+    """Measures how deeply an arm penetrates the body.
 
     The trunk and the thighs are modeled as capsules, whose sizes are derived from the bones.
 

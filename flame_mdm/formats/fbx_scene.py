@@ -183,7 +183,8 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name or 1-based number of the take. None = the first take that contains keys.
+        animation: name or 1-based number of the take, or None for the first take that contains
+            keys.
 
     Raises:
         UserError: If the file is damaged, contains no animation, or contains several animation

@@ -1,4 +1,4 @@
-"""Writes a motion with its skeleton and skin as an FBX file: binary 7.4, centimeters, y up.
+"""Writes a motion with its skeleton and skin as an FBX file: binary 7.4, in centimeters, with y up.
 
 The structure of the scene is the same as in files written by Autodesk's FBX SDK. Some details are
 required only by certain programs, which are named in comments. The bones are at the top level of

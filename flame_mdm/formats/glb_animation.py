@@ -152,8 +152,8 @@ def read(path: Path, animation: str | int | None = None) -> AnimatedNodes:
 
     Args:
         path: the file.
-        animation: name or 1-based number of the animation. None = the first animation that moves
-            nodes.
+        animation: name or 1-based number of the animation, or None for the first animation that
+            moves nodes.
 
     Raises:
         UserError: If the file is damaged or has no such animation.

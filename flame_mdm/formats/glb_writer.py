@@ -1,4 +1,7 @@
-"""Writes a motion with its skeleton and skin as a .glb file: meters, y up, facing +z at rest."""
+"""Writes a motion with its skeleton and skin as a .glb file.
+
+The file is in meters, with y up and the rest pose facing +z.
+"""
 
 from pathlib import Path
 from typing import Any

@@ -5,7 +5,7 @@ relative to this root. Motions are cut in this representation, so that the last 
 be the first pose of the next. Afterward, the path of the root is added back, and inverse kinematics
 keeps each foot in place while it is on the floor.
 
-Arrays contain the positions of the 22 SMPL joints in F frames, in meters, y up. Angles are in
+Arrays contain the positions of the 22 SMPL joints in F frames, in meters, with y up. Angles are in
 radians; positive angles turn to the left.
 """
 

@@ -58,7 +58,7 @@ Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
 class Layout(BaseModel):
-    """A map from the joints in files to SMPL's 22 joints, whose positions are in meters, y up.
+    """A map from the joints in files to SMPL's 22 joints, whose positions are in meters, with y up.
 
     The fields are the keys of `skeleton.yaml`.
     """
@@ -148,7 +148,7 @@ class Layout(BaseModel):
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
         """Maps joints (F, J, 3) with the given names to SMPL's joints (F, 22, 3).
 
-        The result is float32, in meters, y up.
+        The result is float32, in meters, with y up.
         """
         weights = np.zeros((len(SMPL22), len(names)))
         for row, joint in zip(weights, SMPL22.joints, strict=True):
@@ -157,7 +157,7 @@ class Layout(BaseModel):
         return self.turn(weights @ positions).astype(np.float32)
 
     def turn(self, positions: np.ndarray) -> np.ndarray:
-        """Converts positions (F, J, 3) to meters, y up."""
+        """Converts positions (F, J, 3) to meters, with y up."""
         return (
             self.unit
             * positions

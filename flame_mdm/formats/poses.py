@@ -116,7 +116,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
     from pelvis to chest. All other joints, including the head, hands and toes, follow their parent.
 
     Args:
-        joints: (F, 22, 3), joint positions in the order of `SMPL22`, in meters, y up.
+        joints: (F, 22, 3), joint positions in the order of `SMPL22`, in meters, with y up.
         fps: frames per second.
 
     Raises:

@@ -134,11 +134,11 @@ def read(
         unit: meters per unit of length in the file. Does not apply to files with SMPL's rotations,
             such as AMASS files.
         up: the up axis of the file: y, z or -y.
-        resample_to: target frame rate; None = the frame rate of the file. Rotations are
+        resample_to: target frame rate, or None for the frame rate of the file. Rotations are
             interpolated on the sphere. Joint positions and translations are interpolated with cubic
             splines.
-        animation: name or 1-based number of an animation in an FBX or GLB file; None = the first
-            animation.
+        animation: name or 1-based number of an animation in an FBX or GLB file, or None for the
+            first animation.
 
     Returns:
         The motion. Its `notes` state what was left out and what looks wrong.
@@ -201,7 +201,7 @@ def read_recording(
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
-    """Converts joints (F, J, 3) in meters, y up, to a motion.
+    """Converts joints (F, J, 3) in meters, with y up, to a motion.
 
     The skeleton is the built-in skeleton with the same number of joints.
     """
@@ -277,7 +277,7 @@ def _of_scene(
 ) -> Recording:
     """Reads the recording in a file with animated nodes.
 
-    The positions are in meters, y up, unless `fields` specify otherwise.
+    The positions are in meters, with y up, unless `fields` specify otherwise.
     """
     _refuse(fields, ["joints"], "FBX and GLB files contain the names of their joints")
     scene = scenes.read(path, animation)
@@ -398,7 +398,7 @@ def _of_ours(
 ) -> Recording:
     """Returns the recording in a file that this project wrote.
 
-    Such a file is in meters, y up, and may contain rotations and features.
+    Such a file is in meters, with y up, and may contain rotations and features.
     """
     for key, value in said.items():
         raise UserError(

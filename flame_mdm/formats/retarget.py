@@ -56,7 +56,7 @@ def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def preset(name: str | None, poses: Poses) -> Rig:
-    """Returns a skeleton from `rigs.yaml` (None = SMPL's skeleton) with a body's bone lengths."""
+    """Returns a skeleton from `rigs.yaml` (None for SMPL's skeleton) with a body's bone lengths."""
     if name is None:
         same, sources = np.tile(np.eye(3), (len(SMPL22), 1, 1)), tuple(range(len(SMPL22)))
         return Rig(

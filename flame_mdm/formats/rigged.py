@@ -234,7 +234,7 @@ def rigged(
         name: name of the animation.
         fps: frames per second.
         skeleton: the skeleton, with the bone lengths of the body.
-        fitted: the person's body, with toes that bend as in rendered images. None = no skin.
+        fitted: the person's body, with toes that bend as in rendered images, or None for no skin.
         root_motion: whether the root on the floor follows the position and direction of the hips.
             Otherwise, the root stays in place.
 

@@ -11,7 +11,7 @@ TIP = re.compile(r"[_. ]?(end|nub|tip)(site)?$", re.IGNORECASE)
 
 
 def read(path: Path, animation: str | None = None) -> AnimatedNodes:
-    """Reads an animation, given by its name or 1-based number; None = the first animation.
+    """Reads an animation, given by its name or 1-based number, or None for the first animation.
 
     Raises:
         UserError: If the file is damaged or contains no such animation. See the readers of both

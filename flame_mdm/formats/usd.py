@@ -21,7 +21,7 @@ from flame_mdm.safe_io import atomic_write
 
 
 def write(path: Path, clip: RiggedClip) -> None:
-    """Writes a clip in meters, y up. Raises `UserError` if usd-core is not installed."""
+    """Writes a clip in meters, with y up. Raises `UserError` if usd-core is not installed."""
     try:
         from pxr import Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
     except ImportError as error:

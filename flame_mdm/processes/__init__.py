@@ -114,7 +114,7 @@ class Process(nn.Module, ABC):
         Args:
             denoise: the denoiser.
             x: (B, F, D) normalized clean motion.
-            mask: (B, F) bool, True = real frame.
+            mask: (B, F) bool, True for real frames.
             cond: conditions of the batch.
             t: (B,) times. Default: drawn from torch's default generator.
             noise: (B, F, D). Default: drawn from torch's default generator.
@@ -166,7 +166,7 @@ class Process(nn.Module, ABC):
             denoise: the denoiser, with or without guidance; `options.guidance_scale` is ignored.
             noise: function that maps the draw index (0, 1, 2, ...) to noise (B, F, D). Sampling
                 starts from draw 0.
-            mask: (B, F) bool, True = real frame.
+            mask: (B, F) bool, True for real frames.
             cond: conditions of the batch.
             options: the sampler, its number of steps and its options.
             edit: the part of a motion that sampling keeps. Default: nothing is kept.

@@ -42,7 +42,7 @@ def consistency_terms(
             gradients. It is the student itself, or a copy with averaged weights.
         teacher: the guided teacher.
         x: (B, F, D) normalized clean motion.
-        mask: (B, F) bool, True = real frame.
+        mask: (B, F) bool, True for real frames.
         cond: conditions of the batch.
         times: (N,) times, starting from pure noise; see `Process.grid`.
         index: (B,) int64, the index of each motion's time in `times`, from 0 to N - 1.

@@ -50,7 +50,7 @@ class GaussianDiffusion(Process):
             velocity, but the loss is the error of the noise. The network does not need to copy its
             input to its output, and the clean estimate is computed without division by the signal.
         min_snr: maximum weight of a step. The squared error is weighted as if the clean motion were
-            predicted with weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). None =
+            predicted with weight min(SNR, min_snr) (Hang et al. 2023, eq. 4; they use 5). If None,
             every step has weight 1, regardless of the prediction.
         noise_scale: factor by which the noise-to-signal ratio of each step is multiplied. For
             motions with 263 interdependent features, the text is informative only at high noise

@@ -155,7 +155,7 @@ def reach(
         positions: the positions to reach.
         bones: (3, N) int64, the frame, parent and child of each bone. All bones are listed for each
             frame in which the change could affect their lengths.
-        free: (B, F, D) bool, True = this feature may change.
+        free: (B, F, D) bool, True if this feature may change.
         smoothness: standard deviation of the Gaussian process, in frames.
 
     Returns:

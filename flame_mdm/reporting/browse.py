@@ -22,7 +22,7 @@ SECONDS = 15  # only the first seconds of a longer clip are shown, to keep the p
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
-    """Returns the clips of a split (None = all splits) that match a search.
+    """Returns the clips of a split (None for all splits) that match a search.
 
     A clip matches if its id and captions contain all words in `search`. The search ignores case.
     Each clip is grouped with its mirrored copy, and the original comes first. A group matches if

@@ -62,7 +62,7 @@ class HumanML(Representation):
         variant: "clean" for the intended features, "legacy" for the published features.
         fps: frames per second.
         bone_lengths: for each of the J joints, the length of the bone that ends there, in the
-            features' unit. All motions are retargeted to these lengths. None = each motion keeps
+            features' unit. All motions are retargeted to these lengths. If None, each motion keeps
             its own bone lengths.
         units_per_metre: how many of the features' length units make up one meter.
         contact_threshold: squared displacement of a foot per frame, in the features' unit, below

@@ -15,10 +15,10 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 class Rot6D(Representation):
     """The 25 x 6 unnormalized features of Petrovich et al. 2021 (ACTOR).
 
-    The features are 24 rotations as 6D vectors of the kind "rows", followed by (x, y, z, 0, 0, 0).
-    (x, y, z) is the root's translation relative to the first frame. The translation is in meters
-    and in camera coordinates, where y points down and z points away from the camera. See
-    `smpl.read_pose` for the layout of raw motions.
+    The features are 24 rotations as 6D vectors in the "rows" convention, followed by
+    (x, y, z, 0, 0, 0). (x, y, z) is the root's translation relative to the first frame. The
+    translation is in meters and in camera coordinates, where y points down and z points away
+    from the camera. See `smpl.read_pose` for the layout of raw motions.
 
     Args:
         fps: frames per second.

@@ -59,8 +59,8 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """The 147 unnormalized features of Kim et al. 2023 (FLAME).
 
-    The features are the translation (3) and 24 rotations as 6D vectors of the kind "rows". As in
-    AMASS, the coordinates are world coordinates in meters, with z up. The motion is neither
+    The features are the translation (3) and 24 rotations as 6D vectors in the "rows" convention. As
+    in AMASS, the coordinates are world coordinates in meters, with z up. The motion is neither
     centered nor rotated. See `read_pose` for the layout of raw motions.
 
     Args:

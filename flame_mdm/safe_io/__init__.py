@@ -413,7 +413,7 @@ def read_npz(
     Args:
         source: the path or an open, seekable file.
         skip: names of the arrays to skip.
-        only: names of the arrays to read; None = all arrays.
+        only: names of the arrays to read, or None for all arrays.
 
     Raises:
         UserError: If the file is damaged, contains objects, or exceeds the limits of this module.
@@ -527,7 +527,7 @@ def check_members(count: int) -> None:
 
 
 class _DirectoryReader:
-    """A file from which at most `limit` bytes can be read at once; None = no limit."""
+    """A file from which at most `limit` bytes can be read at once, or any number if it is None."""
 
     def __init__(self, file: IO[bytes]):
         self.file, self.limit = file, DIRECTORY_LIMIT

@@ -123,8 +123,8 @@ def remove_abandoned(folder: Path, path: Path | None = None, *, is_locked: bool 
 
     Args:
         folder: the folder that contains the temporary files and folders.
-        path: the file or folder whose temporary files are removed. None = all temporary files in
-            the folder.
+        path: the file or folder whose temporary files are removed, or None for all temporary files
+            in the folder.
         is_locked: whether this process holds the lock that is required for writing such files. If
             it does, files from processes on other machines are also removed. Otherwise, these files
             are kept, because their processes may still be alive.

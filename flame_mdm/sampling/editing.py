@@ -50,7 +50,7 @@ class Edited(Motion):
 
     #: The motion before editing.
     original: Motion
-    #: (F, D) bool, True = this feature should be kept in this frame.
+    #: (F, D) bool, True if this feature should be kept in this frame.
     keep: np.ndarray
     #: Maximum change of the kept features, which are normalized. It is 0 if the method is exact.
     feature_error: float
@@ -66,8 +66,8 @@ class ResolvedEdit:
     Attributes:
         resolved: the resolved request, which includes the kept part.
         original: the original motion, with features in the model's representation.
-        keep: (F, D) bool, True = keep this feature in this frame.
-        kept_joints: (F, J) bool, True = keep this joint in this frame.
+        keep: (F, D) bool, True if this feature is kept in this frame.
+        kept_joints: (F, J) bool, True if this joint is kept in this frame.
     """
 
     resolved: ResolvedRequest

@@ -300,8 +300,8 @@ class Streams(Iterator[list[Motion]]):
         conditions: B texts or actions with which the streams begin, or "" for unconditioned
             motions.
         prefix: (B, C, D) normalized features of the frames before the streams.
-        placement: placement of the first frames in the world. None = each stream starts at x = z =
-            0, facing +z.
+        placement: placement of the first frames in the world. If None, each stream starts at
+            x = z = 0, facing +z.
         options: sampler options. Options that are None default to the model's values.
         kind: "text", "action", or "none" for unconditioned motions.
         seed: seed of the noise.

@@ -28,7 +28,7 @@ MAX_SPEED = 8.0
 REACH = 2.5
 # Maximum number of coordinates of all targets. Every sampling step solves for all of them together.
 MAX_COORDINATES = 600
-# Coordinate in meters; None = free
+# Coordinate in meters, or None if it is free
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)] | None
 # x and z of a position on the floor
 OnFloor = Annotated[Sequence[Coordinate], Field(min_length=2, max_length=2)]
@@ -97,7 +97,7 @@ class PositionGuide:
     bones: Tensor
     # (1, F, D) features of the poses, which are always imposed
     poses: Tensor
-    # (1, F, D) bool, True = impose this feature
+    # (1, F, D) bool, True if this feature is imposed
     keep: Tensor
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:

@@ -343,9 +343,9 @@ class SampleMotions(Callback):
             `step_0001000`.
         every_n_steps: minimum number of steps between samples. Samples are generated when the model
             is validated, and after training.
-        prompts: texts, action names, or (text, requested attributes) pairs; None =
-            `UNCONDITIONED` motions without prompts. If a model is conditioned on actions and no
-            prompt is an action, the model's first actions are used instead.
+        prompts: texts, action names, or (text, requested attributes) pairs. If None,
+            `UNCONDITIONED` motions are generated without prompts. If a model is conditioned on
+            actions and no prompt is an action, the model's first actions are used instead.
         seconds: length of the motions in seconds.
         metrics: torchmetrics metrics, keyed by name. Their `update` methods take some of the
             arguments joints (B, F, J, 3), mask (B, F), keys and requested.

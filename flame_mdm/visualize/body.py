@@ -44,15 +44,15 @@ class Figure:
     """A moving skeleton to show in players and images, such as a `flame_mdm.formats.motion.Motion`.
 
     Attributes:
-        joints: (F, J, 3), joint positions in meters, y up, with the floor at y = 0.
+        joints: (F, J, 3), joint positions in meters, with y up and the floor at y = 0.
         fps: frames per second.
         skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the
             sides.
         text: the caption or the name of the action, or "" if there is neither.
         id: the name of the clip or file. For a generated motion, the text and the sample number,
             which together determine the noise.
-        contacts: (F, N) bool, whether each joint in `skeleton.feet` is on the floor; None =
-            unknown.
+        contacts: (F, N) bool, whether each joint in `skeleton.feet` is on the floor, or None if
+            this is unknown.
     """
 
     joints: np.ndarray
@@ -65,8 +65,8 @@ class Figure:
     def try_fit(self, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
         """Returns the fitted body and "", or None and the reason why no body fits.
 
-        `body` is the mesh to fit; None = the mannequin. Fitting requires the joint rotations. If no
-        body fits, a skeleton is drawn instead.
+        `body` is the mesh to fit, or None for the mannequin. Fitting requires the joint rotations.
+        If no body fits, a skeleton is drawn instead.
         """
         return None, "its joint rotations are unknown"
 

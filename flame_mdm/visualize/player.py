@@ -70,7 +70,7 @@ def player_page(
             For example, an edited motion is shown next to its original.
         marks: for each motion, the spans of frames to mark on the timeline. Each span consists of
             its first frame, its end (exclusive), its kind and a description.
-        body: the body to draw; None = the mannequin.
+        body: the body to draw, or None for the mannequin.
     """
     blank = [""] * len(motions)
     rows = zip(motions, groups or blank, beside or blank, marks or [()] * len(motions), strict=True)

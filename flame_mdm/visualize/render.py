@@ -46,7 +46,7 @@ def write_gif(
     Each motion is shown in a panel that is `size` pixels wide. GIF allows at most 50 frames per
     second, so the highest frame rate of the motions is divided by the smallest integer that results
     in 50 or less. For example, 60 fps becomes 30 fps, and 120 fps becomes 40 fps. Shorter motions
-    hold their last frame. `body` is the body to draw; None = the mannequin.
+    hold their last frame. `body` is the body to draw, or None for the mannequin.
     """
     path = target(path, motions)
     fps = max(motion.fps for motion in motions)
@@ -295,9 +295,10 @@ def _rasterize(
     """Draws triangles on an image. Each pixel shows the triangle nearest to the camera.
 
     Colors are interpolated between the corners. The image has the shape (height, width, 3) and the
-    type uint8. `at` (V, 2) contains the pixel coordinates of the vertices, y down. `depth` (V,)
-    contains their distances from the camera, and `colors` (V, 3) contains values from 0 to 255.
-    Triangles (T, 3) whose corners appear clockwise are seen from inside, so they are not drawn.
+    type uint8. `at` (V, 2) contains the pixel coordinates of the vertices, with y pointing down.
+    `depth` (V,) contains their distances from the camera, and `colors` (V, 3) contains values from
+    0 to 255. Triangles (T, 3) whose corners appear clockwise are seen from inside, so they are not
+    drawn.
     """
     lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
     highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)

@@ -73,7 +73,8 @@ class Body:
     ):
         """`width` is half the distance between the feet, in meters, or a range for this value.
 
-        If `width` is a range, the value is drawn from it. None = the width of a relaxed stance.
+        If `width` is a range, the value is drawn from it. If None, the value of a relaxed stance
+        is used.
         """
         self.t = t
         half = rng.uniform(width[0], width[1]) if isinstance(width, Sequence) else width
@@ -114,7 +115,7 @@ class Body:
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
 
     def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
-        """Blends the current pose of an arm with another pose, whose weight is `weight` (F,).
+        """Blends the current pose of an arm with another pose, weighted by `weight` (F,).
 
         The other pose consists of four angles: forward, sideways, outward rotation and elbow bend.
         """

@@ -55,7 +55,7 @@ class Cell:
 
 @dataclass
 class Line:
-    """One row of a table, with one cell per column; None = no value."""
+    """One row of a table, with one cell per column. Cells without a value are None."""
 
     label: str
     kind: str  # a key of `KINDS`

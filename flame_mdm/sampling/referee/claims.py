@@ -27,11 +27,11 @@ class Claim:
         direction: "forward", "backward", "left", "right", "clockwise" or "counterclockwise"; "" =
             any direction.
         speed: "slow" or "fast"; "" = any speed.
-        amount: number of repetitions or steps, or the angle of a turn in degrees; None = not
+        amount: number of repetitions or steps, or the angle of a turn in degrees; None if not
             stated.
         when: "start" or "end" if the claim is about the start or the end of the motion; "" = at any
             time.
-        seconds: claimed duration; None = not stated.
+        seconds: claimed duration, or None if not stated.
         parts: for a claim about order, the claims about the two events, in the claimed order.
     """
 

@@ -27,8 +27,8 @@ class Reading:
         unclear: reason why the claim is undecided despite a high score; "" = none.
         signal: values (F,) that show in which frames the claim is true, or None if single frames
             cannot show this.
-        level: minimum value of `signal` at which the claim is true; None = the middle of the kind's
-            band.
+        level: minimum value of `signal` at which the claim is true, or None for the middle of the
+            kind's band.
     """
 
     score: float

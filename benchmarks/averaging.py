@@ -16,6 +16,7 @@ from flame_mdm.config import compose, instantiate
 from flame_mdm.training.averaging import MovingAverage
 
 SIZES = {"quickstart": "quickstart", "full size": "humanml3d/mdm"}
+TINY = ["denoiser.num_layers=1", "denoiser.latent_dim=16", "denoiser.ff_size=32"]
 LIGHTNING = "Lightning's EMAWeightAveraging"
 DECAY = 0.999
 
@@ -54,7 +55,7 @@ def measure(settings: Settings) -> Section:
     rows: list[Row] = []
     faster: dict[str, float] = {}
     for name, recipe in SIZES.items():
-        config = compose(recipe)["denoiser"]
+        config = compose(recipe, TINY if settings.quick else [])["denoiser"]
         network = instantiate(config, in_features=263, out_features=263, cond_features=512)
         millions = sum(p.numel() for p in network.parameters()) / 1e6
 

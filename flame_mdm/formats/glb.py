@@ -9,6 +9,7 @@ import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -47,6 +48,8 @@ DOCUMENT_LIMIT = 16 * MEBIBYTE
 MAX_NODES, MAX_ITEMS = 4096, 65_536
 # Maximum absolute value of a coordinate or matrix entry
 LARGEST = 1e9
+# For each corner of a box (8, 3), whether each coordinate is the minimum (0) or the maximum (1)
+CORNERS = np.array([*product((0, 1), repeat=3)])
 HARMLESS = re.compile(r"KHR_(materials|texture|lights|mesh|draco)_|EXT_texture_|VRM")
 """Extensions that a character may require, because they do not change nodes, skins or bounds."""
 
@@ -289,7 +292,7 @@ def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
         raise ValueError("a mesh has no bounds for its positions")
     box = np.array([accessor.min, accessor.max], float)
     box /= WHOLE.get(accessor.componentType, 1) if accessor.normalized else 1
-    return np.array([box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    return box[CORNERS, np.arange(3)]
 
 
 def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:

@@ -338,7 +338,7 @@ The wide models override `denoiser.latent_dim`, `denoiser.ff_size` (four times t
 
 
 def memory_page() -> str:
-    """Returns the content of memory.md: the memory that training takes for the recipes in `SIZES`."""
+    """Returns the contents of memory.md: the memory for training the recipes in `SIZES`."""
     rows = []
     for label, (recipe, words) in SIZES.items():
         config = compose(recipe, words)

@@ -145,7 +145,7 @@ class Protocol(ClosedSchema):
     quick: bool = False
     #: Whether the number of motions differs from the number in the file, set by `resized`.
     resized_samples: bool = False
-    #: Hash of the content of the file, set by `load_protocol`.
+    #: Hash of the contents of the file, set by `load_protocol`.
     sha256: str = ""
 
     def resized(
@@ -298,7 +298,7 @@ class Protocol(ClosedSchema):
         return self.replications * rows + again
 
     def check(self, clips: Clips, model: MotionGenerator | None) -> None:
-        """Checks that the clips and the model fit the protocol.
+        """Checks that the clips and the model match the protocol.
 
         Raises `UserError` if there are no clips, if a caption or label is missing, or if the model
         uses a different condition.

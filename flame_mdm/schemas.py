@@ -72,7 +72,7 @@ _adapter = functools.cache(TypeAdapter)
 
 
 def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
-    """Converts the content of a file to a `Schema` or another type that pydantic supports.
+    """Converts the contents of a file to a `Schema` or another type that pydantic supports.
 
     Dataclasses require `strict=False`, which also accepts the string "1" as a number.
 
@@ -91,7 +91,7 @@ def check_shape(content: Any, kind: type[T] | Any, strict: bool = True) -> T:
 
 
 def check_plain(content: Mapping[str, Any], kind: type[T] | Any, path: Path) -> T:
-    """Converts the content of an untrusted file, which may contain only plain values.
+    """Converts the contents of an untrusted file, which may contain only plain values.
 
     The content is converted as in `check_shape`. Raises a `UserError` that names `path` if the
     conversion fails, or if the content is nested too deeply or contains itself.

@@ -195,7 +195,10 @@ def test_damaged_files_are_named(store, tmp_path, subtests):
         ),
         ([clip("a"), clip("a")], "two clips have the same id"),
         ([clip("a", "test")], "no clip is in the training split"),
-        ([clip("a", motion=np.zeros((9, 263)), encoded="other")], "clip a: its features are other"),
+        (
+            [clip("a", motion=np.zeros((9, 263)), encoded="other")],
+            "clip a: its features are in the other representation",
+        ),
         (
             [clip("a", motion=np.zeros((9, 5)), encoded=ENCODED)],
             r"clip a: its features have shape \(9, 5\), not \(frames, 263\)",

@@ -556,7 +556,7 @@ def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):
     for change, message in (
         ({"base": "0" * 64}, r"a model with other weights \(hash 000000000000"),
         ({"rank": "2"}, "rank"),
-        ({"rows": [10**6]}, "does not fit the weights"),
+        ({"rows": [10**6]}, "does not match the weights"),
         (None, "not an adapter"),
     ):
         with subtests.test(change=change, message=message):

@@ -232,7 +232,7 @@ def test_up_of_commands_and_of_json_files_acts(tmp_path: Path, subtests):
     with pytest.raises(UserError, match="up: down"):
         read(tmp_path / "a.json")
     motion.save(tmp_path / "ours.npz")
-    with pytest.raises(UserError, match="up=z has no effect: this project wrote the file"):
+    with pytest.raises(UserError, match="up=z has no effect: the file was written by this package"):
         read(tmp_path / "ours.npz", up="z")
 
 

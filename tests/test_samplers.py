@@ -611,7 +611,10 @@ REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {
     ],
     FlowMatching: [
         ({"sampler": "ddim"}, "FlowMatching: euler, midpoint, heun, rk4, dopri5"),
-        ({"sampler": "euler", "num_inference_steps": [0, 2]}, "a flow takes equal steps"),
+        (
+            {"sampler": "euler", "num_inference_steps": [0, 2]},
+            "flow matching uses steps of equal size",
+        ),
         (
             {"sampler": "euler", "spacing": "stride"},
             "spacing=stride: the sampler euler does not support this option",

@@ -264,7 +264,7 @@ def other_graph(kind: str) -> bytes:
 @pytest.mark.parametrize(
     ("kind", "says"),
     [
-        ("shape", "denoiser.onnx does not fit model.json"),
+        ("shape", "denoiser.onnx does not match model.json"),
         ("inputs", "denoiser.onnx cannot run: "),
         ("logarithm", "the model returned non-finite numbers"),
     ],

@@ -100,7 +100,7 @@ def main(model: str | None) -> None:
 
 
 def measured(model: MotionGenerator, name: str) -> dict[str, Any]:
-    """Returns the content of streams.json for a model.
+    """Returns the contents of streams.json for a model.
 
     Args:
         model: a model that continues frames.
@@ -345,7 +345,7 @@ def is_shown(motion: np.ndarray, attributes: Attributes, fps: float) -> bool:
 
 
 def page(results: dict[str, Any]) -> str:
-    """Returns the content of streams.md."""
+    """Returns the contents of streams.md."""
     low, seams, shown = results["lowest_toe"], results["seams"], results["recognized"]
     cleaned = results["cleaned_toes"]
     ratio = results["jitter_last_minute"] / results["jitter_first_minute"]

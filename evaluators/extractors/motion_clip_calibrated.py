@@ -25,7 +25,7 @@ from flame_mdm.seeds import key
 NEAR_MISSES = 2
 # Standard deviation, in meters, of noise on the joints at strength 1
 JITTER = 0.02
-# Standard deviation, in normalized features, of noise on the features at strength 1. This noise
+# Standard deviation, in normalized features, of noise in the features at strength 1. This noise
 # moves joints by about 20 mm.
 FEATURE_NOISE = 0.3
 # Weight of `calibration_error` relative to `info_nce`

@@ -83,9 +83,9 @@ class MBenchQuality(PublishedPhysics):
     - `foot_floating`: number of frames in which the body moves without the support of a foot,
       divided by the total number of frames. The value can exceed 1.
 
-    A toe is in contact if it moves less than 1 cm per frame, even in the air, or if it is lower
-    than 2 cm. The published code uses z as the height, although y is the height in its pipeline.
-    This implementation uses y.
+    A toe counts as in contact if it moves less than 1 cm per frame (even in the air) or is below
+    2 cm. The published code uses z as the height, although y is the height in its pipeline. This
+    implementation uses y.
 
     Args:
         fps: frames per second of the motions. For rates other than 20, `compute` raises
@@ -197,7 +197,7 @@ class KimodoQuality(PublishedPhysics):
       fraction is 0, the first two values are also 0.
     - `skate_from_contacts`, `skate_max`: mean and maximum speeds of heels and toes in contact.
     - `contact_consistency`: fraction of contacts that agree with a heuristic (slower than 0.15 m/s
-      and lower than 10 cm). Higher is better.
+      and below 10 cm). Higher is better.
 
     Speeds are computed in three dimensions. For motions with a single frame, speeds are undefined.
 

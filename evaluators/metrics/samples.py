@@ -96,7 +96,7 @@ class SampleMetric(Declared, Metric):
 
     Therefore, the value does not depend on the batches, their order or the number of ranks, and a
     rank may have no samples. Subclasses implement the formula in `value`. If a metric draws at
-    random, its argument `seed` determines the draws.
+    random, its `seed` argument determines the draws.
 
     A class also declares the properties that are needed to interpret its values; see `Declared`.
 

@@ -136,7 +136,7 @@ def copy_weights(model: MotionGenerator, base: str | Path) -> None:
         model.load_state_dict(state)
     except RuntimeError as error:
         raise UserError(
-            f"base={base}: its weights do not fit the recipe: {first_line(error)}"
+            f"base={base}: its weights do not match the recipe: {first_line(error)}"
         ) from error
 
 
@@ -242,7 +242,7 @@ def _merge(
             state[name] = changed(state[name].float(), parts, rows, strength)
     except (KeyError, RuntimeError, IndexError) as error:
         raise UserError(
-            f"{path} is damaged: the adapter does not fit the weights ({first_line(error)})"
+            f"{path} is damaged: the adapter does not match the weights ({first_line(error)})"
         ) from error
 
 

@@ -155,7 +155,7 @@ class _Metadata(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Returns the content of a checkpoint or model file after checking it.
+    """Returns the contents of a checkpoint or model file after checking it.
 
     The content must include metadata, weights, and a recipe that consists of plain values.
     """

@@ -91,7 +91,7 @@ def write_folder(model: MotionGenerator, out: str | Path, *, half: bool = False)
 
 
 def description(model: MotionGenerator) -> dict[str, Any]:
-    """Returns the content of `model.json`, without the hashes of the graphs.
+    """Returns the contents of `model.json`, without the hashes of the graphs.
 
     Raises:
         UserError: If a value is outside the limits of the runner, or if the sampler cannot be

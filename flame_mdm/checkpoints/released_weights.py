@@ -74,7 +74,7 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
 
 
 def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
-    """Extracts the network's state dict from the content of a released file.
+    """Extracts the network's state dict from the contents of a released file.
 
     The content is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with
     `--use_ema`) or FLAME's Lightning checkpoint with "state_dict". If `ema` is True and the file

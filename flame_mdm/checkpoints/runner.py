@@ -195,7 +195,7 @@ def check(content: Any) -> None:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Returns the content of a regular file of at most `most` bytes.
+    """Returns the contents of a regular file of at most `most` bytes.
 
     Raises `ValueError` for any other file, and `OSError` if the file cannot be read.
     """
@@ -392,7 +392,7 @@ class Sampler:
                 f"{name}.onnx cannot run: {first_line(error)}. Export the model again"
             ) from error
         if [np.shape(output) for output in outputs] != list(shapes):
-            raise ValueError(f"{name}.onnx does not fit model.json. Export the model again")
+            raise ValueError(f"{name}.onnx does not match model.json. Export the model again")
         return outputs
 
     def _condition(self, prompt: str) -> dict[str, np.ndarray]:

@@ -24,7 +24,8 @@ class ConvertSettings(BodySettings, WritingSettings, FileSettings):
            flame-mdm convert FOLDER OUT format=glb ...
 
     Converts a motion file, or all motion files in a folder and its subfolders. Uses the nearest
-    skeleton.yaml, in the file's folder or a folder above it; see docs/own-data.md.
+    skeleton.yaml, either in the file's folder or in one of its parent folders; see
+    docs/own-data.md.
 
     Inputs: .bvh; .amc with its .asf; animations in .fbx, .glb, .vrm and .vrma; .npz from
     `make sample` or AMASS; .json; and .npy with joint positions.

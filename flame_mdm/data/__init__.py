@@ -173,7 +173,7 @@ class MotionSource(ABC):
 
         Raises:
             FileNotFoundError: If the raw data is missing. The message explains how to obtain it.
-            UserError: If a file is damaged, or if an option does not fit the data.
+            UserError: If a file is damaged, or if an option does not match the data.
         """
 
     def failure_lines(self) -> list[str]:
@@ -192,7 +192,7 @@ class MotionSource(ABC):
         """Configures the source so that `clips` yields raw motions for a representation.
 
         Raises:
-            UserError: If the options do not fit the representation.
+            UserError: If the options do not match the representation.
         """
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:

@@ -103,7 +103,7 @@ def read(file: Path | bytes, name: str) -> Recording:
     """Reads a recording.
 
     Args:
-        file: path or content of the .npz file.
+        file: path or contents of the .npz file.
         name: file name for error messages.
 
     Raises:

@@ -156,7 +156,7 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """Reader for the expanded content of a compressed file, which has `packed` bytes.
+    """Reader for the expanded contents of a compressed file, which has `packed` bytes.
 
     It raises an error if the expanded size is implausible.
     """

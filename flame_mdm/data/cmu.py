@@ -459,7 +459,7 @@ def _recording(key: str) -> str:
 def _test_captions(path: Path) -> dict[str, list[Description]]:
     """Reads a JSON list of test captions, and returns the captions of each motion.
 
-    The field `segment` states the start and end of the described part in seconds.
+    The `segment` field states the start and end of the described part in seconds.
     """
     texts: defaultdict[str, list[Description]] = defaultdict(list)
     with naming(path, KeyError, TypeError, ValueError, prefix="not a list of HumanML3D captions: "):

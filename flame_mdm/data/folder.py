@@ -132,7 +132,7 @@ class Folder(MotionSource):
         """Configures the source so that `clips` yields raw motions for a representation.
 
         Raises:
-            UserError: If `motion` does not fit the representation.
+            UserError: If `motion` does not match the representation.
         """
         name = representation.name
         if needs_rotations(representation) and self.motion == "joints":
@@ -364,7 +364,8 @@ def _check_upright(folder: Path, uprights: Mapping[str, Sequence[float]]) -> Non
     for layout, values in uprights.items():
         if np.median(values) < LYING:
             raise UserError(
-                f"{folder}: the body is lying down in most motions ({layout}). Set the axis `up` in skeleton.yaml"
+                f"{folder}: the body is lying down in most motions ({layout}). "
+                "Set the `up` axis in skeleton.yaml"
             )
 
 

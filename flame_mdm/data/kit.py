@@ -37,7 +37,7 @@ class KITTemos(MotionSource):
     The recordings have 100 frames per second, and every eighth frame is used. Source: Petrovich,
     Black, Varol, "TEMOS", ECCV 2022; FLAME follows the same rules. Motions shorter than 10 frames
     or longer than 500 frames are left out of the training and validation splits. The test split
-    contains all motions, but only the first caption of each motion. The attribute `ghosh_test`
+    contains all motions, but only the first caption of each motion. The `ghosh_test` attribute
     states whether a clip is in Ghosh et al.'s test split.
 
     The folder `path` contains `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`

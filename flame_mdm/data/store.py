@@ -414,7 +414,8 @@ def _encode(encoder: Representation, named: tuple[str, str, np.ndarray]) -> np.n
     name, encoded, motion = named
     if encoded and encoded not in (encoder.name, encoder.part_of):
         raise UserError(
-            f"clip {name}: its features are {encoded}, which cannot be converted to {encoder.name}"
+            f"clip {name}: its features are in the {encoded} representation, which cannot be "
+            f"converted to {encoder.name}"
         )
     if not encoded:
         try:

@@ -56,7 +56,7 @@ class Cut(NamedTuple):
     ) -> Clip:
         """Cuts this part from a motion and returns it as a clip.
 
-        `facts` contains additional attributes. The attribute `tokens` is left out if any
+        `facts` contains additional attributes. The `tokens` attribute is left out if any
         description has no tokens.
         """
         captions, tokens, *_ = map(list, zip(*self.descriptions, strict=True))
@@ -142,7 +142,7 @@ def read_splits(folder: Path, ending: str, get_it: str) -> dict[str, Split]:
 class T2MFolder(MotionSource):
     """Reader for a processed folder with the layout of HumanML3D and KIT-ML.
 
-    Cuts and mirrored copies are in the same split as their motion. The attribute `tokens` contains
+    Cuts and mirrored copies are in the same split as their motion. The `tokens` attribute contains
     one list per caption, with the caption's words and their parts of speech. Mirrored copies have
     names of their own, so they can be excluded separately.
     """

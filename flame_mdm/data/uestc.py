@@ -144,7 +144,8 @@ class UESTC(MotionSource):
                     or camera.shape != (len(pose), 4)
                 ):
                     raise UserError(
-                        f"unexpected shape: pose {pose.shape}, joints3d {joint.shape} or orig_cam {camera.shape}"
+                        f"unexpected shapes: pose {pose.shape}, joints3d {joint.shape}, "
+                        f"orig_cam {camera.shape}"
                     )
             split, length = self.split(video.subject), min(len(pose), limit)
             if length < (1 if split == "test" else MIN_FRAMES):

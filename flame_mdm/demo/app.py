@@ -101,7 +101,7 @@ class Server(uvicorn.Server):
 
 
 def source(name: str) -> str:
-    """Returns the content of a file in this module's folder."""
+    """Returns the contents of a file in this module's folder."""
     return (FOLDER / name).read_text(encoding="utf-8")
 
 

@@ -127,7 +127,7 @@ class LiveStreams:
         }
 
     def file(self, name: str, ending: str) -> bytes:
-        """Returns the content of a motion file that contains the last minute of a stream.
+        """Returns the contents of a motion file that contains the last minute of a stream.
 
         Raises:
             UserError: If the stream has ended, or if no file format has this extension.

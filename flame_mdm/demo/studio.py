@@ -172,7 +172,7 @@ class Studio:
     def file(
         self, request: DemoRequest, number: int, extension: str, rig: str | None = None
     ) -> bytes:
-        """Returns the content of a motion file with the motion at index `number`.
+        """Returns the contents of a motion file with the motion at index `number`.
 
         The motion must be in memory, so that downloads do not wait for requests.
         """

@@ -179,7 +179,7 @@ def _material(file: glb.Glb, number: int) -> Material:
 
 
 def _image(file: glb.Glb, number: int | None) -> bytes:
-    """Returns the content of a PNG or JPEG image that is stored in the file.
+    """Returns the contents of a PNG or JPEG image that is stored in the file.
 
     Returns b"" if the image is stored outside the file or in another format.
     """

@@ -402,10 +402,13 @@ def _of_ours(
     """
     for key, value in said.items():
         raise UserError(
-            f"{key}={value} has no effect: this project wrote the file, so it is in meters, with y up. Remove {key}="
+            f"{key}={value} has no effect: the file was written by this package, so it already "
+            f"uses meters with y up. Remove {key}="
         )
     rate = _rate(data, rate, {})
-    notes = ("skeleton.yaml does not apply: this project wrote the file",) if fields else ()
+    notes = (
+        ("skeleton.yaml does not apply: the file was written by this package",) if fields else ()
+    )
     joints, layout = data["joints"], Layout()
     if as_smpl:
         layout, names = array_layout(joints, {})

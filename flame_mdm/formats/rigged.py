@@ -28,7 +28,7 @@ class Material:
     Attributes:
         name: the name of the material.
         color: red, green and blue from 0 to 1, in sRGB.
-        image: content of a PNG or JPEG file. Its colors are multiplied by `color`. Empty = no
+        image: contents of a PNG or JPEG file. Its colors are multiplied by `color`. Empty = no
             image.
     """
 

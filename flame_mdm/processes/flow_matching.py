@@ -134,7 +134,8 @@ class FlowMatching(Process):
     ) -> Tensor:
         """See `Process.sample`.
 
-        A flow takes N >= 1 equal steps, except with "dopri5", which chooses its own step sizes.
+        Flow matching uses N >= 1 steps of equal size, except with "dopri5", which chooses its own
+        step sizes.
 
         Only "consistency" adds noise. An edit with mode "trajectory" is applied before each step at
         a time <= `until`: the kept part is set to its point on the straight path from its noise to
@@ -145,7 +146,8 @@ class FlowMatching(Process):
         sampler, count = self.find_sampler(options), options.num_inference_steps
         if not isinstance(count, int):
             raise UserError(
-                f"num_inference_steps={count}: a flow takes equal steps. Use one whole number"
+                f"num_inference_steps={count}: flow matching uses steps of equal size. "
+                "Specify a single whole number"
             )
         if edit is not None:
             self.check_edit(edit, mask, options)

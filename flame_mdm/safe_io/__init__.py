@@ -315,7 +315,7 @@ def _begins(path: str | Path, content: bytes) -> bool:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns the content of a UTF-8 text file of at most `limit` bytes.
+    """Returns the contents of a UTF-8 text file of at most `limit` bytes.
 
     Raises `UserError` for all other files.
     """
@@ -328,7 +328,10 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
-    """Returns the content of a JSON file, which must not contain NaN, infinity or lone surrogates."""
+    """Returns the contents of a JSON file.
+
+    The file must not contain NaN, infinity or lone surrogates.
+    """
     with naming(path, ValueError, prefix="not a JSON file: "):
         return parse_json(read_text(path, limit))
 
@@ -353,7 +356,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the content of a YAML file as plain values.
+    """Returns the contents of a YAML file as plain values.
 
     Interpolations such as `${a}` are kept as text.
     """
@@ -374,7 +377,7 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def read_package_yaml(path: Path) -> Any:
-    """Returns the content of a YAML file of this package as plain values.
+    """Returns the contents of a YAML file of this package as plain values.
 
     With LibYAML, this function is fifteen times as fast as `read_yaml`, but it skips the checks for
     files from other people.

@@ -76,7 +76,7 @@ class SetMotion(ClosedSchema):
 
 
 class MotionSet(ClosedSchema):
-    """Content of a file that describes a set of motions; docs/sampling.md explains the keys."""
+    """Contents of a file that describes a set of motions; docs/sampling.md explains the keys."""
 
     stand: str
     motions: Annotated[

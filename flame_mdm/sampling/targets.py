@@ -66,7 +66,7 @@ class PoseTarget(Timed):
 
 
 class TargetFile(ClosedSchema):
-    """Content of a JSON file with targets; see docs/targets.md."""
+    """Contents of a JSON file with targets; see docs/targets.md."""
 
     root: Sequence[Waypoint] = ()
     joints: Sequence[JointTarget] = ()
@@ -226,7 +226,7 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
-    """Reads targets from a JSON file or from the content of such a file; see docs/targets.md.
+    """Reads targets from a JSON file or from the contents of such a file; see docs/targets.md.
 
     Raises:
         UserError: If the targets are invalid.

@@ -135,7 +135,7 @@ def check_optimizers(resumed: Resumed, optimizer: torch.optim.Optimizer) -> None
     try:
         misfits = list(_misfits(resumed.content, optimizer))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
-        misfits = [f"the optimizer's state does not fit the recipe: {first_line(error)}"]
+        misfits = [f"the optimizer's state does not match the recipe: {first_line(error)}"]
     if misfits:
         reason = f"damaged: {misfits[0]}. Delete this file to resume from another checkpoint"
         raise UserError(f"{resumed.path}: {reason}")

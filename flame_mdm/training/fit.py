@@ -124,7 +124,7 @@ def fit(folder: Path, config: Config) -> None:
         is_restoring = checkpoints.resumed is None and not measurements.begin
         if resumed and is_restoring and not isinstance(error, UserError | OSError | SystemExit):
             raise UserError(
-                f"{resumed.path} is damaged: it does not fit the recipe ({first_line(error)}). "
+                f"{resumed.path} is damaged: it does not match the recipe ({first_line(error)}). "
                 "Delete this file to resume from another checkpoint"
             ) from error
         raise

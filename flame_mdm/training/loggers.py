@@ -74,7 +74,7 @@ class TensorBoardRun(TensorBoardLogger):
 
 
 class Kept(TypedDict, total=False):
-    """Content of `wandb.json`: the id of the run, the last step, and the number of rows."""
+    """Contents of `wandb.json`: the id of the run, the last step, and the number of rows."""
 
     id: str
     step: int | None

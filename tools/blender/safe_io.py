@@ -8,7 +8,7 @@ import numpy as np
 
 
 def read_package_yaml(path: Path) -> Any:
-    """Returns the content of the JSON file that replaces a YAML file of the package."""
+    """Returns the contents of the JSON file that replaces a YAML file of the package."""
     return json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
 
 

@@ -54,7 +54,7 @@ class ActionEntry:
 
 @cache
 def phrases() -> dict[str, Any]:
-    """Returns the content of `phrases.yaml`."""
+    """Returns the contents of `phrases.yaml`."""
     return read_package_yaml(Path(__file__).with_name("phrases.yaml"))
 
 

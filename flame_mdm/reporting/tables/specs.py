@@ -139,7 +139,7 @@ class Figure(ClosedSchema):
 
 
 class Spec(ClosedSchema):
-    """A table: the content of a file in experiments/tables."""
+    """A table: the contents of a file in experiments/tables."""
 
     title: str
     notes: list[str] = Field([])

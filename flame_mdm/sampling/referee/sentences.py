@@ -321,7 +321,7 @@ def _amount(text: str, kind: str) -> int | None:
 
 
 def _speed(text: str) -> str:
-    """Returns "slow" or "fast" if a clause states that speed.
+    """Returns "slow" or "fast" if the clause states one of these speeds and no other.
 
     Returns "" if the clause states both of these speeds, another speed, or none.
     """

@@ -127,7 +127,11 @@ def test_a_plan_leads_to_the_motion_of_the_sampler(subtests) -> None:
                 ours, expected, atol=1e-9, rtol=1e-7, msg=f"{process} {requested}"
             )
     for process, sampler, says in (
-        (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
+        (
+            GaussianDiffusion(50, variance="learned_range"),
+            "ancestral",
+            "the variance that this model has learned",
+        ),
         (FlowMatching(), "rk4", "combines more than two"),
         (FlowMatching(), "dopri5", "dopri5 does not support edits"),
         (FlowMatching(), "ddim", "unknown sampler"),

@@ -125,7 +125,7 @@ def parts_once() -> None:
         overrides_list: list[Override],
         **options: bool,
     ) -> DefaultsList:
-        if not is_fixed(repo):
+        if not is_fixed(repo) or any(word.is_sweep_override() for word in overrides_list):
             return find(repo, config_name, overrides_list, **options)
         keys = [
             word

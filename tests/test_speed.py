@@ -227,6 +227,16 @@ def test_bfloat16_is_chosen_where_the_processor_computes_with_it(monkeypatch, su
             assert speed.accelerate(*parts(config), config) == chosen
 
 
+def test_a_gru_is_trained_in_float32_on_a_cpu(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": True})
+    chosen = {}
+    for name in ("mdm_encoder_small", "mdm_unet_small", "mdm_gru_small"):
+        config = compose("quickstart", ["trainer.accelerator=cpu", f"denoiser={name}"])
+        chosen[name] = speed.accelerate(*parts(config), config)
+    assert chosen.pop("mdm_gru_small") == "32-true"
+    assert set(chosen.values()) == {"bf16-mixed"}
+
+
 def parts(config: Config) -> tuple[GeneratorTask, MotionDataModule]:
     representation = instantiate(config["representation"])
     return GeneratorTask.build(config, representation), instantiate(

@@ -18,20 +18,23 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
+import hydra
 import numpy as np
 import pytest
 import torch
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import IConfigRepository
+from hydra._internal.core_plugins import file_config_source, importlib_resources_config_source
 from hydra._internal.defaults_list import DefaultsList
 from hydra.core.default_element import ResultDefault
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig
+from hydra.core.plugins import Plugins
+from omegaconf import DictConfig, OmegaConf
 
 from flame_mdm.config import Config, compose, recipes
 from flame_mdm.config.composition import EXPERIMENTS, ConfigSource
-from flame_mdm.safe_io import write_json
+from flame_mdm.safe_io import read_package_yaml, write_json
 
 ROOT = Path(__file__).parent.parent.parent
 GOLDEN = Path(os.environ.get("FLAME_MDM_GOLDEN", ROOT / "tests" / "golden"))
@@ -104,8 +107,24 @@ def compositions_once(compose_unchecked: Callable[..., Config]) -> Callable[...,
     return once
 
 
+FIXED = (EXPERIMENTS, Path(hydra.__file__).parent)
+"""Folders of the YAML files of recipes and of Hydra's own configuration."""
+_parsed = cache(read_package_yaml)
+
+
+class ParsedOnce(OmegaConf):
+    """OmegaConf for Hydra, which otherwise parses the files of a recipe again for every composition."""
+
+    @staticmethod
+    def load(file_: Any) -> Any:
+        path = Path(file_.name)
+        if not any(path.is_relative_to(folder) for folder in FIXED):
+            return OmegaConf.load(file_)
+        return OmegaConf.create(_parsed(path) or {})
+
+
 def parts_once() -> None:
-    """Makes Hydra find and merge the parts of a recipe once for each choice of parts.
+    """Makes Hydra parse each file once, and find and merge the parts of a recipe once for each choice of parts.
 
     This takes two thirds of a composition. Words that set single keys are then applied to a copy.
     """
@@ -148,6 +167,9 @@ def parts_once() -> None:
             merged[key] = merge(self, defaults, repo)
         return deepcopy(merged[key])
 
+    Plugins.instance()  # loads the modules of the sources, so they are changed afterwards
+    for source in (file_config_source, importlib_resources_config_source):
+        source.__dict__["OmegaConf"] = ParsedOnce
     config_loader_impl.__dict__["create_defaults_list"] = find_once
     ConfigLoaderImpl._compose_config_from_defaults_list = merge_once
 

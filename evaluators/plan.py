@@ -75,11 +75,15 @@ class Plan:
         elif request.baseline is not None:
             self.source = Baseline(request.baseline, self.clips, protocol.condition, request.seed)
             split = f"-{request.split}" if request.split != "test" else ""
+            seed = f"-seed{request.seed}" if request.seed else ""
+            count = (
+                f"-{protocol.samples}" if "samples" in self.changed and not request.quick else ""
+            )
             path = (
                 Path("runs/baselines")
                 / data.store.info["dataset"]
                 / protocol.title
-                / f"{request.baseline}{split}"
+                / f"{request.baseline}{split}{seed}{count}"
             )
         else:
             self.source = SampleFolder(Path(str(request.from_samples)), self.representation)

@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, get_type_hints
 
 import pytest
@@ -35,8 +36,9 @@ from flame_mdm.config import (
     sweeps,
     trust,
 )
-from flame_mdm.config.building import moved
+from flame_mdm.config.building import MOST_LEVELS, flatten, moved, plain
 from flame_mdm.config.command_line import make_variables, read_settings, run
+from flame_mdm.config.composition import choices, first_choice, parse, quoted
 from flame_mdm.config.jobs import run_jobs
 from flame_mdm.config.options import option
 from flame_mdm.config.signatures import check_kind, source_file
@@ -716,3 +718,132 @@ def test_paths_below_a_moved_folder_move_and_folders_with_similar_names_do_not()
     node = {"a": "runs/x/default", "b": ["runs/x/default/c.ckpt"], "d": "runs/x/default/c.ckpt"}
     node |= {"e": "runs/x/default2/c.ckpt", "f": "x/runs/x/default", "g": 3}
     assert moved(node, folders) == node | {"a": "${run.dir}", "d": "${run.dir}/c.ckpt"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["it's", "a\\", "a\\'b", "\\\\", "'", "[1, 2]", "{a: 1}", "a, b=c", " x ", "", "null", "1e-3"],
+)
+def test_quoted_values_are_taken_literally(text):
+    (override,) = parse([quoted(f"run.dir={text}")])
+    assert (override.key_or_group, override.value()) == ("run.dir", text)
+
+
+@pytest.mark.parametrize(
+    ("word", "values", "first"),
+    [
+        ("seed=3,4", ["3", "4"], "seed=3"),
+        ("+seed=range(1,4)", ["1", "2", "3"], "+seed=1"),
+        ("optimizer.lr=choice(1e-3,0.5)", ["0.001", "0.5"], "optimizer.lr=0.001"),
+        ("launch=glob(l*)", ["local"], "launch=local"),
+        ("a=[1,2]", ["[1, 2]"], "a=[1,2]"),
+        ("a=b", ["b"], "a=b"),
+    ],
+)
+def test_a_sweep_is_checked_with_the_first_of_its_values(word, values, first):
+    (override,) = parse([word])
+    assert choices(override) == values
+    assert first_choice(override) == first
+
+
+def test_help_shows_defaults_as_they_are_typed(capsys):
+    assert run(lambda _: pytest.fail("it ran"), Example, ["x", "--help"]) == 0
+    lines = capsys.readouterr().out.partition("defaults:\n")[2].splitlines()
+    assert [line.split()[0] for line in lines] == [
+        "file=null",
+        "names=null",
+        "text=",
+        "steps=3",
+        "which=last",
+        "rate=null",
+        "loop=false",
+    ]
+    assert lines[3] == f"  {'steps=3':30} steps"
+
+
+@pytest.mark.parametrize(
+    ("stop", "code"), [(SystemExit(), 0), (SystemExit(3), 3), (KeyboardInterrupt(), 130)]
+)
+def test_exit_codes_of_stopped_commands(stop, code):
+    def action() -> None:
+        raise stop
+
+    assert guarded(action) == code
+
+
+@pytest.mark.parametrize(("code", "count"), [(130, 1), (143, 1), (129, 1), (128, 2), (3, 2)])
+def test_a_signal_ends_a_sweep_and_a_failed_job_does_not(code, count):
+    started = []
+
+    def end(job: Example) -> None:
+        started.append(job.rate)
+        raise SystemExit(code)
+
+    assert run_jobs(end, Example, ["rate=1,2", "-m"]) == code
+    assert started == [1, 2][:count]
+
+
+def test_limits_of_a_configuration_are_allowed(subtests):
+    for seed in (0, 2**32 - 1):
+        with subtests.test(seed=seed):
+            sweeps._check_whole(compose("quickstart", [f"seed={seed}"]), "quickstart")
+    with pytest.raises(UserError, match=r"denoiser\.num_layers=-1: must not be negative"):
+        sweeps._check_whole(compose("quickstart", ["denoiser.num_layers=-1"]), "quickstart")
+    node: Any = 1
+    for _ in range(MOST_LEVELS):
+        node = {"a": node}
+    plain(node, "deep.yaml")
+    with pytest.raises(UserError, match=r"deep\.yaml: not a configuration"):
+        plain({"a": node}, "deep.yaml")
+
+
+def test_flat_keys_keep_lists_and_empty_mappings():
+    flat = flatten({"a": {"b": [1, {"x": 2}], "c": {}}, "d": None, "e": {"f": {"g": 0}}})
+    assert flat == {"a.b": [1, {"x": 2}], "a.c": {}, "d": None, "e.f.g": 0}
+
+
+def test_the_path_of_a_file_is_an_object_even_if_it_contains_an_equals_sign(tmp_path, capsys):
+    path, seen = tmp_path / "rate=3.npz", list[Example]()
+    path.touch()
+    assert run(seen.append, Example, [str(path), "a=b", "rate=2"]) == 1
+    assert "unknown config key 'a'" in one_error(capsys)
+    assert run(seen.append, Example, [str(path), "word", "rate=2"]) == 0
+    assert (seen[0].file, seen[0].names, seen[0].rate) == (str(path), ["word"], 2)
+    path.unlink()
+    assert run(seen.append, Example, [str(path)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected", "count"), [((1, 0), 1, 2), ((0, 70), 70, 2), ((143, 0), 143, 1)]
+)
+def test_a_sweep_of_trainings_ends_with_the_worst_code_and_a_signal_ends_it(
+    codes, expected, count, tmp_path, monkeypatch
+):
+    seeds: list[int] = []
+    monkeypatch.setattr(sys, "argv", ["flame-mdm", "train"])
+
+    def sweep(job: Callable[[Any], None], *_: Any) -> None:
+        for seed in (0, 1):
+            hydra = SimpleNamespace(
+                overrides=SimpleNamespace(task=[f"seed={seed}"]),
+                runtime=SimpleNamespace(output_dir=f"{tmp_path}/{seed}"),
+            )
+            state = SimpleNamespace(get=lambda hydra=hydra: hydra, instance=SimpleNamespace)
+            monkeypatch.setattr(sweeps, "HydraConfig", state)
+            job(None)
+
+    def composed(_: str, words: list[str]) -> Any:
+        return {"seed": int(words[0].removeprefix("seed=")), "run": {"dir": words[1]}}
+
+    monkeypatch.setattr(sweeps, "hydra_sweep", sweep)
+    monkeypatch.setattr(sweeps.composition, "compose", composed)
+
+    def train(node: Any) -> None:
+        seeds.append(node["seed"])
+        raise SystemExit(codes[node["seed"]])
+
+    words = ["quickstart", "seed=0,1", "--multirun", f"run.dir={tmp_path / 'sweep'}"]
+    assert sweeps.run_recipe(train, "usage", words) == expected
+    assert seeds == [0, 1][:count]
+    assert sweeps.run_recipe(train, "usage", []) == 2
+    assert sweeps.run_recipe(train, "usage", ["--help"]) == 0

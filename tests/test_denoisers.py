@@ -15,9 +15,10 @@ from torch.nn import functional
 from flame_mdm.batch import Condition, length_mask
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.flame import FLAME, cosine_first_sinusoid
+from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.layers import TransformerLayer
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
-from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
+from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet, ResidualBlock
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_package_yaml
 
@@ -349,3 +350,44 @@ def test_dropout_covers_every_sublayer_of_a_transformer_layer():
         assert norm is not None
         expected = norm(expected)
     torch.testing.assert_close(layer(x, None, memory, None), expected)
+
+
+@pytest.mark.parametrize(
+    ("kind", "part"), [(MDMEncoder, "transformer"), (MDMDecoder, "transformer"), (MDMGRU, "gru")]
+)
+def test_dropout_follows_the_positional_encoding_in_training_alone(kind: Any, part: str) -> None:
+    """With a dropout of 1, nothing is left of frames, tokens and positions."""
+    sizes: dict[str, Any] = {"latent_dim": 16, "num_layers": 1, "dropout": 1.0}
+    if kind is not MDMGRU:
+        sizes |= {"ff_size": 8, "num_heads": 2}
+    network, sequences = kind(D, D, C, **sizes).double(), []
+    getattr(network, part).register_forward_pre_hook(lambda _, inputs: sequences.append(inputs[0]))
+    for training in (True, False):
+        network.train(training)(*batch())
+    in_training, otherwise = sequences
+    assert not in_training.any()
+    assert otherwise.any()
+
+
+def test_dropout_inside_of_layers_has_its_rate_and_its_place() -> None:
+    torch.manual_seed(0)
+    layer, rates = TransformerLayer(8, 16, 2, 0.25, nn.GELU, cross_attention=True), []
+
+    def attend(query: Tensor, key: Tensor, value: Tensor, **options: Any) -> Tensor:
+        rates.append(options["dropout_p"])
+        return functional.scaled_dot_product_attention(query, key, value)
+
+    assert layer.cross_attention is not None
+    layer.self_attention.attend = layer.cross_attention.attend = attend
+    x, memory = torch.randn(2, 3, 8), torch.randn(2, 4, 8)
+    for training in (True, False):
+        layer.train(training)(x, None, memory, None)
+    assert rates == [0.25, 0.25, 0.0, 0.0]
+    # Of the hidden features, all are dropped here, so only the bias of the last layer remains.
+    feed_forward = TransformerLayer(8, 16, 2, 1.0, nn.GELU, False).train().feed_forward
+    bias = feed_forward[-1].get_parameter("bias")
+    torch.testing.assert_close(feed_forward(x), bias.expand(2, 3, 8))
+    block = ResidualBlock(8, 12, features=4, num_groups=4, dropout=1.0).train()
+    motion = torch.randn(2, 8, 5)
+    expected = block.skip(motion) + block.conv2.get_parameter("bias")[:, None]
+    torch.testing.assert_close(block(motion, torch.randn(2, 4), torch.ones(2, 1, 5)), expected)

@@ -21,7 +21,7 @@ from torch.nn.utils import parameters_to_vector
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.batch import Denoise, MotionBatch, length_mask
+from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 from flame_mdm.checkpoints.adapters import About, attach, copy_weights, word_rows, write_adapter
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
@@ -33,13 +33,15 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.demo.request import DemoRequest
 from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError
-from flame_mdm.generator import MotionGenerator
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import DistilledGenerator, MotionGenerator
 from flame_mdm.losses import masked_mse
 from flame_mdm.processes import Process
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.safe_io import read_yaml
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.training import adaptation, distillation
 
 MEAN, VARIANCE = torch.tensor([0.5, -1.0, 0.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
@@ -214,7 +216,13 @@ def test_the_target_of_a_student_has_its_averaged_weights(
         torch.testing.assert_close(target, expected)
 
 
-def recorded_terms(monkeypatch, step: int, u: Tensor | None = None, **changes: Any) -> Any:
+def recorded_terms(
+    monkeypatch,
+    step: int,
+    u: Tensor | None = None,
+    cond: Condition = NO_CONDITION,
+    **changes: Any,
+) -> Any:
     """Returns the arguments and options of the loss in one of 100 training steps of a student."""
     passed: list[Any] = []
     monkeypatch.setattr(
@@ -239,9 +247,10 @@ def recorded_terms(monkeypatch, step: int, u: Tensor | None = None, **changes: A
         losses="losses",
     )
     vars(stub).update(changes)
+    stub.generator.condition.features = changes.get("features", 1)
     x = torch.zeros(4, 2, 3)
     batch = MotionBatch(x, x[..., 0] == 0, list("abcd"))
-    distillation.DistillationTask.loss_terms(cast(Any, stub), batch, NO_CONDITION, u)
+    distillation.DistillationTask.loss_terms(cast(Any, stub), batch, cond, u)
     return passed
 
 
@@ -267,13 +276,31 @@ def test_students_are_validated_on_the_last_grid_with_times_that_are_equally_lik
     assert options["times"].tolist() == [0, 0.25, 0.5, 0.75]
 
 
-@pytest.mark.parametrize(("chosen", "expected"), [(None, 2.5), (4.0, 4.0), (1.0, 1.0)])
-def test_the_teacher_is_guided_as_the_recipe_says_or_else_as_by_default(
-    monkeypatch, chosen, expected
-):
+@pytest.mark.parametrize(
+    ("scale", "features", "value"),
+    [(3.0, 1, -4.0), (1.0, 1, 2.0), (None, 1, 2.0), (3.0, 0, 2.0)],
+)
+def test_the_teacher_alone_is_guided_if_there_is_a_condition(monkeypatch, scale, features, value):
+    """The prediction is the condition, 2, and without a condition, 5; 5 + 3 (2 - 5) is -4."""
+
+    def teacher(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        return cond.pooled[:, None].expand_as(x_t)
+
+    null = Condition(torch.tensor([[5.0]]), torch.zeros(1, 0, 1), None)
+    cond = Condition(torch.full((4, 1), 2.0), torch.zeros(4, 0, 1), None, null)
+    changes: dict[str, Any] = {"teacher": [teacher], "teacher_guidance": scale}
+    passed, _ = recorded_terms(monkeypatch, 0, cond=cond, **changes, features=features)
+    _, student, follower, guided, x, mask, passed_cond = passed
+    assert (student, follower) == ("student", "average")
+    prediction = guided(x, torch.zeros(4), mask, passed_cond)
+    torch.testing.assert_close(prediction, torch.full_like(x, value))
+
+
+def started(monkeypatch, scale: float | None = None, **facts: Any) -> Any:
+    """A student after its start from a teacher; `now` and `before` are the prints of their data."""
     teacher = SimpleNamespace(
         config={part: {} for part in distillation.PARTS[1:]},
-        facts={},
+        facts={"fingerprint": facts.get("before")},
         state_dict=lambda: nn.Linear(1, 1).state_dict(),
         sampler_options=SimpleNamespace(guidance_scale=2.5),
     )
@@ -282,16 +309,34 @@ def test_the_teacher_is_guided_as_the_recipe_says_or_else_as_by_default(
     generator = nn.Linear(1, 1)
     generator.denoiser = nn.Linear(1, 1)
     generator.load_state_dict = lambda state: None  # type: ignore[assignment]
-    options = {"teacher": "base", "guidance_scale": chosen}
+    options = {"teacher": "base", "guidance_scale": scale}
     stub: Any = SimpleNamespace(
-        config=teacher.config | {"distillation": options}, facts={}, generator=generator
+        config=teacher.config | {"distillation": options},
+        facts={"dataset": "walks", "fingerprint": facts.get("now")},
+        generator=generator,
     )
     distillation.DistillationTask.start_from_teacher(stub)
+    return stub
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, 2.5), (4.0, 4.0), (1.0, 1.0)])
+def test_the_teacher_is_guided_as_the_recipe_says_or_else_as_by_default(
+    monkeypatch, chosen, expected
+):
+    stub = started(monkeypatch, chosen)
+    denoiser = stub.generator.denoiser
     assert stub.teacher_guidance == expected
-    assert stub.target == [generator.denoiser]
-    assert stub.teacher[0] is not generator.denoiser
+    assert stub.target == [denoiser]
+    assert stub.teacher[0] is not denoiser
     assert not any(weight.requires_grad for weight in stub.teacher[0].parameters())
-    assert all(weight.requires_grad for weight in generator.denoiser.parameters())
+    assert all(weight.requires_grad for weight in denoiser.parameters())
+
+
+def test_a_student_has_the_data_of_its_teacher_as_far_as_both_are_known(monkeypatch):
+    for before, now in (("f1", "f1"), (None, "f1"), ("f1", None)):
+        assert started(monkeypatch, before=before, now=now).facts["teacher"] == "a"
+    with pytest.raises(UserError, match="fingerprint f1, but walks has fingerprint f2"):
+        started(monkeypatch, before="f1", now="f2")
 
 
 def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teacher(
@@ -325,6 +370,18 @@ def test_a_student_is_sampled_edited_led_chained_and_exported_without_its_teache
         flame_mdm.generate(model, guidance_scale=2, **text)
     with pytest.raises(UserError, match="Pass a text"):
         flame_mdm.generate(model)
+
+
+def test_a_student_refuses_guidance_but_a_scale_of_one():
+    student: Any = SimpleNamespace(condition=SimpleNamespace(features=1, reads="text"))
+    for options in (None, SamplerOptions(), SamplerOptions(guidance_scale=1.0)):
+        DistilledGenerator.check_request(student, options, False)
+    with pytest.raises(UserError, match=r"guidance_scale=0\.0: the guidance is built into"):
+        DistilledGenerator.check_request(student, SamplerOptions(guidance_scale=0.0), False)
+    with pytest.raises(UserError, match="Pass a text"):
+        DistilledGenerator.check_request(student, None, True)
+    student.condition.features = 0  # trained without conditions
+    DistilledGenerator.check_request(student, None, True)
 
 
 def as_version_0_2(run: Path, name: str, old_name: str) -> None:
@@ -801,3 +858,106 @@ def test_two_processes(trained, clips, tmp_path, data_root):
     code, _, err = finish(spawn(["flame_mdm", *words, *TWO, f"data_root={data_root}"]))
     assert code == 0, err
     assert (tmp_path / "run" / "limp.safetensors").stat().st_size < 300_000
+
+
+def test_the_data_of_the_base_is_used_only_if_it_has_not_changed(tmp_path, monkeypatch):
+    written: list[tuple[Path, list[str]]] = []
+
+    def write_store(folder: Path, samples: Any, representation: Any) -> None:
+        written.append((folder, samples.captions))
+        folder.mkdir(parents=True)
+        (folder / "store.json").touch()
+
+    monkeypatch.setattr(adaptation, "write_store", write_store)
+    monkeypatch.setattr(adaptation, "Store", lambda _: SimpleNamespace(fingerprint="f1"))
+    monkeypatch.setattr(adaptation, "SAMPLED", 2)
+    data, out = tmp_path / "walks-humanml", tmp_path / "run"
+    data.mkdir()
+    (data / "store.json").touch()
+    model: Any = SimpleNamespace(
+        config={"data": {"name": "walks"}},
+        facts={"fingerprint": "f1"},
+        representation=SimpleNamespace(name="humanml"),
+    )
+    assert adaptation._prior(model, tmp_path, out, ["own"]) == data
+    assert written == []
+    model.facts = {"fingerprint": "f2", "captions": ["walks", "sits"]}
+    for _ in range(2):  # a resumed adaptation keeps its samples
+        assert adaptation._prior(model, tmp_path, out, ["own"]) == out / "prior-humanml"
+    model.facts, model.config = {}, {}
+    adaptation._prior(model, tmp_path, tmp_path / "other", ["own"])
+    assert written == [
+        (out / "prior-humanml", ["walks", "sits"]),
+        (tmp_path / "other" / "prior-humanml", ["own", "own"]),
+    ]
+
+
+def test_an_adapter_describes_its_style_its_new_words_and_its_base(tmp_path, monkeypatch):
+    monkeypatch.setattr(adaptation, "read_merged", lambda file: {"state_dict": f"of {file}"})
+    monkeypatch.setattr(adaptation, "state_sha256", lambda state: f"hash {state}")
+    facts = {"vocabulary": ["a", "person", "in"]}
+    model: Any = SimpleNamespace(condition=None, facts=facts)
+    captions = [f"a person hobbles {number}." for number in "abc" * 9]
+    about = adaptation._about(model, captions, "limp", 5, Path("base"), True)
+    assert about["captions"] == [f"{text[:-1]} in limp style" for text in captions[:20]]
+    assert about["words"] == ["hobbles", "limp", "style", "b", "c"]
+    assert (about["name"], about["action"], about["rank"]) == ("limp", True, 5)
+    assert (about["rows"], about["base"]) == ([], "hash of base")
+
+
+def test_the_page_of_an_adaptation_compares_both_models_on_the_clips_of_each_kind(monkeypatch):
+    """There are 3 clips of the user, and 70 others, of which every third is compared."""
+    shown: list[list[Motion]] = []
+    rendered: dict[str, Any] = {}
+    own, others = [7, 8, 9], [row for row in range(73) if row not in (7, 8, 9)]
+    clips = [SimpleNamespace(captions=[f"text {row}"]) for row in range(73)]
+    train = SimpleNamespace(clips=clips, __getitems__=lambda draws: draws)
+    data: Any = SimpleNamespace(
+        train=train,
+        setup=lambda _: None,
+        halves=lambda: [np.array(own), np.array(others)],
+        crop=SimpleNamespace(longest=lambda: 6),
+        store=SimpleNamespace(motion=lambda _: np.zeros((9, 1))),
+    )
+
+    def generated(model: Any, texts: Any, frames: int = 4) -> list[Motion]:
+        texts = [texts] if isinstance(texts, str) else texts
+        joints = np.zeros((frames, 22, 3))
+        return [Motion(joints, 20.0, text=f"{model.name}: {text}") for text in texts]
+
+    def task(name: str, extra: float) -> Any:
+        return SimpleNamespace(
+            generator=SimpleNamespace(name=name, representation=None),
+            losses_of=lambda draws: {"loss": torch.tensor([draws[-1][0], len(draws)]) + extra},
+        )
+
+    monkeypatch.setattr(adaptation, "generate", generated)
+    monkeypatch.setattr(adaptation, "collate", lambda draws: draws)
+    monkeypatch.setattr(
+        adaptation,
+        "decoded",
+        lambda _, features, text, id: Motion(
+            np.zeros((len(features), 22, 3)), 20.0, text=text, id=id
+        ),
+    )
+    monkeypatch.setattr(adaptation, "player_page", lambda motions, *_, **__: shown.append(motions))
+    monkeypatch.setattr(adaptation, "render", lambda _, **values: rendered.update(values))
+    adaptation._comparison("limp", data, task("base", 0.5), task("adapted", 0.25))
+    assert rendered["rows"] == [
+        ["loss on 3 of your clips", "6.5", "6.25"],
+        ["loss on 24 clips from its own data", "48.5", "48.25"],
+    ]
+    pairs, beside = shown
+    texts = [f"text {row}" for row in own]
+    texts += [f"text {row} in limp style" for row in (0, 3, 6)]
+    texts += [f"text {row}" for row in (0, 3, 6)]
+    assert [(motion.id, motion.text) for motion in pairs] == [
+        (label, f"{name}: {text}")
+        for text in texts
+        for label, name in (("before", "base"), ("after", "adapted"))
+    ]
+    assert [(motion.id, motion.text, len(motion.joints)) for motion in beside] == [
+        (label, f"{prefix}text {row}", 6)
+        for row in own
+        for label, prefix in (("your clip", ""), ("model", "adapted: "))
+    ]

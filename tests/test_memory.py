@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from flame_mdm.batch import Condition
 from flame_mdm.config import compose
@@ -12,6 +12,7 @@ from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.recomputation import recompute_activations, stacked_layers
 from flame_mdm.denoisers.unet import MDMUNet
+from flame_mdm.training import memory
 from flame_mdm.training.memory import training_memory
 from flame_mdm.training.speed import CheapDropout, _simplify
 
@@ -102,3 +103,19 @@ def test_memory_follows_from_parameters_batch_size_and_averages():
     tokens, width, ff, layers = 64 * 197, 512, 1024, 8
     assert need.activations > 4 * tokens * layers * (8 * width + 2 * ff)
     assert need.activations < 4 * tokens * layers * (16 * width + 4 * ff)
+
+
+def test_tensors_are_counted_once_and_in_the_layer_that_saves_them_first():
+    """A linear layer saves its input, and a hyperbolic tangent saves its result."""
+    layers = nn.ModuleList(nn.Sequential(nn.Linear(8, 8), nn.Tanh()) for _ in range(2))
+    x, size = torch.zeros(5, 8), 4 * 5 * 8
+    saved = memory._saved(layers, lambda: layers[1](layers[0](x)))
+    assert saved == (3 * size, [(2 * size, size), (size, size)])
+
+
+def test_a_recomputed_network_holds_the_inputs_of_all_layers_and_the_inside_of_the_largest(
+    monkeypatch,
+):
+    monkeypatch.setattr(memory, "_saved", lambda *_: (100, [(40, 7), (30, 5)]))
+    need = training_memory(compose("quickstart"))
+    assert (need.activations, need.recomputed) == (100, (100 - 70) + (7 + 5) + 40)

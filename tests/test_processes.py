@@ -431,3 +431,41 @@ def test_the_large_variance_of_fewer_steps_is_that_of_the_longer_steps():
     kept = process.schedule.tables["alphas_cumprod"]
     expected = math.log(1 - float(kept[34] / kept[24]))
     assert float(torch.as_tensor(variance).reshape(-1)[0]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_options_of_a_diffusion_reach_its_schedule():
+    process = GaussianDiffusion(50, schedule="linear", noise_scale=3.0)
+    expected, plain = build_schedule("linear", 50, 3.0), build_schedule("linear", 50)
+    assert torch.equal(process.schedule.tables["betas"], expected.tables["betas"])
+    assert not torch.equal(process.schedule.tables["betas"], plain.tables["betas"])
+
+
+@pytest.mark.parametrize(("count", "null_count"), [(3, 5), (4, 2), (3, 3)])
+def test_a_dropped_condition_has_the_tokens_of_the_null_and_others_keep_theirs(count, null_count):
+    """Tokens are padded to the longer of both; the last token of the null is padding, too."""
+    generator = torch.Generator().manual_seed(0)
+    tokens, lengths = torch.randn(3, count, 2, generator=generator), [count, 1, count]
+    nothing = torch.randn(1, null_count, 2, generator=generator)
+    null_mask = length_mask(torch.tensor([null_count - 1]), null_count)
+    null = Condition(nothing[:, 0], nothing, null_mask)
+    cond = Condition(tokens[:, 0], tokens, length_mask(torch.tensor(lengths), count), null)
+    dropped = cond.drop(torch.tensor([False, False, True]))
+    assert dropped.token_mask is not None
+    assert dropped.tokens.shape[1] == dropped.token_mask.shape[1] == max(count, null_count)
+    expected = [tokens[0], tokens[1, :1], nothing[0, :-1]]
+    for row, rows_of_text in enumerate(expected):
+        assert torch.equal(dropped.tokens[row, dropped.token_mask[row]], rows_of_text)
+    assert torch.equal(dropped.pooled, torch.stack([tokens[0, 0], tokens[1, 0], nothing[0, 0]]))
+
+
+def test_each_step_toward_a_near_position_halves_the_distance_of_each_motion():
+    """Polyak's step, loss / slope, is half of the distance for its square. There are two steps."""
+    x, place = torch.zeros(2, 7, 6), torch.tensor([3])
+    x[1, 3, 5] = 0.06
+    near = Positions(
+        frames=place, joints=torch.tensor([1]), axes=torch.tensor([2]), values=torch.tensor([0.1])
+    )
+    steered = steer(lambda noisy: noisy, x, lambda motion: motion.unflatten(-1, (2, 3)), near)
+    expected = torch.zeros(2, 7, 6)
+    expected[:, 3, 5] = torch.tensor([0.1 - 0.1 / 4, 0.1 - 0.04 / 4])
+    torch.testing.assert_close(steered, expected)

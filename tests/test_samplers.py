@@ -688,3 +688,34 @@ def test_half_precision_denoisers_are_sampled_in_float32(subtests):
                 for denoise in denoisers
             )
             torch.testing.assert_close(half, single, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("sigma_min", [0.0, 0.2])
+@pytest.mark.parametrize("prediction", ["velocity", "x0"])
+def test_a_consistency_step_of_a_flow_ends_on_the_path_from_new_noise_to_the_estimate(
+    prediction, sigma_min
+):
+    process = FlowMatching(sigma_min=sigma_min, prediction=prediction)
+    data, noise = drawn((2, 5, 3), torch.float64)(9), drawn((2, 5, 3), torch.float64)
+    knows, seen = oracle(process, data), []
+
+    def denoise(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        seen.append((t[0].item() / 1000, x_t))
+        return knows(x_t, t, mask, cond)
+
+    x = sample(process, denoise, noise, sampler="consistency", num_inference_steps=4)
+    torch.testing.assert_close(x, data)
+    for number, (time, x_t) in enumerate(seen):
+        assert time == pytest.approx(number / 4)
+        t = torch.full((2,), number / 4, dtype=torch.float64)
+        torch.testing.assert_close(x_t, process.corrupt(data, noise(number), t))
+
+
+@pytest.mark.parametrize("build", [GaussianDiffusion, FlowMatching])
+@pytest.mark.parametrize("shape", [(1, 4, 2), (2, 1, 2), (2, 5, 2)])
+def test_an_edit_has_the_motions_and_frames_of_the_mask(build, shape):
+    """Shapes that torch would broadcast are refused, too."""
+    known = torch.zeros(shape)
+    options = {"sampler": "consistency", "num_inference_steps": 2}
+    with pytest.raises(UserError, match="the shape of the edit does not match the motions"):
+        sample(build(), pulled, drawn((2, 4, 2)), edit=Edit(known, half_kept(known)), **options)

@@ -558,6 +558,19 @@ def test_a_replication_has_its_own_noise(model):
     assert not torch.allclose(first, other, atol=1e-3)
 
 
+def test_noise_that_is_shared_is_the_same_for_all_names_also_block_by_block(model):
+    prefix, _ = starting_point(model, None)
+    mask, texts = torch.ones(2, BLOCK + 3, dtype=torch.bool), ["a person walks"] * 2
+    x = prefix[:, :1].expand(2, BLOCK + 3, -1)
+    batch, prefix = MotionBatch(x, mask, ["a", "b"], text=texts), prefix.expand(2, -1, -1)
+    shared, separate = (
+        model.generate(batch, prefix=prefix, shared_noise=flag) for flag in (True, False)
+    )
+    torch.testing.assert_close(shared[0], shared[1])
+    assert not torch.allclose(separate[0], separate[1], atol=1e-3)
+    assert shared.shape[1] == BLOCK + 3
+
+
 def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):
     short = decoded(model.representation, torch.from_numpy(walk.features[:4]), "", "short")
     ordinary = untrained(["denoiser.latent_dim=16", "denoiser.num_layers=1"], 60)

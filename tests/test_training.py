@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,30 +15,35 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from PIL import Image
 from support.runs import TINY, ended, forked
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torchmetrics import MeanMetric
+from torchmetrics import MeanMetric, Metric
 
 from flame_mdm import task as task_module
 from flame_mdm.__main__ import main
 from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.loading import load, load_task
-from flame_mdm.checkpoints.model_files import read_checkpoint
+from flame_mdm.checkpoints.locating import SHIPPED
+from flame_mdm.checkpoints.model_files import read_checkpoint, read_model_file
 from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import _length_unit
+from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.runs import HISTORY, read_history
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
 from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training import callbacks, provenance, start
-from flame_mdm.training.callbacks import Measurements, SampleMotions
+from flame_mdm.training import fit as fit_module
+from flame_mdm.training.callbacks import Checkpoints, Interrupted, Measurements, SampleMotions
 from flame_mdm.training.guards import BadLoss
-from flame_mdm.training.loggers import History
+from flame_mdm.training.loggers import History, log_table
 
 STEPS = [
     "trainer.val_check_interval=4",
@@ -722,3 +728,300 @@ def test_samples_that_do_not_depend_on_the_input_are_reported(
         "warning: step 5: all 3 samples are the same motion. The network's output no longer depends"
     )
     assert (warning in capsys.readouterr().out) == collapsed
+
+
+def test_values_are_reported_in_the_steps_that_end_a_log_interval():
+    """A step is computed before it is counted: steps 5 and 10 are those after 4 and 9 steps."""
+    task, reported = Stub(), {}
+    weight = torch.ones((), requires_grad=True)
+    for step in range(10):
+        task._trainer = running(step)
+        task.report({"train/loss": weight * step, "train/lr": 0.5})
+        reported |= {step: float(task.reported["train/loss"])} if task.reported else {}
+        assert not any(getattr(x, "requires_grad", False) for x in task.reported.values())
+        task.reported.clear()
+    assert reported == {4: 4.0, 9: 9.0}
+    task._trainer = None
+    assert task.is_reported, "without a trainer, every step is reported"
+
+
+def written_checkpoints(
+    tmp_path: Path, monkeypatch: Any, steps: range, **attributes: Any
+) -> tuple[list[tuple[int, str]], int | None]:
+    """Steps and names of the checkpoints of a run, and the step at which a signal has stopped it.
+
+    A checkpoint is due every 4 steps and is kept every 6 steps. Each step accumulates 2 batches.
+    `signal` is a step and a signal that arrives in it.
+    """
+    written: list[tuple[int, str]] = []
+    signal_at, signum = attributes.pop("signal", (-1, 0))
+    last_step = attributes.pop("should_stop_at", -1)
+    checkpoints, task = Checkpoints(str(tmp_path), 4, 6), Stub()
+    monkeypatch.setattr(checkpoints.stop, "install", lambda: None)
+    trainer = running(steps.start, should_stop=False, **{"max_steps": 13} | attributes)
+    trainer.world_size = 1
+    trainer.save_checkpoint = lambda path: written.append((trainer.global_step, Path(path).name))
+    checkpoints.on_train_start(trainer, task)
+    checkpoints.on_train_batch_end(trainer, task)
+    for trainer.global_step in steps[1:]:
+        trainer.should_stop = trainer.global_step == last_step
+        if trainer.global_step == signal_at:
+            checkpoints.stop.signum = signum
+        try:
+            for _ in range(2):
+                checkpoints.on_train_batch_end(trainer, task)
+        except Interrupted as stop:
+            return written, stop.step if stop.signum == signum else -1
+    return written, None
+
+
+def test_checkpoints_are_written_on_time_at_the_end_and_before_a_stop(tmp_path, monkeypatch):
+    last, kept = "last.ckpt", "step={:07d}.ckpt".format
+    written = partial(written_checkpoints, tmp_path, monkeypatch)
+    usual = [(4, last), (6, kept(6)), (8, last), (12, last), (12, kept(12))]
+    assert written(range(14)) == ([*usual, (13, last)], None)
+    assert written(range(8, 12), max_steps=11) == ([(11, last)], None)
+    assert written(range(14), max_steps=-1) == (usual, None)
+    assert written(range(6), should_stop_at=5) == ([(4, last), (5, last)], None)
+    assert written(range(14), signal=(6, 15)) == ([(4, last), (6, last), (6, kept(6))], 6)
+
+
+@pytest.mark.parametrize(
+    ("fps", "seconds", "frames"),
+    [(20.0, 2.48, 50), (30.0, 1.66, 50), (30.0, 1.54, 46), (20.0, 9.0, 60)],
+)
+def test_samples_have_the_nearest_number_of_frames_and_processes_share_the_prompts(
+    tmp_path, monkeypatch, fps, seconds, frames
+):
+    monkeypatch.setattr(callbacks, "resolve", lambda request, *_, **__: request)
+    monkeypatch.setattr(callbacks, "sample", lambda _, request: request)
+    model: Any = SimpleNamespace(
+        conditioned_on="text", representation=SimpleNamespace(fps=fps), facts={"max_frames": 60}
+    )
+    samples = SampleMotions(str(tmp_path), 1, ["a", "b", "c"], seconds)
+    first, second = (cast(Any, samples._sample(model, rank, 2)) for rank in (0, 1))
+    assert (first.texts, second.texts) == (("a", "c"), ("b",))
+    assert (first.frames, first.samples, first.seed, first.split) == (frames, 1, 0, False)
+    model.conditioned_on = "action"
+    assert cast(Any, samples._sample(model, 1, 2)).actions == ("b",)
+    assert samples._sample(model, 3, 4) == []
+    model.conditioned_on = "none"
+    unprompted = SampleMotions(str(tmp_path), 1, None, seconds)
+    assert cast(Any, unprompted._sample(model, 0, 2)).samples == callbacks.UNCONDITIONED
+    assert unprompted._sample(model, 1, 2) == []
+
+
+class FramesOfAttributes(Metric):
+    """Numbers of real frames, weighted by the number of the motion, and requested speeds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("frames", torch.zeros(()), dist_reduce_fx="sum")
+        self.add_state("speed", torch.zeros(()), dist_reduce_fx="sum")
+
+    def update(self, joints: torch.Tensor, mask: torch.Tensor, keys: Any, requested: Any) -> None:
+        assert joints.shape[:2] == mask.shape
+        self.frames += mask.sum() * (1 + keys[0])
+        self.speed += requested[0].get("speed", 0)
+
+    def compute(self) -> dict[str, Any]:
+        return {"frames": self.frames, "speed": self.speed, "unknown": None}
+
+
+class CountOfMotions(MeanMetric):
+    def update(self, joints: torch.Tensor) -> None:  # type: ignore[override]
+        super().update(float(len(joints)))
+
+
+def test_metrics_of_samples_are_those_of_these_samples_alone(tmp_path):
+    metrics: dict[str, Metric] = {"of": FramesOfAttributes(), "count": CountOfMotions()}
+    samples = SampleMotions(str(tmp_path), 1, None, 1.0, metrics)
+    motions = [torch.zeros(3, 22, 3), torch.zeros(5, 22, 3)]
+    requested = [{"speed": 2.0}, {}]
+    for _ in range(2):
+        values = samples.measure(motions, requested)
+        assert values == {"of/frames": 3 + 2 * 5, "of/speed": 2.0, "count": 1.0}
+    assert samples.measure(motions[1:], requested[:1])["of/frames"] == 5
+
+
+def test_the_seed_of_a_recipe_reaches_torch_the_data_and_the_task(tmp_path, monkeypatch):
+    passed: list[dict[str, Any]] = []
+
+    def build(node: Any, *_: Any, **derived: Any) -> Any:
+        if "batch_size" in node:
+            passed.append(derived)
+            raise StopIteration
+        return instantiate(node)
+
+    monkeypatch.setattr(fit_module, "instantiate", build)
+    config = compose("quickstart", [*TINY, "seed=7"])
+    with pytest.raises(StopIteration):
+        fit_module.fit(tmp_path, config)
+    assert torch.initial_seed() == passed[0]["seed"] == 7
+    assert GeneratorTask.build(config, passed[0]["representation"]).seed == 7
+
+
+@pytest.mark.parametrize("differing", [[], ["commit"], ["changed", "packages"]])
+def test_a_run_that_resumes_with_other_code_or_packages_says_which(
+    tmp_path, monkeypatch, differing
+):
+    kinds = {"commit": "code", "changed": "uncommitted changes", "packages": "packages"}
+    lines: list[str] = []
+    before = provenance.environment() | dict.fromkeys(differing, "other")
+    monkeypatch.setattr(provenance, "say", lambda *texts: lines.extend(texts))
+    monkeypatch.setattr(provenance, "save", lambda *_, **__: None)
+    monkeypatch.setattr(provenance, "read_json", lambda *_: SimpleNamespace(**before))
+    (tmp_path / provenance.PROVENANCE).touch()
+    task = Stub(generator=SimpleNamespace(describe=lambda: ""))
+    trainer = running(3, is_global_zero=True, max_steps=50)
+    trainer.datamodule.store = SimpleNamespace(
+        info={"dataset": "", "representation": "", "hours": 1.0}
+    )
+    trainer.datamodule.counts = lambda _: []
+    sections = {"run": {"dir": str(tmp_path)}, "data": {"batch_size": 4}, "optimizer": {}}
+    provenance.WriteProvenance(sections | {"experiment": ""}).on_train_start(trainer, task)
+    names = " and ".join(kinds[name] for name in differing)
+    warnings = [line for line in lines if line.startswith("resuming")]
+    assert len(warnings) == bool(differing)
+    assert all(line.startswith(f"resuming with different {names}: results") for line in warnings)
+
+
+def test_an_extractor_is_suggested_only_for_the_representation_of_its_training():
+    trained = read_model_file(SHIPPED["motion_clip_synthetic"])["config"]["representation"]
+    facts = {"dataset": "synthetic", "captions": ["a person walks"]}
+    suggested = partial(callbacks._extractor_in_package, {"representation": trained})
+    assert suggested(facts) == "motion_clip_synthetic"
+    assert suggested({"dataset": "synthetic"}) == ""
+    assert suggested(facts | {"dataset": "humanml3d"}) == ""
+    other = {"representation": trained | {"fps": 33}}
+    assert callbacks._extractor_in_package(other, facts) == ""
+
+
+def test_a_table_is_logged_as_lines_of_markdown_with_its_step():
+    texts: list[tuple[Any, ...]] = []
+
+    class Board(TensorBoardLogger):
+        def __init__(self) -> None: ...
+
+        @property
+        def experiment(self) -> Any:
+            return SimpleNamespace(add_text=lambda *values: texts.append(values))
+
+    log_table(Board(), "evaluation/own", ["metric", "mean"], [["fid", 0.5], ["kid", None]], 7)
+    table = "| metric | mean |\n| --- | --- |\n| fid | 0.5 |\n| kid | None |"
+    assert texts == [("evaluation/own", table, 7)]
+
+
+@pytest.mark.parametrize(
+    ("warmup", "decay", "factors"),
+    [
+        (4, 0.0, [0.25, 0.5, 0.75, 1, 1, 1, 1, 1]),
+        (None, 1.0, [1, 7 / 8, 6 / 8, 5 / 8, 4 / 8, 3 / 8, 2 / 8, 1 / 8]),
+        (0, 0.25, [1, 1, 1, 1, 1, 1, 1, 0.5]),
+        (6, 1.0, [1 / 6, 2 / 6, 3 / 6, 5 / 8, 4 / 8, 3 / 8, 2 / 8, 1 / 8]),
+    ],
+)
+def test_the_learning_rate_rises_and_falls_linearly(warmup, decay, factors):
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=2.0)
+    stub: Any = SimpleNamespace(
+        make_optimizer=lambda: optimizer,
+        config={"lr_warmup": warmup, "lr_decay": decay},
+        trainer=SimpleNamespace(max_steps=8),
+    )
+    schedule = cast(Any, Task.configure_optimizers(stub))["lr_scheduler"]
+    assert schedule["interval"] == "step"
+    rates = []
+    for _ in range(8):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule["scheduler"].step()
+    assert rates == pytest.approx([2 * factor for factor in factors])
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(0.0 if decay else 2.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"lr_decay": 1.01}, "lr_decay=1.01: expected a fraction"),
+        ({"lr_decay": -0.01}, "lr_decay=-0.01"),
+        ({"lr_warmup": -1}, "lr_warmup=-1: expected a number of steps"),
+        ({}, ""),
+    ],
+)
+def test_schedules_out_of_range_are_refused_and_none_leaves_the_rate(options, message):
+    stub: Any = SimpleNamespace(
+        make_optimizer=lambda: "optimizer", config=options, trainer=SimpleNamespace(max_steps=8)
+    )
+    if message:
+        with pytest.raises(UserError, match=message):
+            Task.configure_optimizers(stub)
+    else:
+        assert Task.configure_optimizers(stub) == "optimizer"
+
+
+def test_sampling_ignores_dropout_and_leaves_a_model_in_its_mode(trained):
+    model, mask = load(trained), torch.ones(1, 20, dtype=torch.bool)
+    for module in model.denoiser.modules():
+        if isinstance(module, torch.nn.Dropout):
+            module.p = 0.5
+    batch = MotionBatch(torch.zeros(1, 20, 1), mask, ["a"], text=["a person walks"])
+    expected = model.eval().generate(batch)
+    assert not model.training
+    torch.testing.assert_close(model.train().generate(batch), expected)
+    assert model.training
+    assert model.denoiser.training
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("text", {"vocabulary": ["sits", "walks"], "captions": ["walks"], "verbs": ["walks"]}),
+        ("action", {}),
+        ("none", {}),
+    ],
+)
+def test_only_captions_that_may_be_shared_become_facts(monkeypatch, kind, expected):
+    facts: dict[str, Any] = {}
+    clips = [
+        SimpleNamespace(captions=["walks"], license="free"),
+        SimpleNamespace(captions=["sits"], license="closed"),
+    ]
+    source = SimpleNamespace(may_share_captions=lambda name: name == "free", verbs=["walks"])
+    data = SimpleNamespace(
+        store=SimpleNamespace(info={"actions": ["walk"]}),
+        crop=SimpleNamespace(draw=lambda length, _: (0, length - 4), min_frames=24),
+        train=SimpleNamespace(clips=clips),
+        source=source,
+    )
+    monkeypatch.setattr(Task, "setup", lambda *_: None)
+    denoiser = SimpleNamespace(context_frames=19)
+    generator = SimpleNamespace(conditioned_on=kind, denoiser=denoiser, add_facts=facts.update)
+    task = Stub(generator=generator, checkpoints_activations=False, compiles=False)
+    task._trainer = cast(Any, SimpleNamespace(datamodule=data))
+    task.setup("fit")
+    assert facts == expected | ({} if kind == "action" else {"actions": ["walk"]})
+    source.may_share_captions = lambda _: False
+    facts.clear()
+    task.setup("fit")
+    assert "captions" not in facts
+    denoiser.context_frames = 20
+    with pytest.raises(UserError, match="20 frames has no frames left after a prefix of 20 frames"):
+        task.setup("fit")
+
+
+@pytest.mark.parametrize("variance", ["fixed_small", "learned_range"])
+def test_the_options_of_samples_are_tried_before_the_first_step(variance):
+    generator = SimpleNamespace(
+        process=GaussianDiffusion(50, variance=variance),
+        representation=SimpleNamespace(features=3),
+        sampler_options=SamplerOptions(sampler="ddim", num_inference_steps=5),
+    )
+    task = Stub(generator=generator)
+    task.on_fit_start()
+    for sampler, steps, message in (
+        ("euler", 5, "unknown sampler 'euler'"),
+        ("ddim", 51, "num_inference_steps=51"),
+    ):
+        generator.sampler_options = SamplerOptions(sampler=sampler, num_inference_steps=steps)
+        with pytest.raises(UserError, match=message):
+            task.on_fit_start()

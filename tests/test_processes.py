@@ -433,13 +433,6 @@ def test_the_large_variance_of_fewer_steps_is_that_of_the_longer_steps():
     assert float(torch.as_tensor(variance).reshape(-1)[0]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_options_of_a_diffusion_reach_its_schedule():
-    process = GaussianDiffusion(50, schedule="linear", noise_scale=3.0)
-    expected, plain = build_schedule("linear", 50, 3.0), build_schedule("linear", 50)
-    assert torch.equal(process.schedule.tables["betas"], expected.tables["betas"])
-    assert not torch.equal(process.schedule.tables["betas"], plain.tables["betas"])
-
-
 @pytest.mark.parametrize(("count", "null_count"), [(3, 5), (4, 2), (3, 3)])
 def test_a_dropped_condition_has_the_tokens_of_the_null_and_others_keep_theirs(count, null_count):
     """Tokens are padded to the longer of both; the last token of the null is padding, too."""

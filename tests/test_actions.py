@@ -529,3 +529,43 @@ def test_actions_have_the_numbers_of_actors_code():
     assert len(TRAIN_SUBJECTS) == 51
     assert sum(TRAIN_SUBJECTS) == 3081
     assert (uestc.ROOT, uestc.MIN_FRAMES) == (8, 45)
+
+
+def first_hashes(names: dict[int, str]) -> list[int]:
+    """The numbers of names in the order of the hashes of these names."""
+    return sorted(names, key=lambda n: hashlib.sha1(names[n].encode()).hexdigest())
+
+
+def test_splits_of_the_action_sets_follow_from_the_hashes_of_their_names(tmp_path: Path):
+    source = UESTC("there")
+    ranked = first_hashes({subject: f"uestc_p{subject:03d}" for subject in TRAIN_SUBJECTS})
+    validated = {subject for subject in TRAIN_SUBJECTS if source.split(subject) == "val"}
+    assert validated == set(ranked[:5])
+
+    clips = list(HumanAct12(str(write_humanact12(tmp_path / "raw"))).clips(20.0))
+    for action, label in enumerate(HumanAct12.actions):
+        ranked = first_hashes({block: f"humanact12_{action}_{block}" for block in range(3)})
+        expected = {f"{label} {ranked[k]}": split for k, split in enumerate(("test", "val"))}
+        expected[f"{label} {ranked[2]}"] = "train"
+        own = [clip for clip in clips if clip.action == action]
+        assert {clip.source: clip.split for clip in own} == expected
+        assert [clip.source for clip in own] == [f"{label} {k // 10}" for k in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("side", "view", "is_used"),
+    [(1, 0, True), (1, 8, True), (2, 7, True), (2, 8, False), (2, 0, True)],
+)
+def test_the_eighth_view_of_the_second_side_is_left_out(side, view, is_used):
+    source = UESTC("there")
+    source.videos = [uestc.Video(0, "a", 1, view, 1, side)]
+    assert source.count() == is_used
+
+
+def test_a_video_is_as_long_as_the_shorter_one_of_its_poses_and_its_frames(tmp_path: Path):
+    raw = write_uestc(tmp_path / "uestc")
+    frames = raw / "info" / "num_frames_min.txt"
+    lengths = [int(line) for line in frames.read_text().split()]
+    frames.write_text("\n".join(map(str, [lengths[0] - 7, lengths[1] + 7, *lengths[2:]])))
+    clips = [clip for clip, _ in zip(UESTC(str(raw)).clips(20.0), range(2), strict=False)]
+    assert [len(clip.motion) for clip in clips] == [lengths[0] - 7, lengths[1]]

@@ -1,5 +1,6 @@
 """Clips of the user in an adaptation: every kind of file, for every representation."""
 
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, cast
@@ -13,10 +14,12 @@ from support.runs import TINY
 
 from flame_mdm.config import compose, instantiate
 from flame_mdm.config.composition import compose_data
+from flame_mdm.data import Clip
 from flame_mdm.data.adaptation import KEPT, Lesson, LessonData, fault_of, styled
 from flame_mdm.data.crops import Clips, Units
-from flame_mdm.data.folder import Folder
+from flame_mdm.data.folder import Folder, Note
 from flame_mdm.data.store import Entry, Store, write_store
+from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.training import adaptation
@@ -152,3 +155,83 @@ def test_an_odd_batch_has_one_more_clip_of_the_user(tmp_path: Path):
         batch = [index for index, _ in next(batches)]
         assert [entries[index].id.startswith(KEPT) for index in batch] == [False] * 3 + [True] * 2
         assert len(set(batch)) == 5
+
+
+@pytest.mark.parametrize("fps", [10.0, 12.5, 20.0, 60.0])
+def test_the_floor_is_that_of_one_second_at_any_rate(fps: float):
+    joints = np.zeros((round(8 * fps), 22, 3))
+    begin = round(2 * fps)
+    joints[begin : begin + round(0.9 * fps), :, 1] = 0.5  # a jump
+    joints[-round(0.4 * fps) :, :, 1] = 0.3
+    assert fault_of(joints, fps) == ""
+    joints[-round(0.7 * fps) :, :, 1] = 0.3
+    assert fault_of(joints, fps) == "drifts upward by 30 cm (limit 5)"
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 4])
+def test_both_halves_of_a_batch_belong_to_the_same_step(batch_size: int, tmp_path: Path):
+    """So that a resumed run continues both of them."""
+    entries = [Entry(f"{KEPT}{n}", n, 1, "train", "a", [], None) for n in range(8)]
+    entries += [Entry(f"mine {n}", n, 1, "train", "a", [], None) for n in range(8)]
+    data = object.__new__(LessonData)
+    data.batch_size, data.crop = 2 * batch_size, Units()
+    data.train = cast(Clips, SimpleNamespace(clips=entries, lengths=np.arange(16)))
+
+    def batches(first: int, count: int, seed: int = 3) -> list:
+        stream = data.training_batches(seed=seed, first=first, rank=0, world=1)
+        return list(islice(stream, count))
+
+    whole = batches(0, 20)
+    assert batches(7, 13) == whole[7:]
+    assert batches(0, 20, seed=4) != whole
+    for number, draws in enumerate(whole):
+        assert {batch for _, batch in draws} == {number}
+        assert sum(index < 8 for index, _ in draws) == batch_size
+
+
+def test_clips_of_the_prior_keep_their_captions_splits_and_statistics():
+    lesson = Lesson("there", "prior")
+    lesson.name = "limp"
+    entries = [Entry("k", 3, 5, "val", "take", ["a person sits"], 1)]
+    statistics = {"mean": np.array([1.0]), "std": np.array([2.0])}
+    lesson.store = cast(
+        Store,
+        SimpleNamespace(
+            clips=entries,
+            info={"representation": "features"},
+            motion=lambda entry: np.full((entry.length, 1), entry.start),
+            **statistics,
+        ),
+    )
+    mine = Clip("a", np.zeros((9, 22, 3)), ["a person walks."], "train", "a")
+    notes = {"a": Note(), "b": Note(split="test")}
+    lesson.folder = cast(
+        Folder,
+        SimpleNamespace(
+            clips=lambda fps: [mine], require_all=lambda: None, notes=notes, count=lambda: 7
+        ),
+    )
+    first, second = lesson.clips(20.0)
+    assert (first.id, first.captions, first.encoded) == ("a", ["a person walks in limp style"], "")
+    assert (second.id, second.source) == (f"{KEPT}k", f"{KEPT}k")
+    assert (second.captions, second.split) == (["a person sits"], "val")
+    assert second.encoded == "features"
+    assert second.motion.tolist() == [[3]] * 5
+    assert lesson.statistics() == tuple(statistics.values())
+    assert lesson.count() == 7 + 1
+    assert lesson.folder.splits == {"a": "train", "b": "test"}
+
+
+def test_clips_are_counted_by_who_gave_them():
+    entries = [Entry(f"{KEPT}{n}", n, 1, "train", "a", [], None) for n in range(5)]
+    entries += [Entry(f"mine {n}", n, 1, "train", "a", [], None) for n in range(3)]
+    data = object.__new__(LessonData)
+    data.crop, data.source = Units(), Lesson("there", "prior")
+    data.source.name = "limp"
+    data.train = cast(Clips, SimpleNamespace(clips=entries))
+    (line,) = data.counts(cast(Store, None))
+    assert line.startswith("clips: 3 from limp, including mirrored copies; 5 that the model")
+    assert [rows.tolist() for rows in data.halves()] == [[5, 6, 7], [0, 1, 2, 3, 4]]
+    del entries[5:]
+    with pytest.raises(UserError, match="limp: all clips are shorter than 40 frames"):
+        data.halves()

@@ -366,3 +366,14 @@ def test_limbs_of_real_takes_point_the_same_way_on_smpls_body(case, originals, s
             elbow = vectors[f"{side}_elbow"]
             assert sign * elbow[:, 1].mean() > 0.8 * np.linalg.norm(elbow, axis=1).mean()
             assert np.abs(vectors[f"{side}_knee"][:, 1]).max() < 0.2  # the shin does not twist
+
+
+@pytest.mark.parametrize("content", ["walk-left", "walk-right", "walk", "bye"])
+def test_captions_name_the_other_side_where_the_head_turns(content: str):
+    side = side_of(content)
+    for text in captions(content, "old", side):
+        words = text.replace(",", "").split()
+        other = {"left": "right", "right": "left"}.get(side, "left")
+        assert (other in words) == ("head turned to the" in text)
+        if "head turned to the" in text:
+            assert text.rstrip(".").endswith(f"head turned to the {other}")

@@ -14,8 +14,10 @@ from support.asf import write_amc, write_asf
 from support.fixtures import SHARED, needs_third_party
 
 from flame_mdm.__main__ import main
-from flame_mdm.data import archives, cmu
+from flame_mdm.data import archives, cmu, hashed_split
+from flame_mdm.data.humanml3d import IndexedClip
 from flame_mdm.data.store import Store, write_store
+from flame_mdm.data.t2m import Description
 from flame_mdm.errors import UserError
 from flame_mdm.formats import asf, bvh
 from flame_mdm.formats.layouts import tree_layout
@@ -438,3 +440,82 @@ def test_bad_recordings_are_whole_subjects_or_single_ones():
     names = ("18_01", "19_15", "106_03", "143_21", "143_20", "118_01", "02_18")
     bad = [cmu._is_in("bad", name) for name in names]
     assert bad == [True, True, True, True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("rows", "count", "count_of_others"),
+    [(39, 0, 0), (40, 1, 1), (199, 1, 1), (200, 1, 0), (900, 1, 0)],
+)
+def test_parts_of_ones_own_have_no_maximum_length(rows, count, count_of_others):
+    text = [Description("walks", [])]
+    mine = cmu.Item("a", "train", "a", text, is_own=True)
+    assert [(cut.start, cut.length) for cut in mine.cuts(rows)] == [(0, rows)] * count
+    assert len(cmu.Item("a", "train", "a", text).cuts(rows)) == count_of_others
+
+
+def captioned(splits: dict[str, str], seconds: float = 3.0, end: int = 60) -> cmu.CMU:
+    """A recording with a clip in each of these splits, and with a caption of KIT-ML."""
+    data = cmu.CMU("there")
+    data.table = None
+    data.files = {"02_01": [Path("02_01.amc")], "07_01": [Path("07_01.amc")]}
+    rows = [IndexedClip(name, "CMU/02/02_01_poses", 0, end) for name in splits]
+    texts = {name: [Description("walks", [])] for name in splits}
+    data.humanml3d = rows, texts, splits  # type: ignore[assignment]
+    data.kit = [("kit1", "02_01", "Somebody walks.", seconds)]
+    return data
+
+
+@pytest.mark.parametrize(
+    ("splits", "split"),
+    [
+        *((("train",), "train"), (("val",), "val"), (("train", "val"), "val")),
+        *((("test", "train"), "test"), (("test", "val", "train"), "test")),
+        ((), hashed_split("CMU subject 02", val=5, test=10)),
+    ],
+)
+def test_a_recording_is_in_the_strictest_split_of_its_clips(splits, split):
+    data = captioned({f"{number}": split for number, split in enumerate(splits)})
+    assert [item.split for item in data.items["02_01"] if item.id == "kit1"] == [split]
+    assert data.excluded["recordings without a caption"] == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "end", "count"), [(2.05, 41, 2), (2.05, 40, 1), (2.0, 41, 1), (10.05, 201, 0)]
+)
+def test_clips_are_counted_by_the_times_of_their_captions(seconds, end, count):
+    """A clip has one row of features less than it has frames, from 40 to 199 rows."""
+    assert captioned({"a": "train"}, seconds, end).count() == count
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds", "rate"),
+    [
+        *((120.0, 20.04, 60), (120.0, 20.06, 120), (120.0, 10.04, 120), (60.0, 10.04, 120)),
+        *((60.0, 10.06, 60), (100.0, 12.0, 100), (100.0, 10.0, 120), (100.0, None, 100)),
+    ],
+)
+def test_a_duration_fits_a_rate_within_one_frame_at_20_per_second(header, seconds, rate):
+    assert cmu.decide_rate(1200, header, seconds, None, is_sixty=False) == rate
+
+
+def test_a_rate_is_decided_by_the_last_clip_and_the_duration_of_the_recording(monkeypatch):
+    data = cmu.CMU("there", workers=1)
+    data.table = None
+    data.files = {name: [Path(f"{name}.amc")] for name in ("02_01", "60_01")}
+    ends = {"a": 50, "b": 90, "c": 70}
+    rows = [IndexedClip(name, "CMU/02/02_01_poses", 5, end) for name, end in ends.items()]
+    rows.append(IndexedClip("d", "CMU/60/60_01_poses", 20, 30))
+    texts = {row.name: [Description("walks", [])] for row in rows}
+    data.humanml3d = rows, texts, dict.fromkeys(texts, "train")  # type: ignore[assignment]
+    data.kit = [("kit1", "02_01", "Somebody walks.", 4.5)]
+    evidence = {}
+
+    def in_order(_, tasks, workers):
+        evidence.update({files[0].stem: facts for files, facts, _ in tasks})
+        return ["it is damaged"] * len(tasks)
+
+    monkeypatch.setattr(cmu, "in_order", in_order)
+    with pytest.raises(UserError, match=r"The first error is: it is damaged"):
+        list(data.clips(20.0))
+    assert evidence == {"02_01": (4.5, 90, False), "60_01": (None, 30, True)}
+    assert data.findings() == ["left out: it is damaged"] * 2

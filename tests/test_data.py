@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from itertools import islice, product
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,13 +31,25 @@ from flame_mdm.data import (
     split_blocks,
     swap_sides,
 )
+from flame_mdm.data.adaptation import Lesson
+from flame_mdm.data.babel import Babel
+from flame_mdm.data.bandai import Bandai
+from flame_mdm.data.cmu import CMU
 from flame_mdm.data.crops import Crop, Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, MotionDataModule, TrainingBatches, evaluation_batches
-from flame_mdm.data.resident import ResidentLoader, free_memory
+from flame_mdm.data.folder import Folder
+from flame_mdm.data.humanact12 import HumanAct12
+from flame_mdm.data.humanml3d import HumanML3D, HumanML3DSMPL
+from flame_mdm.data.kit import KIT, KITTemos
+from flame_mdm.data.mixture import Mixture
+from flame_mdm.data.resident import ResidentLoader, free_memory, resident_features
 from flame_mdm.data.store import Store, _fingerprint, write_store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.data.synthetic_sequences import SyntheticSequences
+from flame_mdm.data.uestc import UESTC
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Frames
+from flame_mdm.representations.essential import Essential
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rifke import Rifke
 from flame_mdm.representations.rot6d import Rot6D
@@ -153,6 +166,7 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path, monkeypatch)
         {"split": "val"},
         {"window": (0, 20)},
         {"attributes": {"speed": "slow"}},
+        {"license": "CC0-1.0"},
     ],
 )
 def test_the_fingerprint_tells_each_field_of_a_clip(tmp_path, changed):
@@ -680,3 +694,289 @@ def test_at_most_five_names_are_listed():
     assert some("edcba") == "a, b, c, d, e"
     assert some("gfedcba") == "a, b, c, d, e and 2 more"
     assert some([]) == ""
+
+
+@pytest.mark.parametrize("resident", [True, False])
+def test_the_order_of_training_clips_follows_the_seed_of_the_recipe(root, resident):
+    drawn = {}
+    for seed in (0, 7):
+        data = module(root, CROPS[0], resident=resident, seed=seed)
+        drawn[seed] = [batch.ids for batch in islice(loader(data, "train"), 3)]
+        stream = TrainingBatches(data.train.lengths, 4, seed=seed, first=0, rank=0, world=1)
+        expected = [
+            [data.train.clips[index].id for index, _ in draws] for draws in islice(stream, 3)
+        ]
+        assert drawn[seed] == expected
+        assert data.train.seed == data.val.seed == data.test.seed == seed
+    assert drawn[0] != drawn[7]
+
+
+def test_crops_and_captions_of_training_follow_the_seed_and_the_number_of_the_batch(store):
+    parts = {"representation": HumanML(), "crop": Units(24, 28, 4)}
+    first, again, other = (Clips(store, "train", seed=seed, **parts) for seed in (0, 0, 1))
+    rows = np.arange(len(first))
+    draws = [first.draw(rows, 3), other.draw(rows, 3), first.draw(rows, 4)]
+    np.testing.assert_array_equal(draws[0], again.draw(rows, 3))
+    for part in (0, 2):  # first frames and captions
+        assert len({tuple(draw[part].tolist()) for draw in draws}) == 3
+    half = first.draw(rows[10:], 3)
+    np.testing.assert_array_equal(half, np.array(draws[0])[:, 10:])
+
+
+@pytest.mark.parametrize(
+    ("device", "option", "share", "is_kept"),
+    [
+        ("cpu", "auto", 7.9, False),
+        ("cpu", "auto", 8.1, True),
+        ("cuda", "auto", 4.1, True),
+        ("cuda", "auto", 3.9, False),
+        ("mps", "auto", 100, False),
+        ("mps", True, 1.1, True),
+        ("cuda", False, 100, False),
+    ],
+)
+def test_processes_share_the_memory_of_a_cpu_but_not_that_of_gpus(
+    root, device, option, share, is_kept, monkeypatch
+):
+    data = module(root, CROPS[0], resident=option)
+    size = 4 * data.open().features.size
+    monkeypatch.setattr(datamodule, "free_memory", lambda device: int(share * size))
+    strategy = SimpleNamespace(root_device=torch.device(device))
+    data.trainer = SimpleNamespace(strategy=strategy, num_devices=2)  # type: ignore[assignment]
+    data.setup("fit")
+    assert data.device == (torch.device(device) if is_kept else None)
+
+
+def test_training_clips_are_tested_only_where_the_published_split_has_no_test_clips(root):
+    data = module(root, CROPS[0])
+    data.setup("fit")
+    counts = data.store.info["clips"]
+    ids = {split: [clip.id for clip in data.clips(split).clips] for split in counts}
+    assert all(ids.values())
+    for published, tests, tested in (
+        (False, 0, "test"),
+        (True, counts["test"], "test"),
+        (True, 0, "train"),
+    ):
+        data.store.info |= {"published_split": published, "clips": counts | {"test": tests}}
+        assert [clip.id for clip in data.clips("test").clips] == ids[tested], (published, tests)
+        assert [clip.id for clip in data.clips("val").clips] == ids["val"]
+
+
+def test_references_come_in_the_order_of_the_request_or_not_at_all(tmp_path):
+    draw = np.random.default_rng(0)
+    recordings = {name: draw.normal(size=(frames, 22, 3)) for frames, name in enumerate("abc", 3)}
+    clips = [clip(name, reference=recording) for name, recording in recordings.items()]
+    store = write_store(tmp_path / "store", OwnClips(*clips, clip("without")), HumanML())
+    for names in ("b", "ca", "bca"):
+        references = store.references(list(names))
+        assert references is not None
+        for name, joints in zip(names, references, strict=True):
+            np.testing.assert_array_equal(joints, recordings[name].astype(np.float32))
+    assert store.references(["a", "without"]) is None
+    bare = write_store(tmp_path / "bare", OwnClips(clip("a")), HumanML())
+    assert bare.references(["a"]) is None
+
+
+@pytest.mark.parametrize("changed", ["representation", "fps", "mean", "std"])
+def test_the_fingerprint_tells_representation_rate_and_statistics(store, changed):
+    facts = {
+        "representation": store.info["representation"],
+        "fps": store.info["fps"],
+        "mean": store.mean,
+        "std": store.std,
+        "version": 1,
+    }
+    assert _fingerprint(store.folder, **facts) == store.fingerprint
+    if changed in ("mean", "std"):
+        other = facts[changed].copy()
+        other[-1] += 0.001
+    else:
+        other = {"representation": "another", "fps": 25.0}[changed]
+    assert _fingerprint(store.folder, **facts | {changed: other}) != store.fingerprint
+
+
+PATHS = {"path", "amass", "body_models", "captions", "humanact12", "prior", "splits", "workers"}
+"""Arguments of sources that do not define the data."""
+OFTEN = {"often": ["nod"], "often_share": 0.2}
+MORE_OFTEN = {"clips": 7, "seed": 2, "often": ["wave"], "often_share": 0.3}
+CHANGES: list[tuple[Any, list[Any], dict[str, Any], dict[str, Any]]] = [
+    (Folder, ["a"], {}, {"motion": "smpl", "mirror": True, "exclude": ["x"], "balance": 3}),
+    (Folder, ["a"], {}, {"license": "MIT", "prefixes": {"captured": ["walk"]}}),
+    (Folder, ["a"], {"prefixes": {"captured": ["walk"]}}, {"prefixes": {"real": ["walk"]}}),
+    (Synthetic, [], {}, {"clips": 7, "seed": 2, "actions": "all"}),
+    (Synthetic, [], OFTEN | {"actions": "all"}, MORE_OFTEN | {"core_share": 0.3}),
+    (SyntheticSequences, [], OFTEN, MORE_OFTEN),
+    (Bandai, ["a"], {}, {"motion": "smpl", "mirror": False, "exclude": ["x"]}),
+    (Bandai, ["a"], {}, {"split": "compositional"}),
+    (CMU, ["a"], {}, {"motion": "smpl", "exclude": ["x"]}),
+    (Babel, ["a", "b"], {}, {"published_split": True}),
+    (HumanAct12, ["a"], {}, {"published_split": True}),
+    (UESTC, ["a"], {}, {"published_split": True}),
+    (HumanML3D, ["a"], {}, {"exclude": ["x"], "bone_lengths": [0.1] * 22}),
+    (HumanML3DSMPL, ["a", "b"], {}, {"published_split": True, "exclude": ["x"]}),
+    (KIT, ["a"], {}, {"exclude": ["x"]}),
+    (KITTemos, ["a", "b"], {}, {"exclude": ["x"]}),
+    (Mixture, [], {"parts": {"a": Synthetic(1)}}, {"parts": {"a": Synthetic(2)}}),
+    (Mixture, [], {"parts": {"a": Synthetic(1)}}, {"parts": {"b": Synthetic(1)}}),
+    (Mixture, [], {"parts": {"a": Synthetic(1)}}, {"use": "research"}),
+    (Lesson, ["a", "b"], {}, {"motion": "smpl"}),
+]
+
+
+@pytest.mark.parametrize(("source", "paths", "before", "changes"), CHANGES)
+def test_every_option_that_defines_the_data_is_in_the_options_of_a_source(
+    source, paths, before, changes
+):
+    plain = source(*paths, **before).options
+    for name, value in changes.items():
+        assert source(*paths, **before | {name: value}).options != plain, name
+
+
+@pytest.mark.parametrize(
+    "source", dict.fromkeys(row[0] for row in CHANGES), ids=lambda kind: kind.__name__
+)
+def test_every_argument_of_a_source_is_a_path_or_an_option(source):
+    changed = {name for kind, _, _, changes in CHANGES if kind is source for name in changes}
+    assert {*signature(source).parameters} - PATHS == changed
+
+
+NO_OPTIONS: dict[str, Any] = {"exclude": (), "workers": 0}
+
+
+@pytest.mark.parametrize(
+    ("part", "defaults"),
+    [
+        (Units, {"min_frames": 40, "max_frames": 196, "unit": 4}),
+        (Whole, {"min_frames": 1, "max_frames": 471}),
+        (Fixed, {"frames": 60, "min_frames": 1}),
+        (Babel, {"published_split": False, "workers": 0}),
+        (Bandai, NO_OPTIONS | {"motion": "joints", "mirror": True, "split": "takes"}),
+        (CMU, NO_OPTIONS | {"captions": None, "motion": "joints"}),
+        (
+            Folder,
+            NO_OPTIONS
+            | {"motion": "joints", "mirror": False, "balance": 0, "license": "", "prefixes": None},
+        ),
+        (HumanAct12, {"published_split": False}),
+        (HumanML3D, NO_OPTIONS | {"amass": None, "body_models": None, "bone_lengths": None}),
+        (HumanML3DSMPL, NO_OPTIONS | {"humanact12": None, "published_split": False}),
+        (KIT, {"exclude": ()}),
+        (KITTemos, NO_OPTIONS),
+        (Lesson, {"motion": "joints"}),
+        (Mixture, {"use": "any"}),
+        (
+            Synthetic,
+            {
+                **{"clips": 5000, "seed": 0, "workers": 0, "actions": "core", "core_share": 0.0},
+                **{"often": (), "often_share": 0.0},
+            },
+        ),
+        (
+            SyntheticSequences,
+            {"clips": 5000, "seed": 0, "workers": 0, "often": (), "often_share": 0.0},
+        ),
+        (UESTC, {"published_split": False}),
+        (MotionDataModule, {"num_workers": 0, "seed": 0, "resident": "auto", "pad_multiple": 1}),
+    ],
+)
+def test_defaults_of_data_do_not_change(part, defaults):
+    parameters = signature(part).parameters.values()
+    assert {p.name: p.default for p in parameters if p.default is not p.empty} == defaults
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong"),
+    [
+        ("batch_size", (1,), (0, -1)),
+        ("num_workers", (0, 1), (-1,)),
+        ("name", ("a", "my data.2"), (".a", "a/b", "", "../a", " a")),
+        ("resident", (True, False, "auto"), ("yes", 2)),
+        ("pad_multiple", (1, 100_000), (0, 100_001)),
+        ("crop", (Whole(1, 100_000), Fixed(1)), (Whole(1, 100_001), Whole(0, 5), Fixed(0), "a")),
+    ],
+)
+def test_options_of_batches_have_limits(tmp_path, name, right, wrong):
+    options = {"root": str(tmp_path), "name": "s", "batch_size": 4, "crop": Whole()}
+    for value in right:
+        MotionDataModule(Synthetic(clips=1), HumanML(), **options | {name: value})
+    for value in wrong:
+        with pytest.raises(UserError, match=rf"data\.{name}="):
+            MotionDataModule(Synthetic(clips=1), HumanML(), **options | {name: value})
+
+
+@pytest.mark.parametrize(
+    ("frames", "is_right"),
+    [
+        *(((4, 4, 4), True), ((40, 40, 1), True), ((40, 196, 4), True)),
+        *(((40, 198, 4), False), ((3, 196, 4), False), ((200, 196, 4), False)),
+        *(((40, 196, 0), False), ((40, 41, 40), False)),
+    ],
+)
+def test_the_longest_crop_is_made_of_units_and_the_shortest_has_at_least_one(frames, is_right):
+    if is_right:
+        assert Units(*frames).longest() == frames[1]
+    else:
+        with pytest.raises(UserError, match=r"expected 1 <= unit <= min_frames <= max_frames"):
+            Units(*frames)
+
+
+def test_free_memory_is_that_of_the_machine_if_the_available_memory_is_unknown(monkeypatch):
+    limits = {"memory.max": "max\n", "memory.current": "1000\n"}
+    monkeypatch.setattr(resident.os, "sysconf", {"SC_PHYS_PAGES": 3, "SC_PAGE_SIZE": 4096}.get)
+
+    def read_text(path: Path) -> str:
+        if path.name == "meminfo":
+            raise FileNotFoundError
+        return limits[path.name]
+
+    monkeypatch.setattr(resident.Path, "read_text", read_text)
+    assert free_memory(torch.device("cpu")) == 3 * 4096
+    limits["memory.max"] = "5000\n"
+    assert free_memory(torch.device("cpu")) == 4000
+
+
+def test_features_are_copied_to_a_device_in_parts(store, monkeypatch):
+    cpu = torch.device("cpu")
+    normalized = (store.features - store.mean) / store.std
+    for size in (7, len(store.features) - 1, len(store.features), len(store.features) + 1):
+        monkeypatch.setattr(resident, "CHUNK", size)
+        features = resident_features(store, HumanML(), cpu)
+        np.testing.assert_array_equal(features[:-1], normalized)
+        assert not features[-1].any()
+    raw = resident_features(store, Rot6D(), cpu)
+    np.testing.assert_array_equal(raw[:-1], store.features)
+    assert not raw[-1].any()
+
+
+@pytest.mark.parametrize(
+    ("window", "is_inside"),
+    [
+        *(((0, 30), True), ((20, 10), True), ((29, 1), True), ((0, 1), True)),
+        *(((21, 10), False), ((-1, 10), False), ((5, 0), False), ((30, 1), False)),
+    ],
+)
+def test_windows_end_with_their_motion_at_the_latest(tmp_path, window, is_inside):
+    features = np.random.default_rng(0).normal(size=(30, 263)).astype(np.float32)
+    first = clip("a", motion=features[:7], encoded=ENCODED)
+    source = OwnClips(first, clip("b", motion=features, encoded=ENCODED, window=window))
+    if is_inside:
+        store = write_store(tmp_path / "store", source, HumanML())
+        begin, length = window
+        assert store.clips[1].start == 7 + begin
+        np.testing.assert_array_equal(store.motion(store.clips[1]), features[begin:][:length])
+    else:
+        with pytest.raises(UserError, match=r"clip b: window .* exceeds 30 frames"):
+            write_store(tmp_path / "store", source, HumanML())
+
+
+def test_the_first_columns_of_published_features_are_stored_for_a_part_of_them(tmp_path):
+    features = np.random.default_rng(0).normal(size=(30, 263)).astype(np.float32)
+    source = OwnClips(clip("a", motion=features, encoded=ENCODED))
+    source.statistics = lambda: (np.arange(263.0), np.arange(1.0, 264.0))
+    store = write_store(tmp_path / "store", source, Essential())
+    np.testing.assert_array_equal(store.features, features[:, :67])
+    assert (store.mean.tolist(), store.std.tolist()) == ([*range(67)], [*range(1, 68)])
+    for representation in (HumanML(variant="legacy"), Essential(variant="legacy")):
+        with pytest.raises(UserError, match=f"cannot be converted to {representation.name}"):
+            write_store(tmp_path / "other", source, representation)

@@ -6,6 +6,7 @@ import re
 import time
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from support.stores import write_amass
 from flame_mdm.__main__ import main
 from flame_mdm.config import compose_data, instantiate
 from flame_mdm.data import Clip, hashed_split, name_hash
+from flame_mdm.data import folder as folder_reader
 from flame_mdm.data.captions import drawn_splits
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
@@ -621,3 +623,71 @@ def test_a_stated_split_holds_for_all_motions_of_the_source():
     sources = {"a": "one", "b": "one", "c": "two", "d": "three"}
     splits = drawn_splits(sources, {"a": "test", "b": None, "c": "val", "d": None})
     assert splits == {"a": "test", "b": "test", "c": "val", "d": "train"}
+
+
+def test_the_error_of_fitted_rotations_is_rounded_up_to_centimeters(tmp_path: Path, monkeypatch):
+    np.savez(tmp_path / "a.npz", joints=WALK, fps=30)
+    motion = torch.ones(30, 75, dtype=torch.float64)
+    note = "rotations were fitted to joints, on the body of an adult"
+    for error, centimeters in ((0.0301, 4), (0.03, 3), (0.001, 1), (0.25, 25)):
+        fitted = SimpleNamespace(values=motion, note=note, error=error)
+        monkeypatch.setattr(folder_reader, "raw_motion", lambda *_, fitted=fitted: fitted)
+        attempt = folder_reader._read(
+            "smpl", SMPL(), 20.0, folder_reader.MotionFile(tmp_path / "a.npz")
+        )
+        expected = f"rotations were fitted to joints, with a mean error of at most {centimeters} cm"
+        assert attempt.notes[-1] == expected
+        assert (attempt.motion.dtype, attempt.motion.shape) == (np.float32, (30, 75))
+
+
+@pytest.mark.parametrize(("frames", "is_read"), [(2, False), (3, True)])
+def test_a_motion_has_at_least_three_frames_at_the_rate_of_the_model(
+    tmp_path: Path, frames: int, is_read: bool
+):
+    np.savez(tmp_path / "a.npz", joints=WALK[:frames], fps=30)
+    attempt = folder_reader._read(
+        "joints", None, 30.0, folder_reader.MotionFile(tmp_path / "a.npz")
+    )
+    assert (len(attempt.motion) == frames) == is_read
+    assert (f"only {frames} frames at 30 fps" in attempt.error) != is_read
+    attempt = folder_reader._read(
+        "joints", None, 10.0, folder_reader.MotionFile(tmp_path / "a.npz")
+    )
+    assert "only 1 frames at 10 fps" in attempt.error
+
+
+def test_files_that_are_newer_than_the_store_have_changed(tmp_path: Path):
+    mine, store = tmp_path / "mine", tmp_path / "store.json"
+    (mine / "deep").mkdir(parents=True)
+    for number, path in enumerate((mine / "b.npz", store, mine / "deep" / "a.txt")):
+        path.touch()
+        os.utime(path, (1000 + number // 2, 1000 + number // 2))
+    source = Folder(str(mine))
+    (line,) = source.changed(store)
+    assert line.startswith(f"{mine}: deep/a.txt changed since the data set was prepared")
+    os.utime(store, (1001, 1001))
+    assert source.changed(store) == []
+
+
+def test_captions_of_the_table_precede_those_of_the_text_file(tmp_path: Path):
+    for name in ("a", "b"):
+        np.savez(tmp_path / f"{name}.npz", joints=WALK, fps=30)
+    rows = [("a", "one "), ("b", "other"), ("a", " two")]
+    write_table(tmp_path, [{"id": name, "text": text, "source": " take"} for name, text in rows])
+    (tmp_path / "a.txt").write_text(" three # 3 \n#four\n\nfive")
+    source = Folder(str(tmp_path))
+    assert source.notes["a"].texts == ["one", "two", "three", "five"]
+    assert source.notes["b"].texts == ["other"]
+    assert [clip.source for clip in source.clips(20.0)] == ["take", "take"]
+
+
+def test_reading_a_folder_again_reports_each_motion_once(tmp_path: Path):
+    for name in "ab":
+        np.savez(tmp_path / f"{name}.npz", joints=WALK, fps=30)
+    (tmp_path / "c.bvh").write_text("HIERARCHY\n")
+    source = Folder(str(tmp_path))
+    for _ in range(2):
+        assert [clip.id for clip in source.clips(20.0)] == ["a", "b"]
+        assert source.findings() == ["SMPL, unit 1, 30 fps: 2 motions"]
+        assert len(source.failures) == 1
+    assert source.failure_lines()[-1].startswith("error: 1 of 3 motions in ")

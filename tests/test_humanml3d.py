@@ -4,6 +4,9 @@ import math
 import shutil
 import tarfile
 import zipfile
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -612,3 +615,62 @@ def test_times_of_parts_are_rounded_down_and_end_with_the_motion(begin, end, cut
     items = t2m.cuts("x", 150, [part], 40)
     assert [(item.start, item.length) for item in items] == ([] if cut is None else [cut])
     assert all(item.id == f"x@{begin:g}-{end:g}" for item in items)
+
+
+@pytest.mark.parametrize(
+    ("gender", "body"),
+    [("male", "male"), ("female", "female"), ("neutral", "female"), ("unknown", "female")],
+)
+def test_recordings_of_neither_gender_show_the_female_body(gender, body):
+    bodies: Any = {
+        name: SimpleNamespace(joints=lambda recording, name=name: (name, recording.translation))
+        for name in ("male", "female")
+    }
+    path = np.arange(180)[:, None] * np.ones(3)
+    recording = Recording(np.zeros((180, 156)), path, np.zeros(16), gender, 60.0)
+    rows = [IndexedClip("a", "CMU/x", 0, 10), IndexedClip("b", "CMU/x", 5, 30)]
+    written = {}
+
+    def write(row, joints):
+        written[row.name] = joints
+
+    assert humanml3d._from_amass(partial(write), bodies, rows, recording) == 2
+    assert {name: shown for name, (shown, _) in written.items()} == {"a": body, "b": body}
+    assert written["a"][1][:, 0].tolist() == list(range(0, 30, 3))
+    assert written["b"][1][:, 0].tolist() == list(range(15, 90, 3))
+
+
+def test_captions_of_the_smpl_form_end_with_one_point():
+    source = HumanML3DSMPL("a", "b")
+    texts = [t2m.Description(text, []) for text in ("walks.", "sits")]
+    source.folder = cast(HumanML3D, SimpleNamespace(names={"x": "val"}, texts={"x": texts}))
+    row, motion = IndexedClip("x", "CMU/x", 0, 5), np.zeros((5, 75))
+    clips = list(source._clips(row, motion))
+    assert [(clip.id, clip.captions) for clip in clips] == [("x#0", ["walks."]), ("x#1", ["sits."])]
+    assert {(clip.split, clip.source) for clip in clips} == {("val", "x")}
+    assert not list(source._clips(row, motion[:0]))
+    assert source.excluded == {"motions without a frame": 1}
+
+
+def test_words_are_kept_if_every_description_of_a_part_has_them():
+    tagged, bare = t2m.Description("sits", ["sit/VERB"]), t2m.Description("walks", [])
+    motion = np.zeros((9, 3))
+    clips = [
+        t2m.Cut("x", 2, 5, list(descriptions)).clip(motion, "val", "take", recording="r")
+        for descriptions in ((tagged, tagged), (tagged, bare), (bare, bare))
+    ]
+    assert [clip.attributes for clip in clips] == [
+        {"recording": "r", "tokens": [["sit/VERB"]] * 2},
+        {"recording": "r"},
+        {"recording": "r"},
+    ]
+    assert clips[1].captions == ["sits", "walks"]
+    assert {(clip.window, clip.source, clip.split) for clip in clips} == {((2, 5), "take", "val")}
+
+
+@pytest.mark.parametrize("count", [0, 3, 19, 20, 21, 40])
+def test_up_to_twenty_words_are_framed_and_padded_to_twenty_two(count):
+    tokens, length = t2m.frame_tokens([f"w{number}/NOUN" for number in range(count)])
+    kept = [f"w{number}/NOUN" for number in range(min(count, 20))]
+    assert tokens[:length] == ["sos/OTHER", *kept, "eos/OTHER"]
+    assert tokens[length:] == ["unk/OTHER"] * (22 - length)

@@ -166,7 +166,9 @@ def test_the_version_of_a_mixture_follows_the_versions_of_its_parts():
     assert (versions, Mixture.version) == ((1, 2, 2, 1), 1), message
 
 
-@pytest.mark.parametrize(("balance", "walks", "dances"), [(7, 8, 8), (9, 8, 8), (11, 12, 12)])
+@pytest.mark.parametrize(
+    ("balance", "walks", "dances"), [(7, 8, 8), (9, 8, 8), (11, 12, 12), (999, 64, 32)]
+)
 def test_the_number_of_copies_is_rounded(people: Path, balance: int, walks: int, dances: int):
     """Of two walks and a dance, each with its mirror image."""
     source = Folder(str(people), mirror=True, balance=balance)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.runs import TINY
 from support.stores import (
     TAKES,
@@ -28,7 +29,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.config import EXPERIMENTS
 from flame_mdm.data import verify
 from flame_mdm.data.bandai import split_of
-from flame_mdm.data.store import Store, write_store
+from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats import bvh
 from flame_mdm.representations.humanml import HumanML
@@ -298,3 +299,72 @@ def test_figures_are_compared_within_the_rounding_of_the_published_ones(monkeypa
         **{"fewest clips per action": 3, "most clips per action": 6},
         **{"fewest training clips per action": 3, "most training clips per action": 3},
     }
+
+
+def test_a_report_describes_the_lengths_captions_and_actions_of_the_clips(tmp_path: Path):
+    draw = np.random.default_rng(0)
+    facts = [(10, "train", 0), (20, "train", 1), (30, "val", 1), (45, "test", None)]
+    clips = [
+        clip(
+            f"{frames}",
+            split,
+            motion=draw.normal(2, 3, (frames, 263)).astype(np.float32),
+            encoded="humanml-clean-smpl22",
+            action=action,
+        )
+        for frames, split, action in facts
+    ]
+    clips[0].captions = ["A person walks", "he  walks"]
+    clips[1].captions = ["A person walks"]
+    clips[2].captions = []
+    clips[3].captions = ["walks, walks"]
+    source = OwnClips(*clips)
+    source.actions = ("walk", "sit")
+    training = np.concatenate([clip.motion for clip in clips[:2]])
+    mean, std = HumanML().statistics(torch.from_numpy(training))
+    source.statistics = lambda: ((mean - 0.25 * std).numpy(), (3 * std).numpy())
+    store = write_store(tmp_path / "store", source, HumanML())
+    crop = SimpleNamespace(min_frames=20)
+    data: Any = SimpleNamespace(open=lambda: store, crop=crop, representation=HumanML())
+    report = verify.report(data)
+    assert report == json.loads((store.folder / "verify.json").read_text())
+    assert report["frames"] == {
+        **{"frames": 105, "features": 263, "shortest clip": 10, "median clip": 25.0},
+        **{"longest clip": 45, "clips below the 20 frames that cropping needs": 1},
+    }
+    assert report["captions"] == {
+        **{"captions": 4, "different captions": 3, "different words": 4},
+        "clips without a caption": 1,
+    }
+    assert report["actions"] == {
+        "walk": {"train": 1, "val": 0, "test": 0},
+        "sit": {"train": 1, "val": 1, "test": 0},
+    }
+    assert report["statistics"] == pytest.approx(
+        {"largest difference of a mean, in std": 0.25, "largest relative difference of a std": 2},
+        rel=1e-4,
+    )
+
+
+def test_a_clip_is_still_if_no_joint_moves_by_a_centimeter_from_its_first_position():
+    paths = {
+        "moves": [0.0, 0.0, 0.011, 0.0],
+        "trembles": [0.0, 0.009, -0.009, 0.009],
+        "stands": [0.5] * 4,
+        "drifts": [0.0, 0.004, 0.008, 0.012],
+    }
+    joints = np.zeros((16, 2, 3), np.float32)
+    joints[:, 1, 0] = np.concatenate(list(paths.values()))
+    clips = [Entry(name, 4 * n, 4, "train", name, [], None) for n, name in enumerate(paths)]
+    clips.append(Entry("copy", 8, 4, "train", "copy", [], None))
+    store: Any = SimpleNamespace(
+        clips=clips, folder=Path("x"), motion=lambda clip: features[clip.start :][: clip.length]
+    )
+    features = joints.reshape(16, 6)
+    representation: Any = SimpleNamespace(decode=lambda x: x.unflatten(-1, (2, 3)))
+    still, duplicates = verify._anomalies(store, representation)
+    assert [clip.id for clip in still] == ["trembles", "stands", "copy"]
+    assert duplicates == []
+    joints[8:12] = joints[4:8]
+    _, duplicates = verify._anomalies(store, representation)
+    assert [[clip.id for clip in group] for group in duplicates] == [["trembles", "stands"]]

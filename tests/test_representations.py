@@ -1,6 +1,7 @@
 import itertools
 import math
 import re
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -636,3 +637,122 @@ def test_the_adult_body_is_symmetric_and_does_not_change():
     np.testing.assert_allclose(adult.sum(0), [0, -1, 0], atol=1e-12)
     weighted = (np.arange(24) + 1) @ np.abs(adult)
     np.testing.assert_allclose(weighted, [33.391, 25.785, 8.775], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("representation", "columns"),
+    [
+        (HumanML(), [*range(4), *range(193, 196)]),
+        (HumanML("kit21"), [*range(4), *range(184, 187)]),
+        (Essential(), [*range(4)]),
+        (Rot6D(), [*range(6), *range(144, 150)]),
+        (SMPL(), [*range(9)]),
+        (Motion272(), [*range(11), *range(74, 77), *range(140, 146)]),
+    ],
+    ids=lambda part: getattr(part, "name", ""),
+)
+def test_the_path_belongs_to_the_root(representation: Representation, columns: list[int]):
+    assert representation.joint_features([0]).nonzero()[:, 0].tolist() == columns
+
+
+@pytest.mark.parametrize(
+    ("representation", "pose", "contacts"),
+    [
+        (HumanML(), (3, 193), [*range(259, 263)]),
+        (HumanML("kit21", "legacy"), (3, 184), [*range(247, 251)]),
+        (Essential(), (3, 67), None),
+        (Rifke(), (0, 64), None),
+        (SMPL(), (0, 147), None),
+    ],
+    ids=lambda part: getattr(part, "name", ""),
+)
+def test_poses_exclude_steps_velocities_and_contacts(representation, pose, contacts):
+    assert (representation.pose.start, representation.pose.stop) == pose
+    features = torch.arange(representation.features).repeat(2, 3, 1)
+    columns = representation.contacts(features)
+    assert (columns is None) == (contacts is None)
+    if contacts is not None:
+        assert columns.tolist() == [[contacts] * 3] * 2
+
+
+@pytest.mark.parametrize("kind", [SMPL, Rot6D, Motion272])
+def test_bones_have_the_lengths_of_the_given_offsets(kind: type[SMPL]):
+    generator = torch.Generator().manual_seed(0)
+    sizes = 0.5 + torch.rand(24, 1, generator=generator, dtype=torch.float64)
+    offsets = torch.tensor(ADULT, dtype=torch.float64) * sizes
+    offsets[0] = torch.tensor([0.1, -0.2, 0.3])
+    representation = kind(offsets=offsets.tolist())
+    raw = 0.4 * torch.randn(6, 75, generator=generator, dtype=torch.float64)
+    features = representation.encode(raw).double()
+    bones = representation.skeleton.bones(representation.decode(features)).norm(dim=-1)
+    expected = offsets.norm(dim=-1)[: len(representation.skeleton)]
+    close(bones[:, 1:], expected[1:].expand(6, -1), 1e-5)
+
+
+def test_the_pelvis_of_smpl_is_beside_the_translation():
+    offsets = [(0.1, -0.2, 0.3), *ADULT[1:]]
+    raw = torch.zeros(1, 75)
+    raw[0, :3] = torch.tensor([1.0, 2.0, 3.0])
+    pelvis = SMPL(offsets=offsets).decode(SMPL().encode(raw))[0, 0]
+    close(pelvis, torch.tensor([-1.1, 3.3, 1.8]), 1e-6)
+
+
+@pytest.mark.parametrize("kind", [SMPL, Motion272])
+@pytest.mark.parametrize("joints", [24, 52, 55])
+def test_fingers_and_faces_of_raw_motions_do_not_change_the_features(kind, joints: int):
+    generator = torch.Generator().manual_seed(0)
+    raw = 0.3 * torch.randn(5, 3 + 3 * joints, generator=generator)
+    assert torch.equal(kind().encode(raw), kind().encode(raw[:, :75]))
+
+
+@pytest.mark.parametrize("kind", [SMPL, Rot6D])
+def test_features_of_rotations_are_not_normalized(kind):
+    mean, std = kind().statistics(torch.randn(50, kind().features))
+    assert torch.equal(mean, torch.zeros(kind().features))
+    assert torch.equal(std, torch.ones(kind().features))
+
+
+@pytest.mark.parametrize("variant", ["clean", "legacy"])
+@pytest.mark.parametrize(("units", "threshold"), [(1.0, 0.002), (640.0, 0.05)])
+@pytest.mark.parametrize("foot", range(4))
+def test_a_foot_has_contact_until_the_frame_before_it_moves(variant, units, threshold, foot: int):
+    representation = HumanML(variant=variant, units_per_metre=units, contact_threshold=threshold)
+    still = torch.from_numpy(posed(20).joints).double()
+    for share, contact in ((0.99, 1), (1.01, 0)):
+        joints = still.clone()
+        joints[6:, SMPL22.feet[foot], 0] += share * math.sqrt(threshold) / units
+        contacts = representation.contacts(representation.encode(joints))
+        assert contacts is not None
+        expected = torch.ones(19, 4)
+        expected[5, foot] = contact
+        assert torch.equal(contacts, expected)
+
+
+@pytest.mark.parametrize(("frames", "factor", "count"), [(1, 8, 1), (2, 8, 9), (3, 4, 9)])
+def test_frames_are_added_between_the_first_and_the_last(frames: int, factor: int, count: int):
+    times = upsample(torch.arange(frames)[:, None].double(), factor)[:, 0]
+    close(times, torch.arange(count) / factor, 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "defaults"),
+    [
+        *(
+            (
+                kind,
+                {
+                    **{"skeleton": "smpl22", "variant": "clean", "fps": 20.0, "bone_lengths": None},
+                    **{"units_per_metre": 1.0, "contact_threshold": 0.002},
+                },
+            )
+            for kind in (HumanML, Essential)
+        ),
+        (Rifke, {"fps": 12.5, "units_per_metre": 640.0}),
+        (Rot6D, {"fps": 20.0, "offsets": ADULT}),
+        (SMPL, {"fps": 20.0, "offsets": ADULT}),
+        (Motion272, {"fps": 30.0, "offsets": ADULT}),
+    ],
+)
+def test_defaults_of_representations_do_not_change(kind, defaults):
+    parameters = signature(kind).parameters.values()
+    assert {p.name: p.default for p in parameters} == defaults

@@ -247,3 +247,25 @@ def test_slerp_takes_the_shorter_way():
     assert ((a * half).sum(-1) >= 0.5**0.5 - 1e-9).all(), "the longer way round"
     steps = torch.linspace(0, 1, 5, dtype=a.dtype)[:, None, None]
     same(rotation.slerp(a, b, steps)[2], half, 1e-12)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_angles_of_every_order_are_those_that_made_the_matrix(order: str):
+    generator = torch.Generator().manual_seed(0)
+    share = 2 * torch.rand(200, 3, generator=generator, dtype=torch.float64) - 1
+    angles = share * torch.tensor([3.1, 1.55, 3.1])
+    same(rotation.matrix_to_euler(euler_to_matrix(angles, order), order), angles, 1e-7)
+
+
+@pytest.mark.parametrize("dim", [0, 1, -2])
+def test_neighboring_quaternions_of_any_time_axis_share_a_hemisphere(dim: int):
+    generator = torch.Generator().manual_seed(0)
+    angles = torch.linspace(0, 20, 40, dtype=torch.float64)[:, None] + torch.arange(3)
+    turns = functional.pad(angles[..., None], (1, 1))
+    signs = torch.randn(40, 3, 1, generator=generator, dtype=torch.float64).sign()
+    q = (signs * rotation.axis_angle_to_quaternion(turns)).movedim(0, dim)
+    smooth = rotation.continuous(q, dim)
+    same_rotation(smooth, q, 0)
+    in_time, before = smooth.movedim(dim, 0), q.movedim(dim, 0)
+    same(in_time[0], before[0], 0)
+    assert ((in_time[1:] * in_time[:-1]).sum(-1) > 0).all()

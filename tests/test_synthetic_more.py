@@ -834,3 +834,19 @@ def test_a_clip_shorter_than_a_second_has_no_attributes():
     assert read_attributes(still[:20], 20.0)["action"] == "stand"
     assert read_attributes(still[:19], 20.0) == {}
     assert "checks" not in read_all(still[:19], 20.0)
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        {"action": "nod"},
+        {"action": "walk", "direction": "left"},
+        {"action": "get up"},
+        {"action": "walk", "speed": "normal", "ends": "cycle"},
+    ],
+    ids=str,
+)
+def test_an_example_lasts_three_seconds_at_any_rate(attributes: Attributes):
+    slow, fast = example(attributes, 10), example(attributes, 30)
+    assert (len(slow), len(fast), len(example(attributes))) == (30, 90, 60)
+    assert slow.dtype == np.float32

@@ -666,11 +666,3 @@ def test_words_are_kept_if_every_description_of_a_part_has_them():
     ]
     assert clips[1].captions == ["sits", "walks"]
     assert {(clip.window, clip.source, clip.split) for clip in clips} == {((2, 5), "take", "val")}
-
-
-@pytest.mark.parametrize("count", [0, 3, 19, 20, 21, 40])
-def test_up_to_twenty_words_are_framed_and_padded_to_twenty_two(count):
-    tokens, length = t2m.frame_tokens([f"w{number}/NOUN" for number in range(count)])
-    kept = [f"w{number}/NOUN" for number in range(min(count, 20))]
-    assert tokens[:length] == ["sos/OTHER", *kept, "eos/OTHER"]
-    assert tokens[length:] == ["unk/OTHER"] * (22 - length)

@@ -249,14 +249,6 @@ def test_slerp_takes_the_shorter_way():
     same(rotation.slerp(a, b, steps)[2], half, 1e-12)
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_angles_of_every_order_are_those_that_made_the_matrix(order: str):
-    generator = torch.Generator().manual_seed(0)
-    share = 2 * torch.rand(200, 3, generator=generator, dtype=torch.float64) - 1
-    angles = share * torch.tensor([3.1, 1.55, 3.1])
-    same(rotation.matrix_to_euler(euler_to_matrix(angles, order), order), angles, 1e-7)
-
-
 @pytest.mark.parametrize("dim", [0, 1, -2])
 def test_neighboring_quaternions_of_any_time_axis_share_a_hemisphere(dim: int):
     generator = torch.Generator().manual_seed(0)

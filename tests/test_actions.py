@@ -550,22 +550,3 @@ def test_splits_of_the_action_sets_follow_from_the_hashes_of_their_names(tmp_pat
         own = [clip for clip in clips if clip.action == action]
         assert {clip.source: clip.split for clip in own} == expected
         assert [clip.source for clip in own] == [f"{label} {k // 10}" for k in range(30)]
-
-
-@pytest.mark.parametrize(
-    ("side", "view", "is_used"),
-    [(1, 0, True), (1, 8, True), (2, 7, True), (2, 8, False), (2, 0, True)],
-)
-def test_the_eighth_view_of_the_second_side_is_left_out(side, view, is_used):
-    source = UESTC("there")
-    source.videos = [uestc.Video(0, "a", 1, view, 1, side)]
-    assert source.count() == is_used
-
-
-def test_a_video_is_as_long_as_the_shorter_one_of_its_poses_and_its_frames(tmp_path: Path):
-    raw = write_uestc(tmp_path / "uestc")
-    frames = raw / "info" / "num_frames_min.txt"
-    lengths = [int(line) for line in frames.read_text().split()]
-    frames.write_text("\n".join(map(str, [lengths[0] - 7, lengths[1] + 7, *lengths[2:]])))
-    clips = [clip for clip, _ in zip(UESTC(str(raw)).clips(20.0), range(2), strict=False)]
-    assert [len(clip.motion) for clip in clips] == [lengths[0] - 7, lengths[1]]

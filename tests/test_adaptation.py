@@ -157,17 +157,6 @@ def test_an_odd_batch_has_one_more_clip_of_the_user(tmp_path: Path):
         assert len(set(batch)) == 5
 
 
-@pytest.mark.parametrize("fps", [10.0, 12.5, 20.0, 60.0])
-def test_the_floor_is_that_of_one_second_at_any_rate(fps: float):
-    joints = np.zeros((round(8 * fps), 22, 3))
-    begin = round(2 * fps)
-    joints[begin : begin + round(0.9 * fps), :, 1] = 0.5  # a jump
-    joints[-round(0.4 * fps) :, :, 1] = 0.3
-    assert fault_of(joints, fps) == ""
-    joints[-round(0.7 * fps) :, :, 1] = 0.3
-    assert fault_of(joints, fps) == "drifts upward by 30 cm (limit 5)"
-
-
 @pytest.mark.parametrize("batch_size", [1, 2, 4])
 def test_both_halves_of_a_batch_belong_to_the_same_step(batch_size: int, tmp_path: Path):
     """So that a resumed run continues both of them."""

@@ -488,14 +488,15 @@ def test_clips_are_counted_by_the_times_of_their_captions(seconds, end, count):
 
 
 @pytest.mark.parametrize(
-    ("header", "seconds", "rate"),
+    ("header", "seconds", "is_sixty", "rate"),
     [
-        *((120.0, 20.04, 60), (120.0, 20.06, 120), (120.0, 10.04, 120), (60.0, 10.04, 120)),
-        *((60.0, 10.06, 60), (100.0, 12.0, 100), (100.0, 10.0, 120), (100.0, None, 100)),
+        *((120.0, 20.04, False, 60), (120.0, 20.06, False, 120), (60.0, 10.04, False, 120)),
+        *((60.0, 10.06, False, 60), (100.0, 10.0, False, 120), (100.0, None, False, 100)),
+        *((100.0, 12.0, True, 100), (100.0, 13.0, True, 60), (None, 12.0, True, 60)),
     ],
 )
-def test_a_duration_fits_a_rate_within_one_frame_at_20_per_second(header, seconds, rate):
-    assert cmu.decide_rate(1200, header, seconds, None, is_sixty=False) == rate
+def test_a_duration_fits_a_rate_within_one_frame_at_20_per_second(header, seconds, is_sixty, rate):
+    assert cmu.decide_rate(1200, header, seconds, None, is_sixty) == rate
 
 
 def test_a_rate_is_decided_by_the_last_clip_and_the_duration_of_the_recording(monkeypatch):

@@ -547,6 +547,6 @@ def test_splits_of_the_action_sets_follow_from_the_hashes_of_their_names(tmp_pat
         ranked = first_hashes({block: f"humanact12_{action}_{block}" for block in range(3)})
         expected = {f"{label} {ranked[k]}": split for k, split in enumerate(("test", "val"))}
         expected[f"{label} {ranked[2]}"] = "train"
-        own = [clip for clip in clips if clip.action == action]
-        assert {clip.source: clip.split for clip in own} == expected
-        assert [clip.source for clip in own] == [f"{label} {k // 10}" for k in range(30)]
+        of_action = [clip for clip in clips if clip.action == action]
+        assert {clip.source: clip.split for clip in of_action} == expected
+        assert [clip.source for clip in of_action] == [f"{label} {k // 10}" for k in range(30)]

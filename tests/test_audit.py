@@ -801,3 +801,30 @@ def test_a_card_states_which_values_are_exact_and_what_they_depend_on(scene):
     assert not facts["jitter"]["sees_meaning"]
     assert measure.direction_of("fid") is False
     assert measure.direction_of("attributes/action") is True
+
+
+def test_cards_of_the_same_lengths_the_test_split_and_the_same_data_come_first(card):
+    def strength(motions: int, **changes: Any) -> tuple[Any, ...]:
+        data = card.data.model_copy(
+            update={name: changes[name] for name in ("frames", "fingerprint") if name in changes}
+        )
+        return CitedCard(Path("a"), motions, changes.get("split", "test"), data).strength(card.data)
+
+    ranked = [
+        strength(2),
+        strength(1),
+        strength(900, fingerprint="other"),
+        strength(9000, split="train"),
+        strength(90_000, frames=[24, 61]),
+        strength(1, frames=[24, 61], split="train", fingerprint="other"),
+    ]
+    assert ranked == sorted(ranked, reverse=True)
+    assert len(set(ranked)) == len(ranked)
+
+
+def test_motions_pass_through_every_other_representation_of_their_skeleton_and_frame_rate():
+    clean, legacy = (HumanML(variant=variant) for variant in ("clean", "legacy"))
+    for representation, other in ((clean, legacy), (legacy, clean)):
+        (through,) = perturbations.through_others(representation)
+        assert (through.name, through.group) == (f"through {other.name}", "plumbing")
+    assert perturbations.through_others(HumanML(fps=31)) == []

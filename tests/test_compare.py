@@ -13,8 +13,11 @@ from support.runs import TINY
 
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.compare import paired_difference
+from flame_mdm.records import Result, Value
+from flame_mdm.reporting.compare import _difference, _facts, differences, paired_difference
 from flame_mdm.reporting.study import tally
+from flame_mdm.runs import read_run
+from flame_mdm.schemas import check_shape
 
 
 @pytest.fixture
@@ -300,3 +303,55 @@ def test_ratings_of_several_people_are_counted_once(tmp_path, capsys):
         tally([files[0], ratings(tmp_path / "copy.json", "ab")])
     with pytest.raises(UserError, match=r"self\.json: rating 1 compares ours with itself"):
         tally([ratings(tmp_path / "self.json", "a", b="ours")])
+
+
+def test_facts_of_runs_are_medians_of_speeds_and_the_last_number_of_passes(tmp_path, three):
+    lines = [
+        {"step": step, "train/epochs": step / 4, "train/seconds_per_step": seconds}
+        | {"train/samples_per_second": 8 / seconds, "train/loss": 1.0}
+        for step, seconds in ((1, 9.0), (3, 0.5), (5, 0.25))
+    ]
+    (three[0] / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    provenance = {
+        "command": ["train"], "commit": None, "python": "3", "machine": "m", "packages": {},
+        "data": {"fingerprint": "f00d"}, "device": "a GPU", "parameters": 12_345_678,
+    }  # fmt: skip
+    (three[0] / "provenance.json").write_text(json.dumps(provenance))
+    runs = {folder.name: read_run(folder) for folder in three[:2]}
+    head, rows = _facts(runs)
+    first, second = (dict(zip(head, row, strict=True)) for row in rows)
+    assert first == {
+        "run": "a", "steps": "6", "passes": "1.25", "parameters": "12.35 M", "s/step": "0.5",
+        "samples per second": "16", "device": "a GPU", "data": "f00d", "folder": str(three[0]),
+    }  # fmt: skip
+    assert (second["run"], second["steps"], second["parameters"]) == ("b", "10", "–")
+
+
+def test_differences_are_those_of_the_replications_that_both_have():
+    first = Value(mean=0, ci=None, replications=3, n=64, per_replication=[1.0, 2.0, 90.0], unit="m")
+    second = Value(mean=0, ci=None, replications=2, n=64, per_replication=[2.0, 5.0])
+    mean, low, high = paired_difference([1.0, 2.0], [2.0, 5.0])
+    assert (mean, low < 0 < high) == (2, True)
+    name, difference, interval, shown = _difference("x", first, second)
+    assert (name, difference, shown) == ("x (m)", "2", "no difference shown")
+    assert interval == f"[{low:.4g}, {high:.4g}]"
+    assert _difference("x", first, second.model_copy(update={"n": 65})) == []
+    missing = second.model_copy(update={"per_replication": [2.0, None]})
+    assert _difference("x", first, missing) == []
+    ordered = [[1.0, 2.0, 3.0], [3.0, 4.1, 5.0]]
+    one, two = (first.model_copy(update={"per_replication": values}) for values in ordered)
+    assert [_difference("x", *pair)[3] for pair in ((one, two), (two, one))] == ["higher", "lower"]
+
+
+@pytest.mark.parametrize(
+    ("change", "paired"),
+    [
+        ({}, True), ({"seed": 1}, False), ({"skeleton": {"stand_in": True}}, False),
+        ({"skeleton": {"stand_in": False, "smpl_sha256": "5" * 64}}, False),
+        ({"split": "val"}, True), ({"device": "cuda"}, True),
+    ],
+)  # fmt: skip
+def test_motions_are_paired_if_seed_lengths_and_skeleton_agree(change: dict, paired: bool):
+    values = {"values": {"fid": of(4.5, [4.4, 4.6])}}
+    pair = [check_shape(result(**values, **changes), Result) for changes in ({}, change)]
+    assert isinstance(differences(*pair), list) == paired

@@ -1,5 +1,8 @@
 """Rules of evaluations, without a model: folders of motions, numbers of motions, and bounds of real motions."""
 
+import hashlib
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -7,23 +10,29 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from support.pages import result
 
 from evaluators.callback import Evaluate
-from evaluators.evaluation import Evaluation
+from evaluators.evaluation import Evaluation, evaluate
 from evaluators.evaluation_request import EvaluationRequest
-from evaluators.evaluator import Evaluator, Motions
-from evaluators.plan import Plan
-from evaluators.protocol import DrawnClip, Protocol
-from evaluators.results import Outcome, Scores, _cell, mean_cost
-from evaluators.sources import Baseline, Generator
+from evaluators.evaluator import Evaluator, Motions, _values
+from evaluators.extractors import Extractor
+from evaluators.plan import Plan, open_data
+from evaluators.protocol import FOLDER, DrawnClip, Protocol, load_protocol, protocol_names
+from evaluators.results import Outcome, Scores, _cell, _checkpoint, _intervals, mean_cost, show
+from evaluators.sources import Baseline, Generator, SampleFolder, Samples, read_samples
+from flame_mdm.config import parameters
 from flame_mdm.data import advice_on_splits
 from flame_mdm.data.crops import Units
 from flame_mdm.data.folder import Folder
+from flame_mdm.data.store import Entry
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.records import Cost, Value
+from flame_mdm.records import Cost, Measured, Result, Value, read_result
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.schemas import check_shape
+from flame_mdm.seeds import key
 
 BASE: dict[str, Any] = {
     "sampler": "ddim",
@@ -360,17 +369,631 @@ def test_a_model_in_training_is_evaluated_at_multiples_of_the_steps_and_with_its
     monkeypatch.setattr("evaluators.callback.sampling_options", lambda *_: (None, {}))
     monkeypatch.setattr("evaluators.callback.Generator", lambda *_, **__: None)
     monkeypatch.setattr("evaluators.callback.GeneratorTask", SimpleNamespace)
-    result = SimpleNamespace(values={}, ground_truth={})
+    nothing = SimpleNamespace(values={}, ground_truth={})
     callback.next = 3  # the step from which training begins
     trainer: Any = SimpleNamespace(global_step=0, is_global_zero=False)
 
     def run(source: Any, *, ground_truth: bool, force: bool) -> Any:
         ran.append(trainer.global_step)
         assert force
-        return result
+        return nothing
 
     callback.evaluation = cast(Any, SimpleNamespace(protocol=None, clips=None, run=run))
     for step in (0, 3, 4, 9, 10, 11, 19, 27, 29, 30):
         trainer.global_step = step
         callback.on_validation_epoch_start(trainer, module)
     assert ran == [3, 10, 27, 30]
+
+
+def entry_of(name: str, length: int, captions: int = 3, **attributes: Any) -> Entry:
+    texts = [f"{name} {number}" for number in range(captions)]
+    return Entry(name, 0, length, "test", name, texts, None, attributes)
+
+
+def split_of(*entries: Entry) -> Any:
+    """Clips of which the crop is a random window of at most 40 frames."""
+
+    def crop(frames: int, generator: np.random.Generator) -> np.ndarray:
+        length = min(frames, 40)
+        return np.arange(length) + generator.integers(frames - length + 1)
+
+    return SimpleNamespace(clips=list(entries), crop=crop, advice="")
+
+
+@pytest.mark.parametrize(
+    ("context", "frames", "shortest"), [("drawn", 10, 11), ("start", 10, 15), ("drawn", 0, 1)]
+)
+def test_a_clip_is_longer_than_the_context_and_has_the_attributes(
+    context: str, frames: int, shortest: int
+):
+    lengths = (1, 9, 10, 11, 14, 15, 40)
+    entries = [entry_of(f"{length}", length, kind="walk") for length in lengths]
+    clips = split_of(*entries, entry_of("other", 40, kind="run"), entry_of("plain", 40))
+    protocol = protocol_of(context=context, context_frames=frames, only={"kind": "walk"})
+    names = [clip.id for clip in protocol.selected(clips)]
+    assert names == [f"{length}" for length in lengths if length >= shortest]
+
+
+def test_repeated_clips_have_draws_and_names_of_their_own_and_all_clips_occur_before():
+    clips = split_of(*(entry_of(f"{number}", 200, 20) for number in range(6)))
+    rows = protocol_of(samples=15).rows(clips, 0, 0)
+    assert sorted(row.clip.id for row in rows[:6]) == [f"{number}" for number in range(6)]
+    assert [row.clip.id for row in rows[6:12]] == [row.clip.id for row in rows[:6]]
+    suffixes = [row.id.removeprefix(row.clip.id) for row in rows]
+    assert suffixes == [""] * 6 + ["#1"] * 6 + ["#2"] * 3
+    assert len({(row.clip.id, row.caption, row.frames[0]) for row in rows}) == 15
+    assert [row.prompt for row in rows] == [row.id for row in rows]
+    assert [len(row.context) for row in rows] == [0] * 15
+
+
+def test_several_motions_of_a_prompt_share_its_caption_and_frames():
+    clips = split_of(*(entry_of(f"{number}", 200, 20) for number in range(6)))
+    several = {"prompts": 2, "samples": 3, "replications": 1, "metrics": {}}
+    protocol = protocol_of(multimodality=several)
+    rows, prompts = protocol.prompts(clips, 4, 1), protocol.rows(clips, 4, 1)[:2]
+    assert [row.id for row in rows] == [f"{p.id}~{n}" for p in prompts for n in range(3)]
+    assert [row.prompt for row in rows] == [p.id for p in prompts for _ in range(3)]
+    for number, row in enumerate(rows):
+        source = prompts[number // 3]
+        assert (row.text, row.clip) == (source.text, source.clip)
+        np.testing.assert_array_equal(row.frames, source.frames)
+
+
+SKELETONS = {
+    "smpl22": (HumanML(), (7, 10, 8, 11), (10, 11)),
+    "kit21": (HumanML(skeleton="kit21", fps=12.5), (19, 20, 14, 15), (20, 15)),
+}
+
+
+@pytest.mark.parametrize("name", protocol_names())
+@pytest.mark.parametrize("skeleton", SKELETONS)
+def test_metrics_know_the_frame_rate_the_feet_and_the_parents_of_the_motions(
+    name: str, skeleton: str
+):
+    representation, feet, toes = SKELETONS[skeleton]
+    protocol = load_protocol(name, representation)
+    several = protocol.multimodality.metrics if protocol.multimodality else {}
+    parents = list(representation.skeleton.parents)
+    facts = {"fps": representation.fps, "toes": list(toes), "parents": parents, "feet": list(feet)}
+    for metric, config in (protocol.metrics | several).items():
+        expected = {fact: facts[fact] for fact in facts if fact in parameters(config["_target_"])}
+        assert {fact: config.get(fact) for fact in expected} == expected, metric
+
+
+NUMBERS: dict[str, tuple[int, int | None, int | None]] = {
+    **dict.fromkeys(("text_to_motion_t2m", "text_to_motion_t2m_own"), (20, None, None)),
+    **dict.fromkeys(("text_to_motion_mardm", "text_to_motion_mardm_clip"), (20, None, None)),
+    **dict.fromkeys(("text_to_motion_t2m_legacy", "text_to_motion_t2m_dip"), (20, 1024, None)),
+    **dict.fromkeys(("action_to_motion", "action_to_motion_legacy"), (20, 1000, 1000)),
+    **{"action_to_motion_uestc": (20, 1000, 1000), "action_to_motion_own": (5, 1000, 1000)},
+    **dict.fromkeys(("text_to_motion", "text_to_motion_flame", "bandai"), (3, None, None)),
+    **{"synthetic": (5, None, None), "text_to_motion_2026": (3, None, None)},
+    **{"unconditioned": (3, 1000, None), "latency": (1, 16, 16), "reconstruction": (3, None, None)},
+    **dict.fromkeys(
+        ("unconditioned_humanact12", "unconditioned_humanact12_legacy"), (1, 1000, None)
+    ),
+    **dict.fromkeys(
+        ("reconstruction_best_of_10", "reconstruction_kit", "reconstruction_kit_best_of_10"),
+        (1, None, None),
+    ),
+}
+SEVERAL_OF: dict[str, tuple[int | None, int, int]] = {
+    **dict.fromkeys(("text_to_motion", "text_to_motion_flame"), (100, 20, 3)),
+    **dict.fromkeys(("text_to_motion_t2m", "text_to_motion_t2m_own"), (100, 30, 5)),
+    **{"text_to_motion_t2m_dip": (100, 30, 5), "text_to_motion_t2m_legacy": (128, 30, 5)},
+    **{"text_to_motion_mardm": (96, 30, 5), "synthetic": (20, 20, 2)},
+    "reconstruction_best_of_10": (500, 10, 1),
+    "reconstruction_kit_best_of_10": (None, 10, 1),
+}
+
+
+@cache
+def loaded(name: str) -> Protocol:
+    return load_protocol(name, HumanML())
+
+
+def test_protocols_have_the_numbers_of_motions_that_their_page_and_the_papers_state(subtests):
+    for name in protocol_names():
+        with subtests.test(name=name):
+            protocol = loaded(name)
+            sizes = (protocol.replications, protocol.samples, protocol.real_samples)
+            assert sizes == NUMBERS.get(name, (3, None, None) if "editing" in name else None)
+            several = protocol.multimodality
+            numbers = several and (several.prompts, several.samples, several.replications)
+            assert numbers == SEVERAL_OF.get(name)
+            assert protocol.smoothing == (1.0 if name == "text_to_motion_flame" else None)
+            assert protocol.batch_size == (1 if name == "latency" else None)
+            assert protocol.context == ("start" if name.endswith("_dip") else "drawn")
+            own_split = {"ghosh_test": True} if "kit" in name else {}
+            assert protocol.only == own_split
+
+
+def test_metrics_of_protocols_have_the_options_of_the_papers():
+    """Ten pairs of 30 motions per text; 300 pairs of texts, but 200 with repetition of actions."""
+    options: dict[str, dict[str, Any]] = {}
+    for name in protocol_names():
+        protocol = loaded(name)
+        several = protocol.multimodality
+        for metric, config in (protocol.metrics | (several.metrics if several else {})).items():
+            options[f"{name} {metric}"] = config
+            if several and metric in several.metrics:
+                per_text = config["samples"] * (1 + ("Paired" in config["_target_"]))
+                assert per_text == several.samples, (name, metric)
+    for name in ("text_to_motion_t2m", "text_to_motion_t2m_legacy", "text_to_motion_mardm"):
+        assert options[f"{name} multimodality"]["pairs"] == 10
+        assert (options[f"{name} diversity"]["pairs"], options[f"{name} diversity"]["replace"]) == (
+            300,
+            False,
+        )
+        assert "normalize" not in options[f"{name} mm_dist"]
+        assert "normalize" not in options[f"{name} motions_for_text"]
+    for name in ("text_to_motion", "bandai", "synthetic"):
+        assert options[f"{name} diversity"]["pairs"] == 300
+        assert options[f"{name} mm_dist"]["normalize"], "features are compared by their cosine"
+        assert options[f"{name} motions_for_text"]["normalize"]
+    assert options["synthetic multimodality"]["pairs"] == 10
+    for name in ("action_to_motion", "unconditioned", "unconditioned_humanact12"):
+        diversity = options[f"{name} diversity"]
+        assert (diversity["pairs"], diversity["replace"]) == (200, True)
+    assert options["action_to_motion multimodality"]["pairs"] == 20
+    assert "replace" not in options["unconditioned_humanact12 kid"]
+    assert options["unconditioned_humanact12_legacy kid"]["replace"]
+    assert options["reconstruction_kit temos"]["upsampling"] == 8
+    assert options["reconstruction_kit_best_of_10 temos_of_10"]["upsampling"] == 8
+    assert options["editing_in_between_2026 flowmdm"]["window"] == 20
+    assert all("_recursive_" in config for config in options.values() if "encoder" in config)
+
+
+def samples_file(path: Path, ids: list[str], first: float, captions: list[str] | None) -> None:
+    """Motions of two features, of 1, 2, ... frames, which all consist of one number."""
+    lengths = [number + 1 for number in range(len(ids))]
+    values = np.repeat(first + np.arange(len(ids)), lengths)
+    texts: dict[str, Any] = {} if captions is None else {"captions": captions}
+    np.savez(path, ids=ids, lengths=lengths, features=np.stack([values, values], 1), **texts)
+
+
+def test_files_of_others_are_in_numeric_order_and_their_captions_stay_with_their_motions(
+    tmp_path: Path,
+):
+    rows = rows_of([5, 5, 5])
+    ids = [rows[2].id, rows[0].id]
+    for number in (9, 10, 0):
+        samples_file(tmp_path / f"rep_{number}.npz", ids, 100 * number, ["jumps", "sits"])
+    samples_file(tmp_path / "multimodality_0.npz", ids, -1, None)
+    samples_file(tmp_path / ".rep_1.npz", ids, -1, None)
+    source = SampleFolder(tmp_path, cast(Any, SimpleNamespace(features=2, name="two")))
+    assert [path.name for path in source.files] == ["rep_0.npz", "rep_9.npz", "rep_10.npz"]
+    for replication, number in enumerate((0, 9, 10)):
+        samples = source("", rows, replication)
+        assert [row.id for row in samples.rows] == [rows[0].id, rows[2].id]
+        assert samples.captions == ["sits", "jumps"]
+        motions = [motion.tolist() for motion in samples.features]
+        assert motions == [[[100 * number + 1] * 2] * 2, [[100 * number] * 2]]
+        assert samples.cost == Cost()
+    samples_file(tmp_path / "rep_0.npz", ids, 0, None)
+    assert source("", rows, 0).captions is None
+    before = source.sha256
+    samples_file(tmp_path / "rep_10.npz", ids, 7, None)
+    assert source.sha256 != before
+
+
+class Sums(Extractor):
+    """Features are the number of real frames and the sum of the first feature; texts are their lengths."""
+
+    sha256 = "5" * 64
+
+    def check(self, representation: Any, dataset: str) -> None: ...
+
+    def motions(self, features: Any, joints: Any, mask: Any) -> dict[str, Any]:
+        real = features[..., 0] * mask
+        heights = (joints[..., 1].amax(2) * mask).amax(1)
+        sums = torch.stack([mask.float().sum(1), real.sum(1)], 1)
+        return {"features": sums, "logits": heights[:, None]}
+
+    def texts(self, captions: Any, tokens: Any) -> Any:
+        pairs = zip(captions, tokens, strict=True)
+        return torch.tensor([[len(text), len(words)] for text, words in pairs])
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 64])
+def test_inputs_of_metrics_are_in_the_order_of_the_motions(batch_size: int):
+    """Motions of 7, 3, 5, 3 and 9 frames are encoded in batches of similar lengths."""
+    representation = HumanML()
+    lengths = [7, 3, 5, 3, 9]
+    features = [np.zeros((length, 263), np.float32) for length in lengths]
+    for number, motion in enumerate(features):
+        motion[:, 0], motion[:, representation.slices["root_height"]] = 0.01, number + 1
+        motion[:, representation.slices["contacts"]] = number % 2
+    captions = ["a" * (number + 1) for number in range(5)]
+    tokens: list[list[str] | None] = [["a/DET"] * number for number in (4, 0, 3, 1, 2)]
+    evaluator = Evaluator(Sums(), {}, representation, batch_size)
+    rows = evaluator.extract(
+        Motions([f"{n}" for n in range(5)], features, captions, tokens, edit={"region": "prefix"})
+    )
+    assert rows["generated"][:, 0].tolist() == lengths
+    assert rows["generated"][:, 1].tolist() == pytest.approx([0.01 * n for n in lengths])
+    assert rows["logits"][:, 0].tolist() == pytest.approx([1, 2, 3, 4, 5])
+    assert rows["text"].tolist() == [[1, 4], [2, 0], [3, 3], [4, 1], [5, 2]]
+    assert [len(motion) for motion in rows["joints"]] == lengths
+    assert [float(motion[0, 0, 1]) for motion in rows["joints"]] == pytest.approx([1, 2, 3, 4, 5])
+    assert [len(kept) for kept in rows["kept"]] == lengths
+    assert [bool(contacts.all()) for contacts in rows["contacts"]] == [False, True] * 2 + [False]
+    assert rows["captions"] == captions
+    assert rows["text_keys"].tolist() == [key(text) for text in captions]
+
+
+def scored(evaluation: Evaluation, inputs: Any) -> list[Any]:
+    """Replaces the evaluator by one that encodes motions as their ids; returns the scored inputs."""
+    calls: list[Any] = []
+
+    def score(motions: Any, paired: Any, real: Any, seed: int) -> Any:
+        calls.append((motions["ids"], paired["ids"], real["ids"], seed))
+        return {}, {}
+
+    evaluator = SimpleNamespace(
+        extract=lambda motions: {"ids": motions.ids, "keys": torch.arange(len(motions.ids))},
+        score=score, resample=lambda *arguments: {"drawn": [arguments[3:]]},
+        compares_sets=None, unit_of=None,
+    )  # fmt: skip
+    evaluation.__dict__["evaluator"] = evaluator
+    object.__setattr__(evaluation, "_motions", lambda rows, features, texts=None: inputs(rows))
+    return calls
+
+
+def test_motions_of_others_are_compared_with_the_real_motions_of_the_same_clips():
+    """In the first replication all motions are there, in the second one those of two clips."""
+    rows = rows_of([5, 5, 5, 5])
+    protocol: Any = SimpleNamespace(
+        rows=lambda clips, seed, replication: rows, smoothing=None, metrics={}
+    )
+    measured = Evaluation(protocol, cast(Any, None), None, cast(Any, None), seed=3)
+    calls = scored(measured, lambda rows: SimpleNamespace(ids=[row.id for row in rows]))
+    names = [row.id for row in rows]
+    kept = [rows, [rows[1], rows[3]]]
+    paired = {"ids": names, "keys": torch.arange(4)}
+    real = {"ids": ["real"], "keys": torch.arange(1)}
+
+    def source(name: str, rows: Any, replication: int) -> Samples:
+        return Samples(kept[replication], [np.zeros((5, 1))] * len(kept[replication]))
+
+    outcome = measured._measure(source, [(paired, real)] * 2, 100)
+    seeds = [key("draws", 3, replication) for replication in range(2)]
+    assert calls == [
+        (names, names, ["real"], seeds[0]),
+        ([names[1], names[3]], [names[1], names[3]], ["real"], seeds[1]),
+    ]
+    assert outcome.resampled == {"drawn": [(seeds[0], 100)]}, "of the first replication"
+    (warning,) = outcome.warnings
+    assert "different numbers of motions (4, 2)" in warning
+
+
+def test_each_motion_of_a_prompt_is_compared_with_the_real_motion_of_the_prompt(monkeypatch):
+    clips = split_of(*(entry_of(f"{number}", 200) for number in range(6)))
+    several = {"prompts": 2, "samples": 3, "replications": 2, "metrics": {}}
+    protocol = protocol_of(multimodality=several)
+    measured = Evaluation(protocol, clips, None, cast(Any, None), seed=3)
+    calls = scored(measured, lambda rows: SimpleNamespace(ids=[row.id for row in rows]))
+    monkeypatch.setattr("evaluators.evaluation.real_motions", lambda *_: [])
+    clips.store = SimpleNamespace(references=lambda ids: None)
+    monkeypatch.setattr("evaluators.evaluation.Generator", type(lambda: None))
+    drawn: list[tuple[str, int]] = []
+
+    def source(name: str, rows: Any, replication: int) -> Samples:
+        drawn.append((name, replication))
+        return Samples(rows, [])
+
+    measured._measure_multimodality(source, measured.evaluator)
+    assert drawn == [("multimodality_0", 0), ("multimodality_1", 1)]
+    for replication, (motions, paired, real, seed) in enumerate(calls):
+        prompts = [row.id for row in protocol.rows(clips, 3, replication)[:2]]
+        assert motions == [f"{prompt}~{number}" for prompt in prompts for number in range(3)]
+        assert paired == [f"{prompt}~0" for prompt in prompts for _ in range(3)]
+        assert (real, seed) == ([], key("draws", 3, replication))
+
+
+def test_a_result_describes_its_checkpoint(tmp_path: Path):
+    for name, best, selected in (
+        ("best", {"monitor": "val/fid"}, "best val/fid"),
+        ("last", {"monitor": "val/fid"}, "none: last"),
+        ("best", None, "none: best"),
+    ):
+        file = tmp_path / f"{name}.ckpt"
+        file.write_bytes(b"weights")
+        config = {"callbacks": {"best": best}, "ema": 0.999, "experiment": "x/y"}
+        layer = torch.nn.Linear(3, 4)
+        layer.bias.requires_grad = False
+        model = SimpleNamespace(
+            config=config, parameters=layer.parameters, steps=7,
+            process=SimpleNamespace(prediction="epsilon"),
+            facts={"training": {"hours": 1.5, "device": "a GPU"}},
+        )  # fmt: skip
+        sampling = {"sampler": "ddim", "num_inference_steps": 3, "guidance_scale": 2.5}
+        plan: Any = SimpleNamespace(model=model, file=file, sampling=sampling)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("evaluators.results.recipe_changes", lambda config: ["a=1"])
+            checkpoint = _checkpoint(plan)
+        assert checkpoint is not None
+        assert (checkpoint.selected_by, checkpoint.experiment) == (selected, "x/y")
+        assert (checkpoint.parameters, checkpoint.prediction) == (12, "noise")
+        assert (checkpoint.averaged_weights, checkpoint.training_steps) == (True, 7)
+        assert (checkpoint.training_hours, checkpoint.training_device) == (1.5, "a GPU")
+        assert (checkpoint.sampler, checkpoint.guidance_scale) == ("ddim", 2.5)
+        assert checkpoint.sha256 == hashlib.sha256(b"weights").hexdigest()
+
+
+def test_motions_are_kept_in_the_run_of_the_checkpoint(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data = SimpleNamespace(store=SimpleNamespace(fingerprint="f00d"))
+    plan = cast(Plan, SimpleNamespace(sampling={}, data=data, batch_size=64))
+    protocol: Any = SimpleNamespace(samples=None, title="p-3", batch_size=None)
+    paths = {
+        "run/checkpoints/best.ckpt": Path("run"),
+        "models/mine.safetensors": Path("models"),
+        "shipped": Path("runs/shipped"),
+    }
+    for name, run in paths.items():
+        file = Path(name) if "." in name else Path("elsewhere/shipped.safetensors")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(name.encode())
+        request = EvaluationRequest(ckpt=name)
+        folder = Plan._motions_folder(plan, request, file, protocol)
+        assert folder.parent == run / "evaluation" / "p-3"
+        assert folder.name.startswith(hashlib.sha256(name.encode()).hexdigest()[:16])
+
+
+@pytest.mark.parametrize(("resamples", "valid"), [(0, True), (1, False), (99, False), (100, True)])
+def test_a_bootstrap_has_at_least_100_sets(resamples: int, valid: bool):
+    if valid:
+        assert EvaluationRequest(ckpt="a", resamples=resamples).resamples == resamples
+        return
+    with pytest.raises(UserError, match="at least 100"):
+        EvaluationRequest(ckpt="a", resamples=resamples)
+
+
+@pytest.mark.parametrize("option", ["quick", "samples", "replications"])
+def test_motions_of_others_are_all_evaluated(option: str):
+    options: dict[str, Any] = {"from_samples": "a", "protocol": "p", "data": {"name": "x"}}
+    assert EvaluationRequest(**options).from_samples == "a"
+    with pytest.raises(UserError, match="Remove quick, samples and replications"):
+        EvaluationRequest(**options, **{option: 2})
+
+
+def test_intervals_are_explained_by_what_they_are_over():
+    drawn: list[float | None] = [1.0, 2.0]
+    motions = Value(mean=1.5, ci=None, replications=1, n=64, resampled=drawn)
+    replications = Value(mean=1.5, ci=0.1, replications=2, n=64, resampled=drawn)
+    missing = Value(mean=None, ci=None, replications=2, n=64)
+    explained = [_intervals({"a": None, "b": missing, "c": v}) for v in (motions, replications)]
+    assert [text.rpartition(" ")[2] for text in explained] == ["motions", "replications"]
+    assert _intervals({"a": missing, "b": None}) == ""
+
+
+def test_generated_motions_are_read_again_with_their_cost_and_only_for_the_same_clips(
+    tmp_path: Path, monkeypatch
+):
+    def generated(self: Generator, rows: list[DrawnClip], replication: int) -> Any:
+        return [np.full((len(row.frames), 2), len(row.frames)) for row in rows], 4, 3.0
+
+    monkeypatch.setattr(Generator, "_generate", generated)
+    protocol = SimpleNamespace(batch_size=None, count=lambda clips: 3, condition="text")
+    arguments: Any = (None, protocol, None, SamplerOptions(), {}, 0, 2, tmp_path)
+    rows = rows_of([4, 9, 6])
+    first = Generator(*arguments, progress=False)("rep_0", rows, 0)
+    monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled again"))
+    again = Generator(*arguments, progress=False)("rep_0", rows, 0)
+    assert [motion.tolist() for motion in again.features] == [
+        [[length] * 2] * length for length in (4, 9, 6)
+    ]
+    assert again.cost == first.cost == Cost(nfe=4, seconds_per_sample=2, batch_size=2)
+    assert again.captions is None
+    assert read_samples(tmp_path / "rep_0.npz")["captions"].tolist() == ["a"] * 3
+    with pytest.raises(UserError, match="contains motions for other clips"):
+        Generator(*arguments, progress=False)("rep_0", rows[::-1], 0)
+
+
+def test_a_value_that_is_not_finite_or_cannot_be_computed_has_a_reason():
+    def refuse() -> Any:
+        raise UserError("too few")
+
+    computations: dict[str, Any] = {
+        "finite": lambda: 1.5, "none": lambda: None, "infinite": lambda: float("inf"),
+        "parts": lambda: {"a": 0.0, "b": float("nan")}, "refused": refuse,
+    }  # fmt: skip
+    metrics: Any = {name: SimpleNamespace(nothing={"x": None, "y": None}) for name in computations}
+    values, reasons = _values(computations, metrics)
+    assert values == {
+        "finite": 1.5, "none": None, "infinite": None, "parts/a": 0.0, "parts/b": None,
+        "refused/x": None, "refused/y": None,
+    }  # fmt: skip
+    assert reasons.keys() == {"infinite", "parts", "refused"}
+    assert (reasons["refused"], "the value is inf" in reasons["infinite"]) == ("too few", True)
+
+
+def test_repeated_real_motions_are_said():
+    measured = evaluation()
+    for count, lines in ((100, 0), (101, 1)):
+        measured.protocol.real_samples = count  # type: ignore[misc]
+        conditions = measured._conditions()
+        assert len(conditions) == lines
+    assert conditions[0].startswith("101 real motions for set comparisons from 100 clips")
+
+
+@pytest.mark.parametrize(("key_root", "variable", "root"), [
+    ("key", "variable", "key"), ("", "variable", "variable"), ("", "", "recipe"),
+])  # fmt: skip
+def test_the_folder_of_the_data_is_that_of_the_key_the_variable_or_the_recipe(
+    key_root: str, variable: str, root: str, monkeypatch
+):
+    opened: list[dict[str, Any]] = []
+
+    def instantiate(config: dict[str, Any], **options: Any) -> Any:
+        opened.append(config | options)
+        return SimpleNamespace(name="a")
+
+    monkeypatch.setenv("FLAME_MDM_DATA", variable)
+    monkeypatch.setattr("evaluators.plan.instantiate", instantiate)
+    monkeypatch.setattr("evaluators.plan.trust", lambda config: None)
+    config = {"data": {"name": "d", "root": "recipe"}, "representation": {"name": "r"}}
+    model: Any = SimpleNamespace(config=config, representation=SimpleNamespace(name="a"))
+    with pytest.raises(UserError, match="as the data set"):
+        open_data(EvaluationRequest(ckpt="x", data_root=key_root), model)
+    assert opened[0] == {"name": "r"}
+    assert (opened[1]["root"], opened[1]["seed"]) == (root, 0)
+    chosen = EvaluationRequest(
+        ckpt="x", data={"name": "mine"}, representation={"name": "own"}, data_root=key_root
+    )
+    with pytest.raises(UserError, match="as the data set"):
+        open_data(chosen, model)
+    assert (opened[2], opened[3]["name"]) == ({"name": "own"}, "mine")
+    assert opened[3]["root"] == (root if root != "recipe" else "data")
+
+
+def test_reasons_against_a_result_come_from_real_motions_and_from_its_data(
+    tmp_path: Path, monkeypatch
+):
+    request = EvaluationRequest(ckpt="a", seed=5, resamples=200, out=str(tmp_path / "x" / "r.json"))
+    plan = SimpleNamespace(
+        protocol="protocol", clips="clips", extractor="extractor", representation="representation",
+        batch_size=7, source="source", path=Path(str(request.out)),
+        data=SimpleNamespace(clips=lambda split: f"clips of {split}"),
+    )  # fmt: skip
+    runs: list[Any] = []
+
+    def run(self: Evaluation, source: Any, **options: Any) -> Measured:
+        runs.append((self, source, options))
+        parts: dict[str, Any] = {"ground_truth": None, "values": {}, "not_computed": {}}
+        return Measured(**parts, invalid_because=["real motions are off"], seeds=[1, 2])
+
+    of_data = check_shape(result(invalid_because=["splits may overlap"]), Result)
+    monkeypatch.setattr("evaluators.evaluation.Plan", lambda *_: plan)
+    monkeypatch.setattr("evaluators.evaluation.make_result", lambda *_: of_data)
+    monkeypatch.setattr(Evaluation, "run", run)
+    monkeypatch.setattr("evaluators.evaluation.show", lambda *_: None)
+    evaluate(request)
+    ((measured, source, options),) = runs
+    assert (source, options) == ("source", {"force": False, "resamples": 200})
+    assert (measured.seed, measured.batch_size) == (5, 7)
+    assert measured.training == "clips of train"
+    written = read_result(plan.path)
+    assert written.invalid_because == ["real motions are off", "splits may overlap"]
+    assert (written.seeds, written.values, written.split) == ([1, 2], {}, "test")
+
+
+def test_a_printed_result_has_both_columns_and_all_its_reservations(capsys):
+    of: dict[str, Any] = {"ci": 0.25, "replications": 2, "n": 64}
+    shown = result(
+        values={
+            "fid": {"mean": 4.5, **of}, "drift": {"mean": 2.0, **of, "unit": "m"},
+            "kid": {"mean": None, **of, "ci": None},
+        },
+        ground_truth={"fid": {"mean": 0.125, **of}},
+        invalid_because=["splits may overlap"], warnings=["biased"], changed={"samples": 64},
+        audit="a.html", audit_motions=40, skeleton={"stand_in": True},
+        data={"dataset": "d", "fingerprint": "f", "excluded": {"short clips": 3}},
+    )  # fmt: skip
+    show(check_shape(shown, Result), Path("r.json"))
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[1][-6:] == ["+-:", "95", "%", "interval", "over", "replications"]
+    table = [line for line in lines if line[0] in ("fid", "drift", "kid", "real")]
+    assert table == [
+        ["real", "motions", "generated"],
+        ["fid", "0.125", "+-", "0.25", "4.5", "+-", "0.25"],
+        ["drift", "(m)", "-", "2", "+-", "0.25"],
+    ]
+    text = "\n".join(" ".join(line) for line in lines)
+    for words in (
+        "p version 3, d test", "differs from the protocol: samples=64", "excluded from the data set: 3",
+        "not computed: kid: too few", "stand-in skeleton", "warning: biased",
+        "NOT VALID: splits may overlap", "on 40 motions: a.html", "written: r.json",
+    ):  # fmt: skip
+        assert words in text
+
+
+def test_copies_are_searched_in_whole_training_motions_by_their_joints_and_in_windows_by_features(
+    monkeypatch,
+):
+    entries = [entry_of("a", 100), entry_of("b", 30), entry_of("c", 60)]
+    training, clips = split_of(*entries), split_of(entry_of("d", 50))
+    target = "evaluators.metrics.memorization.NearestTraining"
+    protocol = protocol_of(metrics={"nearest": {"_target_": target}}, condition="none")
+    frames_of = "evaluators.evaluation.real_motions"
+    monkeypatch.setattr(frames_of, lambda source, rows: [(source, row.frames) for row in rows])
+    monkeypatch.setattr(Evaluator, "training_motions", lambda self, *motions: motions)
+    representation: Any = None
+    measured = Evaluation(protocol, clips, None, representation, seed=4, training=training)
+    whole, windows = cast(Any, measured.evaluator.training)
+    rows = protocol.rows(training, 4, 0, purpose="training")
+    assert whole.ids == windows.ids == [row.id for row in rows]
+    for row, (source, every), (_, window) in zip(
+        rows, whole.features, windows.features, strict=True
+    ):
+        assert source is training
+        np.testing.assert_array_equal(every, np.arange(row.clip.length))
+        np.testing.assert_array_equal(window, row.frames)
+    alone = Evaluation(protocol, clips, None, representation)
+    assert alone.evaluator.training is None
+
+
+def test_the_condition_decides_which_inputs_metrics_get():
+    walk = {
+        "action": "walk",
+        "side": "left",
+        "content": "walk-left",
+        "tokens": [["x"], ["y"], ["z"]],
+    }
+    rows = [
+        DrawnClip(
+            name, replace(entry_of(name, 50, **walk), action=number), np.arange(5), 1, "prompt"
+        )
+        for number, name in enumerate("ab")
+    ]
+    inputs: dict[str, Any] = {}
+    for condition in ("text", "action", "none"):
+        measured = Evaluation(
+            protocol_of(condition=condition), cast(Any, None), None, cast(Any, None)
+        )
+        inputs[condition] = measured._motions(rows, [np.zeros((5, 1))] * 2)
+    text, action, none = inputs.values()
+    assert (text.captions, text.tokens) == (["a 1", "b 1"], [["y"], ["y"]])
+    assert text.inputs["requested"] == [{"action": "walk", "side": "left"}] * 2
+    assert text.inputs["sides"] == [("walk-left", "left")] * 2
+    assert text.inputs["groups"].tolist() == [key("prompt")] * 2
+    assert "labels" not in text.inputs
+    assert (action.captions, action.inputs["labels"].tolist()) == (None, [0, 1])
+    assert (none.captions, none.tokens, none.inputs.keys()) == (None, None, {"groups"})
+    measured = Evaluation(protocol_of(), cast(Any, None), None, cast(Any, None))
+    others = measured._motions(rows, [], ["b 2", "b 0"])
+    assert (others.captions, others.tokens) == (["b 2", "b 0"], [None, ["x"]])
+    some = [rows[0], replace(rows[1], clip=entry_of("b", 50))]
+    assert measured._motions(some, []).inputs.keys() == {"groups"}
+
+
+def test_a_protocol_generates_from_what_clips_and_model_have():
+    bare = split_of(entry_of("a", 50, 0), entry_of("b", 50, 0))
+    bare.store = SimpleNamespace(info={"dataset": "d"})
+    full = split_of(replace(entry_of("a", 50), action=0))
+    models: dict[Any, Any] = {
+        kind: SimpleNamespace(conditioned_on=kind) for kind in ("text", "action", "none")
+    }
+    for condition in ("text", "action"):
+        with pytest.raises(UserError, match=f"the data set d has clips without {condition}"):
+            protocol_of(condition=condition).check(bare, None)
+        protocol_of(condition=condition).check(full, None)
+        for kind in models.keys() - {condition}:
+            with pytest.raises(UserError, match=f"was trained with condition {kind}"):
+                protocol_of(condition=condition).check(full, models[kind])
+        protocol_of(condition=condition).check(full, models[condition])
+    for model in models.values():
+        protocol_of(condition="none").check(bare, model)
+
+
+def test_the_hash_of_a_protocol_is_that_of_its_content_not_of_its_name(tmp_path: Path):
+    text = (FOLDER / "unconditioned.yaml").read_text()
+    (tmp_path / "copy.yaml").write_text(text)
+    (tmp_path / "other.yaml").write_text(text.replace("pairs: 200", "pairs: 201"))
+    original, copy, other = (
+        load_protocol(name, HumanML())
+        for name in ("unconditioned", str(tmp_path / "copy.yaml"), str(tmp_path / "other.yaml"))
+    )
+    assert original.sha256 == copy.sha256 != other.sha256
+    assert (copy.name, copy.title) == ("copy", "copy-1")

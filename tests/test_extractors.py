@@ -4,6 +4,7 @@ import json
 import pickle
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,17 @@ from support.fixtures import (
 from support.stores import write_words
 from torch import Tensor, nn
 
-from evaluators.extractors import CLASSIFIERS, ClassifierExtractor, MARDMClipExtractor, T2MExtractor
+from evaluators.extractors import (
+    CLASSIFIERS,
+    ClassifierExtractor,
+    MARDMClipExtractor,
+    MotionCLIPExtractor,
+    OwnExtractor,
+    OwnT2MExtractor,
+    T2MExtractor,
+)
 from evaluators.extractors.action_gru import ActionGRU
+from evaluators.extractors.classifier import ClassifierTask
 from evaluators.extractors.mardm import MARDMClip
 from evaluators.extractors.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained
 from evaluators.extractors.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
@@ -507,3 +517,88 @@ def test_a_random_start_is_a_function_of_the_motion(tmp_path, subtests):
     assert not torch.allclose(network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), (
         "two draws"
     )
+
+
+def test_the_gru_sees_joints_with_y_down_relative_to_the_first_pelvis():
+    torch.manual_seed(0)
+    network, joints = ActionGRU().eval(), torch.randn(2, 9, 24, 3)
+    mask = length_mask(torch.tensor([9, 6]))
+    down = joints * FLIP
+    relative = down - down[:, 0, 0][:, None, None]
+    with torch.no_grad():
+        expected = network.published(relative, mask)
+        torch.testing.assert_close(network(joints, mask), expected)
+        assert not torch.allclose(network.published(joints, mask), expected, atol=1e-3)
+        torch.testing.assert_close(network.logits(joints, mask), network.linear2(expected))
+
+
+def test_a_classifier_learns_from_joints_that_are_zero_past_the_end():
+    seen: list[Tensor] = []
+
+    def logits(joints: Tensor, mask: Tensor) -> Tensor:
+        seen.append(joints)
+        return torch.zeros(len(joints), 2)
+
+    task: Any = SimpleNamespace(
+        representation=SimpleNamespace(
+            to_joints=lambda x: x[..., None, None].expand(-1, -1, 4, 3) + 1
+        ),
+        network=SimpleNamespace(logits=logits),
+    )
+    mask, labels = length_mask(torch.tensor([3, 1])), torch.tensor([1, 0])
+    batch: Any = SimpleNamespace(x=torch.zeros(2, 3), mask=mask, action=labels)
+    _, action = ClassifierTask._classified(task, batch)
+    assert torch.equal(action, labels)
+    assert torch.equal(seen[0], mask[..., None, None].float().expand(2, 3, 4, 3))
+
+
+def represented(name: str, fps: float = 20.0, features: int = 263, part_of: str = "") -> Any:
+    return SimpleNamespace(name=name, fps=fps, features=features, part_of=part_of)
+
+
+@pytest.mark.parametrize(
+    ("kind", "other", "reads"),
+    [
+        (OwnExtractor, represented("a"), True),
+        (OwnExtractor, represented("b"), False),
+        (OwnExtractor, represented("a", fps=30.0), False),
+        (OwnExtractor, represented("a", features=251), False),
+        (OwnExtractor, represented("b", features=67, part_of="a"), False),
+        (OwnT2MExtractor, represented("a"), True),
+        (OwnT2MExtractor, represented("a", fps=30.0), False),
+        (OwnT2MExtractor, represented("b", features=67, part_of="a"), True),
+        (OwnT2MExtractor, represented("b", features=66, part_of="a"), False),
+        (OwnT2MExtractor, represented("b", features=67, part_of="c"), False),
+        (OwnT2MExtractor, represented("b", fps=30.0, features=67, part_of="a"), False),
+    ],
+)
+def test_an_extractor_reads_its_own_representation_or_its_part(kind, other, reads):
+    extractor = kind.__new__(kind)
+    network = SimpleNamespace(used=67)
+    extractor.task = SimpleNamespace(representation=represented("a"), network=network)
+    assert extractor.reads(other) == reads
+
+
+def test_a_motion_fits_its_texts_by_the_mean_cosine_of_its_parts():
+    """The features of a part are its sums; texts are vectors at angles that they state."""
+    extractor = MotionCLIPExtractor.__new__(MotionCLIPExtractor)
+    extractor.encoded = {}
+    calls: list[list[str]] = []
+
+    class Task:
+        def __call__(self, x: Tensor, mask: Tensor) -> Tensor:
+            assert mask.shape == x.shape[:2]
+            assert mask.all()
+            return x.sum(1)
+
+        def text(self, captions: list[str]) -> Tensor:
+            calls.append(captions)
+            angles = torch.deg2rad(torch.tensor([float(text) for text in captions]))
+            return torch.stack([angles.cos(), angles.sin()], 1)
+
+    extractor.task = Task()  # type: ignore[assignment]
+    along = np.repeat(np.array([[1.0, 0.0], [0.0, 1.0]], np.float32), [2, 3], 0)
+    whole: Any = SimpleNamespace(parts=(), text="90", features=along)
+    parts: Any = SimpleNamespace(parts=(("60", 0, 2), ("90", 2, 5)), text="x", features=along)
+    assert extractor.fit([whole, parts]) == pytest.approx([3 / 13**0.5, (0.5 + 1) / 2])
+    assert calls == [["90"], ["60"]], "no caption is encoded twice"

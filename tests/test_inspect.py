@@ -402,6 +402,18 @@ def test_encoding_keeps_frames_heights_and_features(subtests):
             )
 
 
+def test_encoding_keeps_heights_in_the_units_of_the_features():
+    """KIT's features are in units of 1 / 640 m; the body floats 3 cm above the floor."""
+    kit = HumanML(skeleton="kit21", fps=12.5, variant="legacy", units_per_metre=640)
+    pose = np.random.default_rng(0).uniform(0, 1, (1, 21, 3))
+    motion = pose + 0.01 * np.arange(8.0)[:, None, None] * [1.0, 0.0, 0.0]
+    motion[..., 1] += 0.03 - motion[..., 1].min()
+    (features,) = encode(kit, [motion])
+    assert features.shape == (8, 251)
+    heights = kit.decode(torch.from_numpy(features)).numpy()[..., 1]
+    np.testing.assert_allclose(heights, motion[..., 1], atol=1e-4)
+
+
 def test_the_selected_animation_is_read_from_each_file_of_a_folder(tmp_path, monkeypatch):
     motion = synthetic("kick")
     for name in ("a", "b"):

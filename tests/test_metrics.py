@@ -828,3 +828,76 @@ def test_precision_and_recall_compare_sets_of_the_same_size():
     with pytest.raises(UserError, match="got 3 motions in the smaller set, but needs at least 4"):
         PrecisionRecall().value(generated[:3], real)
     PrecisionRecall().value(generated[:4], real)
+
+
+def test_drift_is_averaged_over_the_motions_with_kept_joints_and_the_largest_is_that_of_all():
+    """Joints are 1 to 4 m off in motions of 2, 4 and 3 frames; nothing is kept of the last motion."""
+    real = torch.zeros(3, 4, 2, 3)
+    joints, kept = real.clone(), torch.zeros(3, 4, 2, dtype=torch.bool)
+    joints[0, :2, 0, 0] = torch.tensor([1.0, 3.0])
+    joints[1, :, 1, 2], joints[2, ..., 1] = 1.5, 4.0
+    kept[0, :2, 0], kept[1, :, 1] = True, True
+    mask = length_mask(torch.tensor([2, 4, 3]), 4)
+    motions = {"joints": joints, "mask": mask, "real_joints": real, "real_mask": mask, "kept": kept}
+    drift = computed(reconstruction.KeptDrift(), keys=torch.arange(3), **motions)
+    assert drift == pytest.approx({"mean": (2 + 1.5) / 2, "largest": 3})
+    errors = computed(reconstruction.DisplacementErrors(), keys=torch.arange(3), **motions)
+    assert errors == pytest.approx({"ade": 4 / 3, "fde": 4 / 3}), "of clips, not of frames"
+
+
+def test_every_frame_transition_has_the_same_weight_in_the_physics_of_several_motions():
+    """A foot slides in 1 of 1 and in 1 of 5 transitions; a joint of two has a jerk of 2 or 0 m/frame^3."""
+    sliding = torch.full((2, 6, 22, 3), 0.5)
+    sliding[:, :, 10, 1], sliding[:, 1:, 10, 0] = 0.0, 1.5
+    mask = length_mask(torch.tensor([2, 6]), 6)
+    values = computed(physics.FootSkating(20.0), joints=sliding, mask=mask, keys=keys(2))
+    assert values == pytest.approx(2 / 6)
+    shaken = torch.zeros(2, 8, 2, 3)
+    shaken[0, 1, 0, 0] = 2.0 / 3  # third differences of the first 4 frames: 3 times as much
+    mask = length_mask(torch.tensor([4, 8]), 8)
+    values = computed(physics.Jitter(1.0), joints=shaken, mask=mask, keys=keys(2))
+    assert values == pytest.approx((2 / 2) / (1 + 5))
+
+
+@pytest.mark.parametrize(("point", "share"), [(4.0, 1), (4.001, 0), (-2.0, 1), (-2.001, 0)])
+def test_the_manifold_of_a_sample_ends_at_its_third_neighbor(point: float, share: int):
+    """The third neighbors of 0 and of 2 are 2 away, those of the samples between them less."""
+    samples = torch.tensor([[0.0], [1.0], [1.5], [2.0]], dtype=torch.float64)
+    points = torch.tensor([[point]], dtype=torch.float64)
+    assert distribution.manifold_coverage(points, samples).item() == share
+
+
+def test_upsampled_motions_are_compared_with_recordings_instead_of_real_motions():
+    """Every eighth frame of a recording, whose joints move at a constant speed; the recording is longer."""
+    pose = wander(21, 1, 0)[0].double()
+    recording = pose + torch.arange(30.0)[:, None, None] * torch.tensor([0.01, 0.0, 0.02])
+    joints, mask = recording[:25:8][None], torch.ones(1, 4, dtype=torch.bool)
+    motions = {"joints": joints, "mask": mask, "real_joints": joints + 1.0, "real_mask": mask}
+    metric = TemosPositionErrors(upsampling=8)
+    values = computed(metric, keys=torch.tensor([0]), references=[recording], **motions)
+    assert list(values.values()) == pytest.approx([0.0] * 8, abs=1e-7)
+    metric = TemosPositionErrors(upsampling=8)
+    twice = [pose + 2 * (recording - pose)]
+    values = computed(metric, keys=torch.tensor([0]), references=twice, **motions)
+    step = 0.64 * math.hypot(0.01, 0.02)  # a KIT unit is 1/640 m
+    assert values["ape_trajectory"] == pytest.approx(12 * step), "the mean of 0 to 24 steps"
+    with pytest.raises(UserError, match="the store has no recordings"):
+        TemosPositionErrors(upsampling=8).update(keys=torch.tensor([0]), **motions)
+
+
+DEFAULTS: list[tuple[Any, dict[str, Any]]] = [
+    (KernelMotionDistance(), {"subsets": 100, "subset_size": 1000, "replace": False}),
+    (TextsForMotion(), {"pool": 32}),
+    (MotionsForText(), {"pool": 32, "normalize": False}),
+    (diversity.TextMultimodality(), {"samples": 30, "pairs": 10}),
+    (diversity.PairedMultimodality(), {"samples": 10}),
+    (diversity.ActionMultimodality(), {"pairs": 20}),
+    (alignment.MutualInformationDivergence(), {"eps": 5e-4}),
+    (MultimodalDistance(), {"normalize": False}),
+]
+
+
+@pytest.mark.parametrize(("metric", "options"), DEFAULTS, ids=lambda x: type(x).__name__)
+def test_metrics_without_options_are_those_of_the_papers(metric: Any, options: dict[str, Any]):
+    """As their docstrings state; protocols leave these options out."""
+    assert {name: getattr(metric, name) for name in options} == options

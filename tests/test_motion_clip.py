@@ -33,6 +33,7 @@ from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.checkpoints.released_weights import load_strictly
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.config import compose, instantiate
+from flame_mdm.data.store import Entry
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
@@ -470,3 +471,26 @@ def test_half_of_the_motions_have_copies_of_mostly_weak_noise_and_errors_count_f
     ]
     assert meanings[0][:, :2].tolist() == [[1, 2]] * 5
     assert len(meanings[0][:, 2].unique()) == 5
+
+
+def test_motions_with_equal_captions_or_attributes_have_equal_meanings(monkeypatch):
+    walk, run = {"action": "walk", "side": "left"}, {"action": "run", "side": "left"}
+    clips = [
+        Entry(f"{number}", 0, 40, "train", "", captions, None, attributes)
+        for number, (captions, attributes) in enumerate(
+            [
+                (["a", "b"], walk), (["b", "a"], run), (["c"], walk),
+                (["d"], {"side": "left"}), (["e"], {"side": "left"}),
+            ]
+        )
+    ]  # fmt: skip
+    task = CalibratedMotionCLIPTask.__new__(CalibratedMotionCLIPTask)
+    torch.nn.Module.__init__(task)
+    trainer = SimpleNamespace(datamodule=SimpleNamespace(train=SimpleNamespace(clips=clips)))
+    monkeypatch.setattr(CalibratedMotionCLIPTask, "trainer", trainer)
+    monkeypatch.setattr(MotionCLIPTask, "on_fit_start", lambda self: None)
+    task.on_fit_start()
+    captions, attributes = zip(*(task.meanings[clip.id] for clip in clips), strict=True)
+    assert [captions.index(meaning) for meaning in captions] == [0, 0, 2, 3, 4]
+    assert [attributes.index(meaning) for meaning in attributes] == [0, 1, 0, 3, 4]
+    assert not set(captions) & set(attributes)

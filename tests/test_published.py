@@ -19,6 +19,7 @@ from flame_mdm.reporting.tables import build as builder
 from flame_mdm.reporting.tables.settings import hyperparameters as settings
 from flame_mdm.reporting.tables.specs import ABOUT, load_spec, spec_names
 from flame_mdm.reporting.tables.specs import PUBLISHED as PUBLISHED_FILE
+from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import read_package_yaml
 
 PUBLISHED: dict[str, dict[str, Any]] = read_package_yaml(PUBLISHED_FILE)
@@ -228,6 +229,52 @@ def test_real_motions_have_what_protocols_expect(subtests):
             assert {n: float(real[c].split()[0]) for n, c in names.items()} == {
                 n: expected[n][0] for n in names
             }
+
+
+@pytest.mark.parametrize(
+    ("table", "part", "row", "data", "fid"),
+    [
+        ("mdm_3", "HumanAct12", "Real (ours)", "humanact12", "FID"),
+        ("mdm_4", "UESTC", "Real", "uestc", "FID test"),
+    ],
+)
+def test_real_motions_of_actions_have_what_protocols_expect(table, part, row, data, fid):
+    protocol = {"humanact12": "action_to_motion", "uestc": "action_to_motion_uestc"}[data]
+    rows = PUBLISHED[table][part]["rows"]
+    (real,) = (published["values"] for published in rows if published["label"] == row)
+    names = {"fid": fid, "accuracy": "Accuracy", "diversity": "Diversity"}
+    names["multimodality"] = "Multimodality"
+    expected = load_protocol(protocol, HumanML()).expected[data]
+    assert {name: mean for name, (mean, _) in expected.items()} == {
+        name: float(real[column].split()[0]) for name, column in names.items()
+    }
+    assert all(0 < tolerance < max(mean, 1) for mean, tolerance in expected.values())
+
+
+def test_r_precision_of_real_motions_is_that_of_guo_and_edits_expect_the_same_fid(subtests):
+    t2m = load_protocol("text_to_motion_t2m", HumanML()).expected
+    tops = {
+        data: [values[f"motions_for_text/top{k}"][0] for k in (1, 2, 3)]
+        for data, values in t2m.items()
+    }
+    assert tops == {"humanml3d": [0.511, 0.703, 0.797], "kit": [0.424, 0.649, 0.779]}
+    edits: dict[str, dict[str, str]] = {
+        "in_between": {"region": "in_between"}, "prediction": {"region": "prediction"},
+        "interpolation": {"region": "interpolate"}, "upper_body": {"joints": "upper_body"},
+    }  # fmt: skip
+    for name, edit in edits.items():
+        with subtests.test(name=name):
+            plain, measured = (
+                load_protocol(f"editing_{name}{suffix}", HumanML()) for suffix in ("", "_t2m")
+            )
+            assert plain.edit == measured.edit == edit
+            assert plain.expected == {}
+            assert measured.expected == {data: {"fid": t2m[data]["fid"]} for data in t2m}
+    assert load_protocol("editing_in_between_2026", HumanML()).edit == {"region": "in_between"}
+    for name in ("own", "legacy"):
+        assert load_protocol(f"text_to_motion_t2m_{name}", HumanML()).expected == {}
+    assert load_protocol("text_to_motion_t2m_dip", HumanML()).expected == t2m
+    assert load_protocol("action_to_motion_own", HumanML()).expected == {}
 
 
 ROWS: dict[str, list[int]] = {

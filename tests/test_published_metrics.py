@@ -412,3 +412,90 @@ def test_kept_joints_count_as_end_effectors_only_in_frames_that_keep_a_part():
     values = metric.compute()
     assert values["fullbody_keyframe"] == pytest.approx(0.5)
     assert values["end_effector"] == pytest.approx(0.2)
+
+
+def test_jerks_of_transitions_are_averaged_over_all_windows_of_all_motions():
+    """Steps of 1 m and 3 m at the two seams of a motion, and none at the seam of another: 2, 6 and 0."""
+    joints = torch.zeros(2, 60, 22, 3)
+    joints[0, 20:, 3, 0], joints[0, 40:, 5, 1] = 1, 3
+    kept = torch.zeros(2, 60, 22, dtype=torch.bool)
+    kept[0, 20:40], kept[1, 30:] = True, True
+    metric = TransitionJerk(60.0, window=10)
+    metric.update(joints, torch.ones(2, 60, dtype=torch.bool), kept, torch.arange(2))
+    assert metric.compute() == pytest.approx({"peak": (2 + 6 + 0) / 3, "area": None, "windows": 3})
+
+
+def test_the_root_is_compared_on_the_ground_where_it_is_kept():
+    """The root is kept in frames 1 to 3, where it is 0.1, 0.11 and 0 m off, and another joint in frame 0."""
+    real = torch.zeros(1, 5, 22, 3, dtype=torch.float64)
+    joints = real.clone()
+    joints[0, :, 0, 0] = torch.tensor([9.0, 0.0, 0.11, 0.0, 9.0])
+    joints[0, 1, 0, 2] = 0.1
+    joints[0, :, 0, 1] = 7.0
+    kept = torch.zeros(1, 5, 22, dtype=torch.bool)
+    kept[0, 1:4, 0], kept[0, 0, 5] = True, True
+    metric = KimodoConstraints()
+    metric.update(joints, real, torch.ones(1, 5) > 0, kept, keys=torch.tensor([0]))
+    values = metric.compute()
+    assert values["root2d_err"] == pytest.approx(0.07)
+    assert values["root2d_acc"] == pytest.approx(2 / 3)
+    assert values["fullbody_keyframe"] is None
+    metric = KimodoConstraints()
+    metric.add(torch.arange(22), [*({"root2d_err": float(x)} for x in range(21)), {}])
+    assert metric.compute()["root2d_err_p95"] == 19, "motions without a kept root do not count"
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0, 60.0])
+def test_kimodos_toes_skate_faster_than_a_fifth_of_a_meter_per_second(fps: float):
+    """The left toe moves at 0.19, 0.21 and 0.21 m/s; at last it is low in the first three frames."""
+    motion = torch.full((4, 22, 3), 0.5, dtype=torch.float64)
+    motion[:, 10, 0] = torch.tensor([0.0, 0.19, 0.4, 0.61]) / fps
+    motion[:, 10, 1] = 0.049
+    low = KimodoQuality(fps).measure(motion)
+    assert float(low["skate_ratio"]) == pytest.approx(2 / 3, abs=1e-5)
+    assert float(low["skate_from_height"]) == pytest.approx(0.61 / 3, abs=1e-5)
+    assert float(low["low"]) == pytest.approx(0.5)
+    motion[3, 10, 1] = 0.051
+    rising = KimodoQuality(fps).measure(motion)
+    assert float(rising["low"]) == pytest.approx(0.5), "where movements begin"
+    assert float(rising["skate_ratio"]) == pytest.approx(1 / 2, abs=1e-5)
+    contacts = torch.zeros(4, 4, dtype=torch.bool)
+    contacts[1, 1] = contacts[3] = True  # no movement begins in the last frame
+    values = KimodoQuality(fps).measure(motion, contacts)
+    assert float(values["skate_from_contacts"]) == pytest.approx(0.21, abs=1e-5)
+    assert float(values["skate_max"]) == pytest.approx(0.21)
+    assert float(values["contact_consistency"]) == pytest.approx(11 / 12)
+
+
+def test_at_most_100_motions_and_half_of_them_are_dissimilar():
+    angles = torch.linspace(0, 3, 250)
+    meaning = torch.stack([angles.cos(), angles.sin()], 1).double()
+    for count, chosen in ((150, 75), (199, 99), (201, 100), (250, 100)):
+        indices = dissimilar(meaning[:count])
+        assert (len(indices), len(set(indices)), indices[:2]) == (chosen, chosen, [0, count - 1])
+
+
+def test_similar_captions_count_as_correct_by_the_cosine_of_their_meanings():
+    """At 0, 25 and 27 degrees: cosines of 0.906 and 0.891 with the first. Two motions are exchanged."""
+    angles = torch.deg2rad(torch.tensor([0.0, 25.0, 27.0, 180.0]))
+    meaning = torch.stack([angles.cos(), angles.sin()], 1).double()
+    text = torch.eye(4, dtype=torch.float64)
+    for order, top1 in (([1, 0, 2, 3], 1.0), ([2, 1, 0, 3], 0.5)):
+        metric = MultiPositiveRPrecision(pool=4)
+        values = metric.value(text[order], text, torch.arange(4), meaning)
+        assert (values["top1"], values["positives"]) == (top1, (2 + 3 + 2 + 1) / 4)
+
+
+@pytest.mark.parametrize(("count", "batches"), [(31, 0), (32, 1), (63, 1), (64, 2)])
+def test_whole_batches_of_32_motions_are_retrieved(count: int, batches: int):
+    generator = torch.Generator().manual_seed(0)
+    motion, text = torch.randn(2, count, 4, generator=generator, dtype=torch.float64)
+    values = TMRRetrieval().value(motion, text, torch.arange(count), torch.zeros(count, 0))
+    top = values["batches_t2m_top10"]
+    if not batches:
+        assert top is None
+        return
+    assert top is not None
+    assert 0 < top < 1
+    assert (top * 32 * batches) % 1 == pytest.approx(0, abs=1e-9)
+    assert values["dissimilar_t2m_top1"] is None, "without an encoder"

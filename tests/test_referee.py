@@ -398,6 +398,28 @@ def test_the_metric_counts_true_and_decided_claims():
     assert pairs["all"].tolist() == [[2, 2], [0, 2], [0, 0]]
 
 
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+def test_an_audit_keeps_ten_seconds_of_a_motion_wherever_it_starts(fps: float):
+    metric, longest = ClaimAccuracy(fps), round(10 * fps)
+    short = torch.from_numpy(raising("left").joints).double()
+    long = short[torch.arange(longest + 5).clamp(max=len(short) - 1)]
+    far = short + torch.tensor([40.0, 0.0, -40.0])
+    kept = metric.readings({"joints": [short, long, far]})
+    assert kept["frames"].tolist() == [len(short), longest, len(short)]
+    assert kept["positions"].shape == (3, longest, 66)
+    restored = kept["positions"][2, : len(short)].reshape(-1, 22, 3) * 0.0005
+    expected = (short - short[0, 0] * torch.tensor([1.0, 0.0, 1.0])).numpy()
+    np.testing.assert_allclose(restored, expected, atol=0.00026)
+    np.testing.assert_allclose(kept["positions"][2], kept["positions"][0], atol=1)
+
+
+def test_motions_below_half_a_second_and_other_skeletons_are_not_judged():
+    motion = raising("left").joints
+    for frames, judged in ((9, False), (10, True)):
+        assert bool(ClaimAccuracy(20.0).judged(motion[:frames], "raises the left hand")) == judged
+    assert ClaimAccuracy(20.0).judged(motion[:, :21], "raises the left hand") == []
+
+
 def test_of_several_candidates_the_one_with_the_most_true_claims_is_kept():
     candidates = [raising("right"), raising("left")]
     for candidate in candidates:

@@ -30,7 +30,7 @@ from flame_mdm.reporting.plots import (
     chart,
     svg,
 )
-from flame_mdm.reporting.report import charted, write_report
+from flame_mdm.reporting.report import _evaluation, _facts, charted, marks, sampling, write_report
 from flame_mdm.runs import read_history, read_run
 from flame_mdm.schemas import check_shape
 from flame_mdm.training import callbacks
@@ -471,3 +471,109 @@ def test_a_page_names_the_number_of_motions_of_most_values():
 def test_a_value_that_some_draws_lack_has_no_interval(resampled, half):
     value = Value(mean=2.0, ci=None, replications=1, n=3, resampled=resampled)
     assert value.half == pytest.approx(half)
+
+
+def test_a_result_says_where_its_motions_come_from_and_how_long_they_took():
+    of_model = check_shape(result(cost={"seconds_per_sample": 0.01234, "batch_size": 8.0}), Result)
+    assert sampling(of_model) == (
+        "last.ckpt (01234567), ddim, 5 steps, guidance 2.5, seed 0, replications x motions: 2 x 64, "
+        "0.0123 seconds per motion on cpu, batches of 8"
+    )
+    others = {"checkpoint": None, "cost": None}
+    assert sampling(check_shape(result(**others), Result)) == (
+        "motions from other systems, replications x motions: 2 x 64"
+    )
+    baseline = check_shape(result(**others, baseline="noisy"), Result)
+    assert sampling(baseline).startswith("baseline noisy, replications")
+
+
+@pytest.mark.parametrize(("quick", "marked"), [
+    (False, ["not valid: a", "not valid: b", "differs from the protocol: samples 64, replications 2"]),
+    (True, ["Quick run — not for publication", "not valid: a", "not valid: b"]),
+])  # fmt: skip
+def test_a_result_is_marked_if_it_is_quick_not_valid_or_of_another_size(quick, marked):
+    changed = {"samples": 64, "replications": 2}
+    shown = check_shape(result(quick=quick, invalid_because=["a", "b"], changed=changed), Result)
+    assert marks(shown) == marked
+    assert marks(check_shape(result(), Result)) == []
+
+
+def test_of_a_resumed_run_the_later_line_of_a_step_counts_and_an_incomplete_one_does_not(tmp_path):
+    folder = a_run(tmp_path / "run")
+    lines = ['{"step": 3, "train/loss": 3.0}', '{"step": 5, "train/loss": 9.0, "epoch": 1}']
+    lines += ['{"step": 4, "train/loss": 4.0}', '{"step": 5, "train/loss": 5.0}']
+    lines += ['{"step": 8, "samples/skating": 0.5}', '{"step": 9, "train/loss": 1.0}']
+    (folder / "metrics.jsonl").write_text("\n".join(lines))
+    curves = read_history(folder)
+    assert list(curves["train/loss"].items()) == [(3, 3.0), (4, 4.0), (5, 5.0)]
+    assert curves.keys() == {"samples/skating", "train/loss"}
+    assert read_run(folder).steps == 9
+    (folder / "metrics.jsonl").write_text("\n".join([*lines, ""]))
+    assert read_run(folder).steps == 10
+
+
+def test_facts_of_a_report_are_those_of_the_last_step(tmp_path):
+    folder = a_run(tmp_path / "run")
+    lines = [
+        {"step": step, "train/epochs": passes, "train/seconds_per_step": seconds}
+        for step, passes, seconds in ((1999, 2.0, 9.0), (999, 1.0, 0.5), (2999, 3.0, 0.123456))
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    provenance = {
+        "command": ["train"], "commit": None, "python": "3", "machine": "m", "packages": {},
+        "data": {"fingerprint": "f00d"}, "device": "a GPU", "parameters": 12_345_678,
+    }  # fmt: skip
+    (folder / "provenance.json").write_text(json.dumps(provenance))
+    assert _facts(read_run(folder)) == [
+        "step 3,000 of 20", "3 passes over the data", "12.35 M parameters", "0.123 s/step", "a GPU",
+    ]  # fmt: skip
+
+
+def drawn(*series: Series, **options: Any) -> dict[str, Any]:
+    panel = _drawn(Panel(series, **options))
+    assert panel is not None
+    return panel
+
+
+def test_errors_reach_as_far_up_as_down_and_a_logarithmic_axis_has_no_zero():
+    points = [(0.0, 1.0), (1.0, 2.0), (10.0, 3.0), (100.0, 4.0)]
+    panel = drawn(Series("a", points, {1.0: 0.5, 100.0: 0.25}, "dots"), log_x=True)
+    ((_, kind, _, rim, errors, dots),) = panel["lines"]
+    assert (kind, len(dots), len(errors), len(rim.split())) == ("dots", 3, 2, 4)
+    across = [float(x) for x, _ in dots]
+    assert across[1] - across[0] == pytest.approx(across[2] - across[1], abs=0.1)
+    middle = {x: float(y) for x, y in dots}
+    sizes = []
+    for x, lower, upper in errors:
+        assert float(lower) - middle[x] == pytest.approx(middle[x] - float(upper), abs=0.15)
+        sizes.append(float(lower) - float(upper))
+    assert sizes[0] == pytest.approx(2 * sizes[1], abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("count", "dots", "ends"), [(40, 40, 40), (41, 0, 41), (600, 0, 600), (601, 0, 401)]
+)
+def test_short_curves_have_dots_and_long_ones_the_extremes_of_their_parts(count, dots, ends):
+    """601 points are 200 parts of 3, of which the lowest and the highest one are drawn, and one point."""
+    curve = [(float(x), float(x % 7)) for x in range(count)]
+    ((_, _, line, _, _, shown),) = drawn(Series("a", curve))["lines"]
+    assert (len(shown), len(line.split())) == (dots, ends)
+
+
+@pytest.mark.parametrize(("audit", "motions", "text"), [
+    (None, None, "evaluator not audited"), ("a.html", None, "audit of the evaluator: a.html"),
+    ("a.html", 40, "audit of the evaluator: a.html, of 40 motions"),
+])  # fmt: skip
+def test_an_evaluation_in_a_report_names_its_audit_and_units(audit, motions, text):
+    changes: dict[str, Any] = {"audit": audit, "audit_motions": motions}
+    value = {"mean": 2.0, "ci": 0.5, "replications": 2, "n": 64, "unit": "m"}
+    values = {
+        "values": {"drift": value},
+        "ground_truth": {"drift": value | {"mean": 1.0}, "x": value},
+    }
+    extractor = {"extractor": {"sha256": "0123456789"}}
+    shown = check_shape(result(**changes, **values, **extractor), Result)
+    title, facts, _, _, rows = _evaluation(shown)
+    assert title == "p version 3, synthetic test, extractor 01234567"
+    assert str(facts).endswith(f"; {text}")
+    assert rows == [["drift (m)", "1 ± 0.5", "2 ± 0.5"], ["x (m)", "2 ± 0.5", "–"]]

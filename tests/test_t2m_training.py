@@ -12,8 +12,9 @@ import torch
 from support.stores import line, write_folder, write_words
 
 from evaluators.extractors import OwnT2MExtractor
-from evaluators.extractors.t2m import LearnedWords
+from evaluators.extractors.t2m import LearnedWords, WordVectors
 from evaluators.extractors.t2m_training import T2MTask, matching_loss, reconstruction_terms
+from evaluators.extractors.training import ExtractorTask
 from flame_mdm.__main__ import main
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.errors import UserError
@@ -292,3 +293,38 @@ def test_the_wrong_motions_of_a_text_are_those_that_it_does_not_describe(monkeyp
     T2MTask.training_step(task, batch, 0)
     rows = [[True, False, False], [True, True, False], [False, False, True]]
     assert seen == [rows], "rows are texts, columns are motions"
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_of_equal_captions_of_a_clip_the_tags_of_the_first_one_count(learned: bool, monkeypatch):
+    clips = [
+        SimpleNamespace(
+            id=name,
+            captions=["Walks.", "runs", "Walks."],
+            attributes={"tokens": [["walks/VERB"], [f"{name}/VERB"], ["walks/NOUN"]]},
+        )
+        for name in ("train", "val")
+    ]
+    data = SimpleNamespace(
+        batch_size=2,
+        **{clip.id: SimpleNamespace(clips=[clip]) for clip in clips},
+    )
+    task = T2MTask.__new__(T2MTask)
+    torch.nn.Module.__init__(task)
+    task.tokens, task.facts, task.word_folder = {}, {}, "x"
+    task.words = LearnedWords() if learned else None
+    task.network = cast(Any, SimpleNamespace(mean=torch.zeros(2), std=torch.zeros(2)))
+    statistics = SimpleNamespace(mean=torch.full((2,), 3.0), std=torch.full((2,), 4.0))
+    task.representation = cast(Any, statistics)
+    vectors = WordVectors({"walks": 1, "unk": 0}, torch.zeros(2, 300))
+    monkeypatch.setattr(WordVectors, "read", lambda folder: vectors)
+    monkeypatch.setattr(T2MTask, "trainer", SimpleNamespace(datamodule=data))
+    monkeypatch.setattr(ExtractorTask, "setup", lambda self, stage: None)
+    task.setup("fit")
+    if learned:
+        assert task.tokens["train"] == {"Walks.": ["walks"], "runs": ["runs"]}
+    else:
+        assert task.tokens["val"] == {"Walks.": ["walks/VERB"], "runs": ["val/VERB"]}
+        assert task.facts["words"] == {"walks": 1, "unk": 0}
+    assert task.tokens.keys() == {"train", "val"}
+    assert (task.network.mean.tolist(), task.network.std.tolist()) == ([3.0] * 2, [4.0] * 2)

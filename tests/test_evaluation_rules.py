@@ -756,8 +756,9 @@ def test_a_bootstrap_has_at_least_100_sets(resamples: int, valid: bool):
 def test_motions_of_others_are_all_evaluated(option: str):
     options: dict[str, Any] = {"from_samples": "a", "protocol": "p", "data": {"name": "x"}}
     assert EvaluationRequest(**options).from_samples == "a"
+    options[option] = 2
     with pytest.raises(UserError, match="Remove quick, samples and replications"):
-        EvaluationRequest(**options | {option: 2})
+        EvaluationRequest(**options)
 
 
 def test_intervals_are_explained_by_what_they_are_over():

@@ -872,7 +872,8 @@ def test_upsampled_motions_are_compared_with_recordings_instead_of_real_motions(
     pose = wander(21, 1, 0)[0].double()
     recording = pose + torch.arange(30.0)[:, None, None] * torch.tensor([0.01, 0.0, 0.02])
     joints, mask = recording[:25:8][None], torch.ones(1, 4, dtype=torch.bool)
-    motions = {"joints": joints, "mask": mask, "real_joints": joints + 1.0, "real_mask": mask}
+    motions: dict[str, Any] = {"joints": joints, "mask": mask, "real_mask": mask}
+    motions["real_joints"] = joints + 1.0
     metric = TemosPositionErrors(upsampling=8)
     values = computed(metric, keys=torch.tensor([0]), references=[recording], **motions)
     assert list(values.values()) == pytest.approx([0.0] * 8, abs=1e-7)

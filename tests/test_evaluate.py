@@ -916,5 +916,6 @@ def test_results_of_other_sizes_have_other_files(runs):
     shared |= {"protocol": "synthetic", "baseline": "real", "extractor": "none"}
     shared["data_root"] = str(runs.root)
     sizes: list[dict[str, Any]] = [{}, {"quick": True}, {"replications": 3}]
+    sizes += [{"samples": 20}, {"seed": 1}, {"seed": 2, "samples": 20}]
     plans = [Plan(EvaluationRequest(**shared, **size), "cpu") for size in sizes]
     assert len({plan.path for plan in plans}) == len(sizes)

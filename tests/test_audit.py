@@ -401,6 +401,31 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert "extractor=none" in capsys.readouterr().err
 
 
+def test_the_command_audits_real_test_motions_under_the_protocol_of_the_data(
+    tmp_path, monkeypatch, capsys
+):
+    audited: list[Any] = []
+
+    def audit(*values: Any) -> None:
+        audited.append(values)
+        raise UserError("audited")
+
+    monkeypatch.setattr("evaluators.audit.audit", audit)
+    for data, protocol in (("synthetic", "synthetic"), ("bandai", "text_to_motion")):
+        words = [f"data={data}", "extractor=none", "samples=8", "seed=3", f"out={tmp_path}"]
+        assert main(["audit", *words]) == 1
+        ((request, cache, resamples),) = audited
+        assert (request.data["name"], request.protocol) == (data, protocol)
+        assert (request.baseline, request.split, request.samples) == ("real", "test", 8)
+        assert (cache, resamples) == (tmp_path / "cache", 100)
+        audited.clear()
+    for few in ("samples=7", "resamples=99"):
+        assert main(["audit", "data=synthetic", "extractor=none", few]) == 1
+        assert f"{few}" in (error := capsys.readouterr().err)
+        assert "too few" in error
+    assert not audited
+
+
 CARDS = sorted((ROOT / "docs" / "benchmarks" / "audit").glob("*.json"))
 
 

@@ -34,6 +34,8 @@ from flame_mdm.checkpoints.released import (
     import_mdm,
 )
 from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
+from flame_mdm.commands.edit import EditSettings
+from flame_mdm.commands.sample import SampleSettings
 from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.mdm import MDMEncoder
 from flame_mdm.errors import UserError
@@ -755,6 +757,7 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, su
     assert before.state_dict().keys() == load_file(file).keys()
     torch.testing.assert_close(after.state_dict(), before.state_dict(), rtol=0, atol=0)
     assert after.facts == before.facts
+    assert before.steps == after.steps == 2
     content = model_files.read_model_file(file)
     assert (
         model_files.read_model_file(hub.export(file, tmp_path / "again"))["origin"]
@@ -771,6 +774,124 @@ def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys, su
     assert {value.dtype for value in vectors.values()} == {torch.float32}, "statistics are exact"
     torch.testing.assert_close(load(half).state_dict(), before.state_dict(), atol=1e-3, rtol=1e-3)
     assert model_files.read_model_file(half)["origin"]["half_precision"]
+
+
+@pytest.mark.parametrize(
+    ("words", "folder", "upload", "private"),
+    [
+        ([], Path("push/walker"), True, False),
+        (["private=true"], Path("push/walker"), True, True),
+        (["mine", "dry_run=true"], "mine", False, False),
+    ],
+)
+def test_the_command_pushes_to_a_folder_of_the_same_name(
+    monkeypatch, capsys, words, folder, upload, private
+):
+    pushed = list[tuple[Any, ...]]()
+
+    def push(source: Path, name: str, out: str | Path, **keys: Any) -> str | Path:
+        pushed.append((source, name, out, keys))
+        return out
+
+    monkeypatch.setattr(hub, "push", push)
+    assert main(["push", "quickstart", "me/walker", *words]) == 0
+    keys = {"upload": upload, "private": private}
+    assert pushed == [(find("quickstart"), "me/walker", folder, keys)]
+    result = "uploaded to me/walker" if upload else "not uploaded"
+    assert f"{result}: {folder}" in capsys.readouterr().out
+
+
+def test_commands_load_the_chosen_checkpoint_of_a_run_with_its_adapters(tmp_path, monkeypatch):
+    files = {which: tmp_path / "checkpoints" / f"{which}.ckpt" for which in ("last", "best")}
+    files["last"].parent.mkdir()
+    for path in (*files.values(), tmp_path / "config.yaml"):
+        path.touch()
+    loaded = list[tuple[Any, ...]]()
+    monkeypatch.setattr(
+        "flame_mdm.checkpoints.loading.load", lambda *words, **keys: loaded.append((words, keys))
+    )
+    for which, file in files.items():
+        assert find(tmp_path, which) == file  # type: ignore[arg-type]
+        options: dict[str, Any] = {"ckpt": str(tmp_path), "which": which, "text": "walks"}
+        options |= {"device": "cpu", "adapter": ["a", "b"], "adapter_strength": [0.5, 2.0]}
+        SampleSettings(**options).load()
+        EditSettings(**options, motion="walk.npz", joints="arms").load()
+        expected = (file, "cpu"), {"adapter": ["a", "b"], "strength": [0.5, 2.0]}
+        assert loaded == [expected] * 2
+        loaded.clear()
+    files["best"].unlink()
+    with pytest.raises(FileNotFoundError, match=r"no such checkpoint\. The run has last\.ckpt"):
+        find(tmp_path, "best")
+
+
+def test_the_hash_of_weights_depends_on_all_but_their_order():
+    row, table = torch.arange(1.0, 5.0), torch.arange(6.0).reshape(2, 3)
+    state = {"a": row, "b": table}
+    expected = model_files.state_sha256(state)
+    columns = table.T.contiguous().T  # the same values, stored by column
+    assert model_files.state_sha256({"b": columns, "a": row.clone()}) == expected
+    later = row.clone()
+    later[3] = 5
+    changes = [
+        {"a": later},
+        {"a": row.view(torch.int32)},
+        {"a": row.reshape(2, 2)},
+        {"a": row.double()},
+        {"c": torch.zeros(0)},
+        {"b": table.T},
+    ]
+    hashes = {model_files.state_sha256(state | change) for change in changes}
+    hashes.add(model_files.state_sha256({"c": row, "b": table}))
+    assert len(hashes - {expected}) == 7
+
+
+def test_a_card_states_the_facts_of_the_model_and_how_it_is_sampled():
+    model: dict[str, Any] = {
+        "config": {
+            "experiment": "humanact12/mdm",
+            "condition": {"_target_": "flame_mdm.conditions.action.ActionLabels"},
+        },
+        "facts": {"actions": ["walk", "sit"], "max_frames": 60, "dataset": "humanact12"},
+        "state_dict": {"a": torch.zeros(1000, 20), "b": torch.zeros(7)},
+        "origin": {"steps": 500, "averaged": True},
+    }
+    card = hub.card(model, "me/walker", "f00d")
+    rows = dict(re.findall(r"^\| ([^|]+) \| (.*) \|$", card, re.MULTILINE))
+    expected = {"parameters": "20,007", "longest motion": "60 frames", "actions": "walk, sit"}
+    expected |= {"condition": "ActionLabels", "data": "humanact12", "weights: steps": "500"}
+    expected |= {"fingerprint of the data": "unknown", "sha256 of model.safetensors": "f00d"}
+    assert {name: rows[name] for name in expected} == expected
+    assert "flame_mdm.generate(model, actions=['walk'], seconds=3, seed=0)" in card
+
+
+@pytest.mark.parametrize("is_moved", [True, False])
+def test_a_shared_recipe_names_the_default_folders_instead_of_absolute_ones(is_moved: bool):
+    here = "/home/me" if is_moved else "mine"
+    config = {
+        "experiment": "bandai/mdm",
+        "data_root": f"{here}/sets",
+        "run": {"dir": f"{here}/runs/7"},
+        "data": {"root": f"{here}/sets"},
+        "seed": 3,
+    }
+    shared = model_files.without_own_paths(config)
+    folders = (shared["data_root"], shared["data"]["root"], shared["run"]["dir"])
+    default = ("data", "data", "runs/bandai/mdm/default")
+    assert folders == (default if is_moved else ("mine/sets", "mine/sets", "mine/runs/7"))
+    assert (shared["seed"], config["data_root"]) == (3, f"{here}/sets")
+
+
+def test_options_at_the_top_of_a_file_override_those_of_training_and_of_the_network(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(
+        "model: {num_heads: 2, num_frames: 20, lambda_vel: 1}\n"
+        "training: {num_heads: 3, num_frames: 30}\n"
+        "num_frames: 40\ncond_mask_prob: null\n"
+    )
+    expected = {"num_heads": 3, "num_frames": 40, "lambda_vel": 1.0, "cond_mask_prob": 0.1}
+    options = read_options(path, {}).model_dump()
+    assert {name: options[name] for name in expected} == expected
+    assert read_options(path, {"num_heads": 8}).num_heads == 8
 
 
 def test_a_loaded_model_has_the_hash_of_its_file_and_a_built_one_the_facts_about_its_data():

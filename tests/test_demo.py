@@ -14,6 +14,7 @@ import tempfile
 import threading
 import urllib.error
 import urllib.request
+from collections import OrderedDict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,6 +27,7 @@ from support.browser import browser, in_chromium
 from support.fixtures import ROOT
 from support.refusals import error_of
 
+from flame_mdm.__main__ import main
 from flame_mdm.demo import studio as making
 from flame_mdm.demo.request import MAX_EDITS, DemoEdit, DemoRequest, parse_query
 from flame_mdm.errors import UserError
@@ -252,6 +254,26 @@ def test_a_sentence_becomes_parts_that_are_read_unless_it_stays_as_it_is(
     read = [caption for reading in studio.readings(understood) for caption in reading.captions]
     assert read == captions
     assert studio.advice(understood) == advice
+
+
+def test_motions_that_were_used_longest_ago_are_forgotten_first(studio, monkeypatch):
+    seeds = list[int]()
+    monkeypatch.setattr(making, "KEPT", 2)
+    monkeypatch.setattr(making, "generate", lambda model, **keys: seeds.append(keys["seed"]) or [])
+    monkeypatch.setattr(studio, "_made", OrderedDict())
+    for seed in (1, 2, 1, 3, 1, 2):
+        studio.motions(DemoRequest(text="a person walks", seed=seed))
+    assert seeds == [1, 2, 3, 2]
+
+
+def test_the_command_offers_the_first_model_with_each_adapter(monkeypatch):
+    app = pytest.importorskip("flame_mdm.demo.app", reason="gradio is not installed")
+    served = list[tuple[Any, ...]]()
+    monkeypatch.setattr(app, "serve", lambda *values: served.append(values))
+    words = ["adapter=x.safetensors y.safetensors", "port=8000", "hosts=a.example b.example"]
+    assert main(["demo", "ckpt=one two", *words, "host=0.0.0.0", "device=cpu"]) == 0
+    sources = ["one", "two", "one + x.safetensors", "one + y.safetensors"]
+    assert served == [(sources, "0.0.0.0", 8000, "cpu", ["a.example", "b.example"])]
 
 
 def test_parts_that_are_too_long_for_the_page_are_not_read(studio):

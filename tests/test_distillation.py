@@ -24,6 +24,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 from flame_mdm.checkpoints.adapters import About, attach, copy_weights, word_rows, write_adapter
 from flame_mdm.checkpoints.hub import export
+from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import hashed
@@ -605,6 +606,38 @@ def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path, subtes
         strength=[0.5, 2],
     )
     assert torch.equal(sampled(flame_mdm.load(merged)), sampled(both))
+
+
+@pytest.mark.parametrize(
+    ("format_", "module", "function"),
+    [("safetensors", "hub", "export"), ("onnx", "onnx_export", "export_onnx")],
+)
+def test_the_command_exports_with_all_adapters_and_their_strengths(
+    monkeypatch, format_, module, function
+):
+    exported = list[tuple[Any, ...]]()
+
+    def export_to(source: Path, out: str, **keys: Any) -> str:
+        exported.append((source, out, keys))
+        return out
+
+    monkeypatch.setattr(f"flame_mdm.checkpoints.{module}.{function}", export_to)
+    words = ["adapter=a.safetensors b.safetensors", "adapter_strength=[0.5,2]", "half=true"]
+    assert main(["export", "quickstart", "out", f"format={format_}", *words]) == 0
+    ((source, out, keys),) = exported
+    assert (source, out) == (find("quickstart"), "out")
+    adapters = ["a.safetensors", "b.safetensors"]
+    assert keys == {"half": True, "adapter": adapters, "strength": [0.5, 2]}
+
+
+def test_words_and_captions_of_an_adapter_come_first_unless_its_strength_is_zero(taught):
+    files = [taught / "limp.safetensors", taught / "march.safetensors"]
+    base = flame_mdm.load(taught / "base.safetensors").facts
+    facts = flame_mdm.load(taught / "base.safetensors", adapter=files, strength=[0, 0.5]).facts
+    assert facts["vocabulary"] == ["march", "in", "style", *base["vocabulary"]]
+    assert facts["captions"] == ["a person limps", *base["captions"]]
+    without = flame_mdm.load(taught / "base.safetensors", adapter=files, strength=0).facts
+    assert without == base
 
 
 def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path, subtests):

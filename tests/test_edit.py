@@ -31,8 +31,9 @@ from flame_mdm.sampling.editing import (
     _part_length,
     edit,
     method_options,
+    resolve_edit,
 )
-from flame_mdm.sampling.motion_request import EditRequest
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
 from flame_mdm.sampling.reading import decoded, part_of, read_motion, with_features
 from flame_mdm.seeds import seeded_noise
 
@@ -287,6 +288,15 @@ def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, reque
         edit(model, motion, strength=strength, joints="upper_body", method="mdm")[0].feature_error
         == 0
     )
+
+
+def test_a_sentence_of_several_actions_stays_the_text_of_one_edited_part(diffusion, motion):
+    text = "a person walks forward, then jumps"
+    request = SamplingRequest.of("edit", {"texts": text, "region": "suffix"}, editing=True)
+    resolved = resolve_edit(request, diffusion, motion).resolved
+    (prompt,) = resolved.prompts
+    assert (prompt.text, prompt.frames) == (text, (len(motion.joints),))
+    assert not resolved.is_sequence
 
 
 def test_an_edit_depends_on_its_own_seed_alone(diffusion, motion):

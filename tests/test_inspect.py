@@ -1,5 +1,6 @@
 """Faults of motions, the command that shows them, and perturbations of real motions against closed forms."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from evaluators import perturbations as p
 from evaluators.encoding import encode
 from flame_mdm.__main__ import main
 from flame_mdm.commands import FileSettings, read_motions
-from flame_mdm.formats.faults import LIMITS, _away, _stretched, depths, find_faults
+from flame_mdm.formats import faults as faults_module
+from flame_mdm.formats.faults import LIMITS, Fault, _away, _stretched, depths, find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
@@ -297,6 +299,34 @@ def test_the_worst_clips_of_a_data_set_are_shown(tmp_path, capsys):
     assert "0 of 40 motions have faults" in printed
     assert "the 3 worst motions" in printed
     assert len(Page(tmp_path / "page.html").motions) == 3
+
+
+def test_motions_are_worst_by_their_kinds_of_faults_and_then_by_their_share_of_faulty_frames(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    first, second = list(LIMITS)[:2]
+    spans = {
+        "few": (40, [(first, 0, 4)]),
+        "short": (20, [(first, 0, 3)]),
+        "twice": (40, [(first, 0, 5), (first, 0, 5)]),  # 5 of 40 frames
+        "kinds": (40, [(first, 0, 1), (second, 0, 1)]),
+        "none": (40, []),
+    }
+    for name, (frames, _) in spans.items():
+        Motion(body()[:frames], FPS, text=name).save(f"motions/{name}.npz")
+
+    def faults_of(motion: Motion) -> list[Fault]:
+        return [Fault(kind, "head", start, end, 1.0) for kind, start, end in spans[motion.text][1]]
+
+    monkeypatch.setattr(faults_module, "find_faults", faults_of)
+    assert main(["inspect", "motions", "page.html", "clips=3"]) == 3
+    shown = Page(tmp_path / "page.html").motions
+    assert [motion["caption"] for motion in shown] == ["kinds", "short", "twice"]
+    printed = capsys.readouterr().out
+    assert "motions: 4 of 5 motions have faults" in printed
+    assert re.search(rf"{first} +4 \(80\.0%\)", printed)
+    assert re.search(rf"{second} +1 \(20\.0%\)", printed)
 
 
 @pytest.fixture

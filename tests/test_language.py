@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from support.fixtures import ROOT
 
+from flame_mdm.conditions.language import meaning
 from flame_mdm.conditions.language.abilities import Abilities
 from flame_mdm.conditions.language.meaning import is_thing, nearest_actions
 from flame_mdm.conditions.language.parsing import understand
 from flame_mdm.conditions.language.reading import NotUnderstood, Reader
 from flame_mdm.conditions.language.spelling import corrections, distance
-from flame_mdm.conditions.language.tables import actions
+from flame_mdm.conditions.language.tables import actions, words_of
 from flame_mdm.conditions.language.tokens import corrected_to_action, tokenize
 from flame_mdm.conditions.language.understanding import Mention, Understanding
-from flame_mdm.conditions.language.vectors import FILE, word_table
+from flame_mdm.conditions.language.vectors import FILE, WordTable, word_table
 from flame_mdm.conditions.language.wording import caption, predicate
 from flame_mdm.conditions.vocabulary import known_form
 from flame_mdm.data.synthetic import draw_captions, prompts
@@ -446,3 +447,151 @@ def test_next_to_a_thing_is_a_place_and_next_alone_a_time(text: str, count: int)
 def test_words_between_a_number_and_its_action_do_not_hide_the_count(text: str):
     (mention,) = understand(text).mentions
     assert (mention.action, mention.attributes["count"]) == ("squat", 3)
+
+
+def test_frequent_words_have_little_weight_in_the_mean_of_words():
+    """By Zipf's law, the frequency of the word in row n is proportional to 1 / (n + 2)."""
+    table = WordTable(["the", "walk", "jump", "wave"], np.eye(4))
+    total = 1 / 2 + 1 / 3 + 1 / 4 + 1 / 5
+    walk, wave = (1e-4 / (1e-4 + 1 / place / total) for place in (3, 5))
+    expected = np.array([0, walk, 0, wave]) / np.hypot(walk, wave)
+    mean = table.mean(["walks", "unlisted", "waving"])
+    assert mean is not None
+    np.testing.assert_allclose(mean, expected)
+    assert table.mean(["unlisted"]) is None
+    assert (table.rank("jumps"), table.rank("the"), table.has("jumps")) == (2, 0, False)
+
+
+@pytest.mark.parametrize("word", ["brawl", "stroll", "bread", "tiptoeing"])
+def test_an_action_is_as_similar_as_its_closest_word_and_the_mean_of_its_words(word: str):
+    table, scores = word_table(), {}
+    vector = table.vector(word)
+    assert vector is not None
+    for name, entry in actions().items():
+        single = [phrase.words[0] for phrase in entry.phrases if phrase.size == 1]
+        rows = [table.vector(other) for other in single if other not in words_of("weak")]
+        rows = [row for row in rows if row is not None]
+        if not rows and (mean := table.mean(list(entry.phrases[0].words))) is not None:
+            rows = [mean]
+        closest = max((float(row @ vector) for row in rows), default=-1.0)
+        center = np.sum(rows, axis=0) if rows else np.zeros(64)
+        center = center / max(np.linalg.norm(center), 1e-9)
+        scores[name] = (closest + float(center @ vector)) / 2
+    ranked = nearest_actions(word)
+    assert dict(ranked) == pytest.approx(scores, abs=1e-5)
+    assert [score for _, score in ranked] == sorted((score for _, score in ranked), reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("count", "repeats"), [(5, ["twice", "twice", "once"]), (12, ["twice"] * 6), (13, [""])]
+)
+def test_up_to_twelve_repetitions_are_sampled_in_parts(count: int, repeats: list[str]):
+    reading = Reader(FACTS).read(f"kicks {count} times")
+    assert list(reading.captions) == [f"a person kicks {times}".strip() for times in repeats]
+    is_ignored = reading.ignored == ("13 times",)
+    assert is_ignored == (count == 13)
+    if not is_ignored:
+        numbers = {"once": 1, "twice": 2}
+        seconds = [0.8 + 0.7 * numbers[times] for times in repeats]
+        assert reading.seconds() == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("jumps x 3", 3),
+        ("jumps 3 times", 3),
+        ("jumps 3x", 3),
+        ("jumps a couple of times", 2),
+        ("jumps two more times", 2),
+        ("jumps thrice", 3),
+        ("does five quick push-ups", 5),
+        ("claps 120 times", 120),
+        ("claps 1200 times", None),
+        ("jumps for five seconds", None),
+        ("jumps over two meters", None),
+        ("jumps with both arms", None),
+        ("jumps on one leg", None),
+        ("takes three steps", 3),
+        ("jumps once", 1),
+        ("jumps once he has looked around", None),
+    ],
+)
+def test_numbers_are_counts_unless_they_measure_something_else(text: str, count: int | None):
+    assert understand(text).mentions[0].attributes.get("count") == count
+
+
+@pytest.mark.parametrize(
+    ("text", "amount"),
+    [
+        ("turns 180 degrees", "half"),
+        ("turns around", "half"),
+        ("makes half a turn", "half"),
+        ("turns 90 degrees", "quarter"),
+        ("makes a quarter turn to the left", "quarter"),
+        ("turns to the left", None),
+    ],
+)
+def test_a_turn_has_an_amount_if_its_angle_is_stated(text: str, amount: str | None):
+    (mention,) = understand(text).mentions
+    assert (mention.action, mention.attributes.get("amount")) == ("turn", amount)
+
+
+@pytest.mark.parametrize(
+    ("text", "steps"),
+    [
+        ("a person jumps before bowing", ["jump", "bow"]),
+        ("before bowing, a person jumps", ["jump", "bow"]),
+        ("a person bows after jumping", ["jump", "bow"]),
+        ("after jumping, a person bows", ["jump", "bow"]),
+        ("once they have jumped, they bow", ["jump", "bow"]),
+        ("when the person has jumped, he bows", ["jump", "bow"]),
+        ("a person jumps until he bows", ["jump", "bow"]),
+        ("a person jumps, bows afterwards", ["jump", "bow"]),
+        ("a person jumps followed by a bow", ["jump", "bow"]),
+        ("a person jumps and bows", ["jump", "bow"]),
+        ("a person kicks, jumps and bows after clapping", ["kick", "jump", "clap", "bow"]),
+        ("a person waves while walking", ["wave+walk"]),
+        ("while walking, a person waves", ["walk+wave"]),
+        ("while walking, a person waves, then bows", ["walk+wave", "bow"]),
+        ("a person walks, waving", ["walk+wave"]),
+        ("a person walks and waves at the same time", ["walk+wave"]),
+        ("a person kicks, then walks and waves simultaneously", ["kick", "walk+wave"]),
+        ("a person jumps once", ["jump"]),
+        ("a person walks next to the table", ["walk"]),
+        ("a person stands still while waving", ["wave"]),
+        ("a person kicks, then faster", ["kick", "kick"]),
+    ],
+)
+def test_connectives_state_the_order_of_actions(text: str, steps: list[str]):
+    understood = understand(text).steps
+    assert ["+".join(mention.action for mention in step) for step in understood] == steps
+
+
+def test_a_word_is_replaced_by_the_most_similar_one_from_a_cosine_of_0_65_on(monkeypatch):
+    cosines = {"alpha": 1.0, "beta": 0.65, "gamma": 0.64, "delta": 0.7}
+    vectors = [[cosine, (1 - cosine**2) ** 0.5] for cosine in cosines.values()]
+    table = WordTable(list(cosines), np.array(vectors))
+    monkeypatch.setattr(meaning, "word_table", lambda: table)
+    for words, expected in (
+        (["gamma"], None),
+        (["gamma", "beta"], "beta"),
+        (["unlisted", "beta", "delta", "gamma"], "delta"),
+        (["unlisted"], None),
+    ):
+        assert meaning.similar_word("alpha", words) == expected
+    assert meaning.similar_word("unlisted", ["alpha"]) is None
+
+
+@pytest.mark.parametrize(("things", "expected"), [([0.9, 0.8, 0.7], True), ([0.9, 0.8], False)])
+def test_a_word_is_a_thing_if_three_of_the_five_closest_words_are(monkeypatch, things, expected):
+    def vectors(cosines: list[float]) -> np.ndarray:
+        return np.array([[cosine, (1 - cosine**2) ** 0.5] for cosine in cosines])
+
+    table = WordTable(["word"], np.array([[1.0, 0.0]]))
+    listed = ["walk"], np.zeros(5, int), vectors([0.95, 0.85, 0.6, 0.5, 0.4])
+    monkeypatch.setattr(meaning, "word_table", lambda: table)
+    monkeypatch.setattr(meaning, "_action_vectors", lambda: listed)
+    monkeypatch.setattr(meaning, "_thing_vectors", lambda: vectors(things))
+    assert meaning.is_thing("word") == expected
+    assert not meaning.is_thing("unlisted")

@@ -304,3 +304,19 @@ def test_a_function_of_the_page_is_called_at_its_own_address_with_its_own_argume
             assert client.post(queue, json=call | change).status_code == 400, change
         stream = "/gradio_api/queue/data?session_hash="
         assert [client.get(stream + name).status_code for name in ("s", "t")] == [200, 404]
+
+
+def test_replaced_frames_are_no_part_of_a_file_that_begins_after_the_start(model, monkeypatch):
+    monkeypatch.setattr(making, "KEPT", 2.0)
+    live = LiveStreams(model)
+    name = live.block("", WALK, 0)["stream"]
+    for begin in (30, 60):
+        live.block(name, WALK, begin)
+    before = live._streams[name].joints.copy()
+    assert len(before) == 40  # frames 50 to 89
+    block = live.block(name, WALK, 75)
+    kept = live._streams[name].joints
+    assert len(kept) == 40  # frames 65 to 104
+    np.testing.assert_array_equal(kept[:10], before[15:25])
+    apart = np.abs(joints_of(block["motion"]) - kept[10:]).max()
+    assert apart < 0.001 + block["motion"]["step"]

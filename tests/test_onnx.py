@@ -29,6 +29,7 @@ from flame_mdm.batch import Condition, length_mask
 from flame_mdm.checkpoints import onnx_export as onnx
 from flame_mdm.checkpoints import runner
 from flame_mdm.conditions import vocabulary
+from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.data.standing import standing
 from flame_mdm.errors import UserError
 from flame_mdm.formats import fbx_scene
@@ -248,6 +249,42 @@ def test_the_runner_draws_the_noise_of_a_sentence_for_another_caption() -> None:
     read = sampler_without_graphs(**passes).generate("caption", text="typed")
     np.testing.assert_array_equal(read, as_typed)
     assert not np.array_equal(sampler_without_graphs(**passes).generate("caption"), as_typed)
+
+
+@pytest.mark.parametrize("clip", [False, True])
+def test_a_step_of_the_runner_combines_noise_and_the_last_two_clean_estimates(clip: bool) -> None:
+    """A row of the plan contains t, p, q, a, b, c and d; the denoiser returns 5 t."""
+    steps = [[3, 0.5, 0.2, 0.25, 3, 7, 0.1], [2, 0, 0.3, 0.5, 0.25, 4, 0], [1, 0, 0.1, 1, 1, 2, 2]]
+    sampler, times = sampler_without_graphs(clip_x0=clip, steps=steps, features=3), list[float]()
+
+    def run(name: str, inputs: dict[str, np.ndarray], shapes: Any) -> list[np.ndarray]:
+        times.extend(inputs["t"].tolist())
+        return [np.full(shapes[0], 5 * inputs["t"][0], np.float32)]
+
+    sampler._run = run  # type: ignore[method-assign]
+    x, before, draws = runner.normal(11, 4, 3), np.zeros((4, 3)), 0
+    for t, p, q, a, b, c, d in steps:
+        clean = p * x + q * 5 * t
+        clean = clean.clip(-1, 1) if clip else clean
+        x = a * x + b * clean + c * before
+        if d:
+            draws += 1
+            x = x + d * runner.normal(11 + draws, 4, 3)
+        before = clean
+    np.testing.assert_allclose(sampler._sample({}, 4, 11), x, rtol=1e-5)
+    assert times == [3, 2, 1]
+
+
+@pytest.mark.parametrize("words", [["a", "jumps", "walks"], []])
+def test_the_runner_reads_the_words_that_the_package_reads(words: list[str]) -> None:
+    encoder = LearnedTokens(8, buckets=50, max_words=4, heads=2)
+    encoder.seen = set(words)
+    sampler = sampler_without_graphs(reads="text", buckets=50, max_words=4, vocabulary=words)
+    for text in ("", "Walked", "a man walks", "a jumping man walks and jumps, walks again"):
+        rows, condition = encoder.rows(text), sampler._condition(text)
+        assert condition["counts"].tolist() == [len(rows)]
+        padding = [(0, 0)] * (3 - len(rows))
+        assert [tuple(row) for row in condition["condition"][0].tolist()] == [*rows, *padding]
 
 
 def test_noise_of_the_runner_depends_on_prompt_sample_and_seed() -> None:

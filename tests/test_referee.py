@@ -22,10 +22,18 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.generation import best
-from flame_mdm.sampling.referee import kinds
+from flame_mdm.sampling.referee import judging, kinds
 from flame_mdm.sampling.referee.body import Body
 from flame_mdm.sampling.referee.claims import Claim, falsified
-from flame_mdm.sampling.referee.judging import END, claim_score, decide, verdicts
+from flame_mdm.sampling.referee.judging import (
+    END,
+    Answer,
+    Judgment,
+    Verdict,
+    claim_score,
+    decide,
+    verdicts,
+)
 from flame_mdm.sampling.referee.kinds import KINDS, Kind, band, group_of, thresholds
 from flame_mdm.sampling.referee.readings import (
     Reading,
@@ -732,6 +740,109 @@ def test_a_posture_at_an_end_is_held_there_and_not_at_the_other_end(
     begin, end = verdict.reading.spans[0]
     assert end - begin == pytest.approx(END)
     assert (begin == 0) == (when == "start")
+
+
+def judgment(*answers: Answer) -> Judgment:
+    reading = Reading(0.5, 0.5, "m")
+    return Judgment(
+        "", tuple(Verdict(Claim("walk"), answer, reading, (0.0, 1.0)) for answer in answers)
+    )
+
+
+def test_a_true_claim_raises_the_score_of_a_candidate_and_a_false_one_lowers_it(monkeypatch):
+    judged = [
+        judgment("yes", "yes", "cannot tell"),
+        judgment("yes", "no", "no"),
+        judgment("cannot tell"),
+        None,
+    ]
+    assert [one.accuracy for one in judged if one] == [1, pytest.approx(1 / 3), None]
+    rest = iter(judged)
+    monkeypatch.setattr(judging, "try_judge", lambda motion: next(rest))
+    assert claim_score([raising("left", 20)] * 4) == [2, -1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("fps", "frames", "marked"),
+    [
+        (20.0, 60, [(10, 24), (38, 39), (59, 60)]),
+        (30.0, 90, [(15, 36), (57, 58), (88, 90)]),
+        (120.0, 360, [(60, 144), (228, 229), (354, 360)]),
+    ],
+)
+def test_evidence_is_marked_in_the_frames_of_the_motion(fps: float, frames: int, marked: list):
+    """Spans are in seconds; a mark has at least one frame, and none is after the motion."""
+    spans = ((0.5, 1.2), (1.9, 1.9), (2.95, 4.0), (0.0, 1.0))
+    verdict = Verdict(Claim("walk"), "no", Reading(0.1, 0.1, "m", "pelvis", spans), (0.2, 0.6))
+    marks = verdict.marks(fps, frames)
+    assert [mark[:2] for mark in marks] == marked  # the first three spans
+    evidence = "pelvis: 0.10 m, 0.5-1.2 s, 1.9-1.9 s, 2.9-4.0 s"
+    assert {mark[2:] for mark in marks} == {("no: walk", evidence)}
+
+
+@pytest.mark.parametrize(
+    ("claim", "wrong"),
+    [
+        (Claim("travel", direction="forward"), [("direction", "travel: backward")]),
+        (Claim("travel", direction="backward"), [("direction", "travel: forward")]),
+        (Claim("turn", direction="clockwise"), [("direction", "turn: counterclockwise")]),
+        (Claim("pace", speed="slow"), [("speed", "pace: fast")]),
+        (Claim("turn angle", amount=90), []),
+        (Claim("count jumps", amount=1), [("count", "count jumps: 2")]),
+        (Claim("run", seconds=1), [("duration", "run: for 2 s")]),
+        (Claim("run", seconds=5), [("duration", "run: for 10 s"), ("duration", "run: for 2 s")]),
+        (Claim("upright", when="start"), [("posture", "lie: at the start")]),
+        (
+            Claim("lie", when="start"),
+            [("posture", "upright: at the start"), ("start or end", "lie: at the end")],
+        ),
+        (
+            Claim("raise hand", side="both", when="end"),
+            [("start or end", "raise hand: both, at the start")],
+        ),
+        (Claim("return pose", when="end"), []),
+        (Claim("raise hand"), []),
+    ],
+    ids=str,
+)
+def test_a_claim_is_falsified_in_each_of_its_attributes_that_has_an_opposite(
+    claim: Claim, wrong: list[tuple[str, str]]
+):
+    assert [(change, str(other)) for change, other in falsified(claim)] == wrong
+
+
+@pytest.mark.parametrize(
+    ("text", "claims"),
+    [
+        ("a man turns a quarter turn to the left", ["turn: left", "turn angle: left, 90"]),
+        ("he turns 45 degrees to the right", ["turn: right", "turn angle: right, 45"]),
+        ("a person takes twelve steps", ["count steps: 12"]),
+        ("a person takes thirteen steps", []),
+        ("a person takes 13 steps", []),
+        ("a person takes two steps", ["count steps: 2"]),
+        ("a person takes one step forward", ["step", "step: forward"]),
+        ("a person runs for 10 seconds", ["run", "run: for 10 s"]),
+        ("a person walks forward for two seconds", ["walk", "travel: forward", "walk: for 2 s"]),
+        ("a person walks diagonally forward", ["walk"]),
+        ("a person jumps before he runs", ["jump", "run", "jump, then run"]),
+        ("a person jumps after he runs", ["jump", "run"]),
+        ("a person jumps | runs", ["jump", "run", "jump, then run"]),
+        ("a person jumps, then jumps again", ["jump"]),
+        ("a person bows and stands up", ["bend"]),
+        ("a person stands still, then walks", ["walk"]),
+    ],
+)
+def test_numbers_directions_and_orders_are_read_within_their_limits(text: str, claims: list[str]):
+    assert [str(claim) for claim in read_claims(text)] == claims
+
+
+@pytest.mark.parametrize(("frames", "is_judged"), [(10, False), (11, True)])
+def test_a_generated_motion_of_half_a_second_is_not_judged(frames: int, is_judged: bool):
+    motion = raising("left", frames)
+    motion.text = "a person raises the left hand"
+    assert (judging.try_judge(motion) is not None) == is_judged
+    motion.text = "someone cooks"
+    assert judging.try_judge(motion) is None
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast, get_type_hints
@@ -17,8 +17,10 @@ from support.refusals import error_of, one_line_error
 import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Edit
-from flame_mdm.commands.sample import SampleSettings
+from flame_mdm.commands.edit import EditSettings
+from flame_mdm.commands.sample import SampleSettings, _folders
 from flame_mdm.conditions import prompts
+from flame_mdm.conditions.prompts import ReadPrompt
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
@@ -26,11 +28,16 @@ from flame_mdm.formats.readers import read
 from flame_mdm.processes.guidance import Positions
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling import generation, motion_request, resolution
-from flame_mdm.sampling.generation import _edit, _stages, best
+from flame_mdm.sampling.generation import _edit, _rows, _stages, best
 from flame_mdm.sampling.keywords import EditKeywords, SamplerKeywords, SamplingKeywords
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest, path_targets
-from flame_mdm.sampling.output import degenerate_notes
-from flame_mdm.sampling.resolution import resolve
+from flame_mdm.sampling.output import degenerate_notes, summary
+from flame_mdm.sampling.resolution import (
+    ResolvedPrompt,
+    ResolvedRequest,
+    _usual_frames,
+    resolve,
+)
 from flame_mdm.sampling.targets import Targets, read_targets
 
 TEXT = "a person walks forward"
@@ -455,3 +462,135 @@ def test_an_option_that_is_zero_replaces_the_value_of_the_recipe():
     recipe = SamplerOptions(guidance_scale=2.5, sampler="ddim", eta=0.7)
     chosen = SamplerOptions(guidance_scale=0, eta=0).over(recipe).chosen()
     assert chosen == {"guidance_scale": 0, "sampler": "ddim", "eta": 0}
+
+
+def test_samples_of_a_text_that_is_listed_twice_are_numbered_on():
+    request = SamplingRequest(texts=["walks", "sits", "walks"], samples=2, candidates=2)
+    prompts = tuple(ResolvedPrompt(text, False, (text,), (20,)) for text in request.prompts)
+    names = [row.id for row in _rows(ResolvedRequest(request, prompts, False))]
+    walking, sitting = ([f"{text}#{n}" for n in range(8)] for text in ("walks", "sits"))
+    assert names == [*walking[:4], *sitting[:4], *walking[4:]]
+
+
+@pytest.mark.parametrize(
+    ("texts", "samples", "candidates", "is_valid"),
+    [
+        (100, 100, 1, True),
+        (100, 101, 1, False),
+        (101, 100, 1, False),
+        (50, 20, 10, True),
+        (50, 20, 11, False),
+    ],
+)
+def test_a_request_has_at_most_ten_thousand_motions(texts, samples, candidates, is_valid):
+    def request() -> SamplingRequest:
+        return SamplingRequest(texts=["walks"] * texts, samples=samples, candidates=candidates)
+
+    if is_valid:
+        assert len(request().prompts) == texts
+    else:
+        with pytest.raises(UserError, match=r"may contain at most 10,000 motions"):
+            request()
+
+
+@pytest.mark.parametrize(
+    ("fitting", "requested", "longest", "frames"),
+    [
+        ((3.6, None, 1.5), None, 196, [60, None, 30]),
+        ((3.6, None, 1.5), None, 50, [50, None, 30]),
+        ((3.6, None, 1.5), 25.0, 196, [25, 25, 25]),
+        ((), None, 196, [None, None, None]),
+        ((), 25.0, 196, [25, 25, 25]),
+    ],
+)
+def test_repetitions_last_three_seconds_or_as_long_as_training_motions_at_most(
+    fitting, requested, longest, frames
+):
+    prompt = ReadPrompt([(text, None) for text in ("kicks", "walks", "claps")], ("",) * 3)
+    sized: Any = SimpleNamespace(
+        representation=SimpleNamespace(fps=20.0), facts={"max_frames": longest}
+    )
+    assert _usual_frames(replace(prompt, fitting=fitting), requested, sized) == frames
+
+
+@pytest.mark.parametrize(("frames", "is_long"), [(10, True), (9, False)])
+def test_a_motion_to_continue_is_as_long_as_the_overlap_of_windows(model, frames, is_long):
+    walk = flame_mdm.generate(model, TEXT, frames=frames, num_inference_steps=2)[0]
+    request = SamplingRequest(texts=TEXT, after=walk, seconds=2)
+    if not is_long:
+        with pytest.raises(
+            UserError, match=r"the motion has 9 frames\. Use a motion of at least 10"
+        ):
+            resolve(request, model)
+        return
+    resolved = resolve(request, model)
+    assert resolved.prompts[0].frames == (10 + 40,)
+    assert resolved.before is not None
+    assert resolved.edit is not None
+    np.testing.assert_array_equal(resolved.before.numpy(), walk.features)
+    expected = model.representation.normalize(resolved.before)[None]
+    torch.testing.assert_close(resolved.edit.known, expected)
+    assert resolved.edit.keep.all()
+
+
+def test_the_summary_counts_the_motions_and_names_the_files_that_are_written():
+    motions = [Motion(np.zeros((40, 22, 3)), 20.0)] * 3
+    folder = Path("out")
+    page = folder / "player.html"
+    assert summary(folder, motions, mp4=True) == (
+        f"3 motions of 40 frames: {page}, motions.gif, motions.mp4"
+    )
+    assert summary(folder, motions[:1], mp4=False) == f"1 motion of 40 frames: {page}, motions.gif"
+
+
+@pytest.mark.parametrize(
+    ("options", "samples"),
+    [
+        ({}, 3),
+        ({"out": "folder"}, 3),
+        ({"out": "walk.fbx"}, 1),
+        ({"out": "walk.fbx", "samples": 2}, 2),
+        ({"samples": 1}, 1),
+    ],
+)
+def test_a_command_samples_three_motions_for_a_folder_and_one_for_a_file_by_default(
+    options, samples
+):
+    settings = SampleSettings(ckpt="quickstart", text=TEXT, **options)
+    assert settings.request_for(None).samples == samples
+    edit = EditSettings(ckpt="quickstart", motion="walk.npz", joints="arms", text=TEXT)
+    assert edit.request().samples == 3
+    assert SamplingRequest(texts=TEXT).samples == 1
+
+
+def test_samples_of_different_requests_are_written_to_different_folders(model, monkeypatch):
+    def folder(**options: Any) -> Path:
+        settings = SampleSettings(ckpt="quickstart", **{"text": TEXT} | options)
+        resolved = resolve(settings.request_for(None), model)
+        (only,) = _folders(settings, resolved, model, [])
+        return only
+
+    changes: list[dict[str, Any]] = [
+        {"text": "a person jumps"},
+        {"seconds": 2.0},
+        {"seed": 1},
+        {"guidance_scale": 2.0},
+        {"spacing": "stride"},
+        {"candidates": 2},
+        {"candidates": 2, "scorer": "claims"},
+        {"split": False},
+        {"loop": True},
+        {"path": "0,1"},
+        {"path": "0,1.5"},
+        {"shared_noise": True},
+        {"cleanup": True},
+        {"adapter": ["a"]},
+        {"adapter": ["b"]},
+        {"adapter_strength": 0.5},
+    ]
+    first = folder()
+    assert len({first, *(folder(**change) for change in changes)}) == len(changes) + 1
+    for same in ({"samples": 5}, {"frames": 60}, {"mp4": True}, {"trajectory": True}):
+        assert folder(**same) == first
+    monkeypatch.setattr(model, "sha256", "f00d")
+    assert folder() != first

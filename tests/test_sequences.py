@@ -175,6 +175,22 @@ def test_lengths_out_of_range_are_refused(model, seconds, usual, message):
         part_frames(model, "walks", parts, [usual] * len(parts), is_sequence=timed, loop=False)
 
 
+@pytest.mark.parametrize(
+    ("model", "seconds", "usual", "frames"),
+    [
+        (sized(20, 60), [None], 2.0, [2]),
+        (sized(20, 60), [None], 60.4, [60]),
+        (sized(20, 60), [2.0, 0.5], None, [40, 10]),
+        (sized(20, 60), [300.0, 300.0], None, [6000, 6000]),
+        (sized(20, 40, 10), [0.05], None, [1]),
+    ],
+)
+def test_the_shortest_and_the_longest_motions_are_not_refused(model, seconds, usual, frames):
+    parts = [("walks", duration) for duration in seconds]
+    options = {"is_sequence": seconds != [None], "loop": False}
+    assert part_frames(model, "walks", parts, [usual] * len(parts), **options) == frames
+
+
 def test_one_window_changes_nothing_and_two_are_averaged():
     x, t, mask = (
         torch.randn(2, 20, 3),
@@ -635,6 +651,16 @@ def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, ca
         flame_mdm.edit(model, walk, text, region="prefix")
     assert "no word says what happens" in error_of(capsys, "sample", "quickstart", f"text={text}")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_captions_are_nearest_if_they_share_the_words_for_what_happens():
+    both, one = "a person waves with both hands twice", "a person waves"
+    captions = ["a person jumps", one, "cats", "a man with a red hat waves slowly", both, "twice"]
+    text = "a person waves twice"
+    assert vocabulary.nearest(text, captions) == [both, one, "twice"]
+    assert vocabulary.nearest(text, captions, 9)[3:] == ["a man with a red hat waves slowly"]
+    # Without such words, all words count
+    assert vocabulary.nearest("the person", captions, 2) == ["a person jumps", one]
 
 
 def test_plain_captions_are_about_a_person_and_short():

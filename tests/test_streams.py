@@ -33,8 +33,10 @@ from flame_mdm.sampling import streams as streams_module
 from flame_mdm.sampling import waypoints
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
+from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
+from flame_mdm.sampling.resolution import resolve
 from flame_mdm.sampling.streams import (
     OnlineCleanup,
     Schedule,
@@ -372,6 +374,46 @@ def test_a_model_trained_with_targets_also_reads_them():
     next(stream(aiming, "a person walks"))
     assert seen
     assert all(target is None for target in seen)
+
+
+def test_a_model_in_training_streams_without_dropout_and_stays_in_training(model):
+    expected = next(stream(model, "a person walks")).joints
+    model.train()
+    try:
+        training = next(stream(model, "a person walks")).joints
+        assert model.training
+    finally:
+        model.eval()
+    assert_same(training, expected)
+
+
+def test_samples_of_a_text_with_shared_noise_are_the_same_stream(model):
+    one, other = generate(model, "a person walks", seconds=1, samples=2, shared_noise=True)
+    assert_same(one.joints, other.joints)
+    seeded = generate(model, "a person walks", seconds=1, shared_noise=True, seed=1)[0]
+    assert not np.allclose(one.joints, seeded.joints, atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [CONTEXT, CONTEXT - 1])
+def test_a_motion_that_is_continued_has_at_least_as_many_frames_as_the_model_reads(
+    model, walk, count
+):
+    features = torch.from_numpy(walk.features[:count])
+    begun = decoded(model.representation, features, "", "begun")
+    request = SamplingRequest(texts="a person walks", after=begun)
+    if count < CONTEXT:
+        for name, read in (
+            ("start", starting_point),
+            ("after", lambda *_: resolve(request, model)),
+        ):
+            with pytest.raises(UserError, match=f"{name}=begun: the motion has 9 frames"):
+                read(model, begun)
+        return
+    prefix, _ = starting_point(model, begun)
+    torch.testing.assert_close(prefix[0], model.representation.normalize(features))
+    before = resolve(request, model).before
+    assert before is not None
+    assert torch.equal(before, features)
 
 
 def test_a_person_stands_still_before_the_first_block(model):

@@ -40,7 +40,15 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats import asf, resampling
 from flame_mdm.formats import bvh as bvh_files
 from flame_mdm.formats.readers import read
-from flame_mdm.safe_io import MEBIBYTE, read_npz, sha256
+from flame_mdm.safe_io import (
+    MEBIBYTE,
+    check_expansion,
+    check_members,
+    read_npz,
+    read_yaml,
+    regular_file,
+    sha256,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -338,6 +346,24 @@ def test_archives_of_too_many_members_are_refused_before_they_are_listed(
     for name in ("a.zip", "a.npz"):
         refuses("more than 999 files", listed[name])
     assert made == []
+
+
+def test_the_limits_of_files_are_the_largest_sizes_that_are_read(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"x" * 1010)
+    assert regular_file(path, 1010) == 1010
+    refuses(
+        "the file is 0.986 KiB, but at most 0.985 KiB is allowed", lambda: regular_file(path, 1009)
+    )
+    check_members(200_000)
+    refuses("more than 200,000 files", lambda: check_members(200_001))
+    for packed in (1, 10 * MEBIBYTE):
+        most = max(128 * MEBIBYTE, 20 * packed)
+        check_expansion(most, packed)
+        refuses("expand to", lambda packed=packed, most=most: check_expansion(most + 1, packed))
+    path = tmp_path / "a.yaml"
+    path.write_text(f"a: {10**19}")  # 20 digits
+    assert read_yaml(path) == {"a": 10**19}
 
 
 def wide_bvh(joints: int, frames: int) -> bytes:

@@ -568,7 +568,7 @@ def check_expansion(expanded: int, packed: int) -> None:
 
 def _size(count: float) -> str:
     for unit in ("bytes", "KiB", "MiB", "GiB"):
-        if count < 1024:
+        if count < 999.5:  # so that three digits are enough
             return f"{count:.3g} {unit}"
         count /= 1024
     return f"{count:.3g} TiB"

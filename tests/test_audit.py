@@ -401,6 +401,7 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert "extractor=none" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("composed_once")
 def test_the_command_audits_real_test_motions_under_the_protocol_of_the_data(
     tmp_path, monkeypatch, capsys
 ):

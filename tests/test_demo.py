@@ -18,6 +18,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, quote, urlencode
 
@@ -267,9 +268,10 @@ def test_motions_that_were_used_longest_ago_are_forgotten_first(studio, monkeypa
 
 
 def test_the_command_offers_the_first_model_with_each_adapter(monkeypatch):
-    app = pytest.importorskip("flame_mdm.demo.app", reason="gradio is not installed")
     served = list[tuple[Any, ...]]()
-    monkeypatch.setattr(app, "serve", lambda *values: served.append(values))
+    app = SimpleNamespace(serve=lambda *values: served.append(values))
+    monkeypatch.setitem(sys.modules, "flame_mdm.demo.app", app)
+    monkeypatch.setattr("flame_mdm.commands.demo.find_spec", bool)
     words = ["adapter=x.safetensors y.safetensors", "port=8000", "hosts=a.example b.example"]
     assert main(["demo", "ckpt=one two", *words, "host=0.0.0.0", "device=cpu"]) == 0
     sources = ["one", "two", "one + x.safetensors", "one + y.safetensors"]

@@ -548,7 +548,6 @@ def test_a_turn_has_an_amount_if_its_angle_is_stated(text: str, amount: str | No
         ("when the person has jumped, he bows", ["jump", "bow"]),
         ("a person jumps until he bows", ["jump", "bow"]),
         ("a person jumps, bows afterwards", ["jump", "bow"]),
-        ("a person jumps followed by a bow", ["jump", "bow"]),
         ("a person jumps and bows", ["jump", "bow"]),
         ("a person kicks, jumps and bows after clapping", ["kick", "jump", "clap", "bow"]),
         ("a person waves while walking", ["wave+walk"]),

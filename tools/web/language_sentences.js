@@ -61,7 +61,7 @@ function findPhrases(tokens) {
   let number = 0;
   while (number < tokens.length) {
     const match = longestAt(tokens, number);
-    if (!match) {
+    if (!match || isConnective(tokens, number)) {
       number += 1;
       continue;
     }
@@ -104,6 +104,11 @@ function matchAt(tokens, start, words) {
     return rest && [start, ...rest];
   }
   return isDeterminer(token.word) ? matchAt(tokens, start + 1, words) : undefined;
+}
+
+/** Returns whether a word begins "followed by", which states an order and not an action. */
+function isConnective(tokens, number) {
+  return tokens[number].word === "followed" && tokens[number + 1]?.word === "by";
 }
 
 function isNegated(tokens, number) {

@@ -48,7 +48,7 @@ def find_phrases(tokens: Sequence[Token]) -> list[Match]:
     number = 0
     while number < len(tokens):
         used, phrase = _longest_at(tokens, number)
-        if phrase is None:
+        if phrase is None or _is_connective(tokens, number):
             number += 1
             continue
         if not _is_negated(tokens, number):
@@ -91,6 +91,11 @@ def _match(tokens: Sequence[Token], start: int, words: Sequence[str]) -> tuple[i
     if tokens[start].word in words_of("determiners"):
         return _match(tokens, start + 1, words)
     return None
+
+
+def _is_connective(tokens: Sequence[Token], number: int) -> bool:
+    """Returns whether a word begins "followed by", which states an order and not an action."""
+    return [token.word for token in tokens[number : number + 2]] == ["followed", "by"]
 
 
 def _is_negated(tokens: Sequence[Token], number: int) -> bool:

@@ -564,8 +564,9 @@ def test_a_command_samples_three_motions_for_a_folder_and_one_for_a_file_by_defa
 
 
 def test_samples_of_different_requests_are_written_to_different_folders(model, monkeypatch):
-    def folder(**options: Any) -> Path:
-        settings = SampleSettings(ckpt="quickstart", **{"text": TEXT} | options)
+    def folder(**changed: Any) -> Path:
+        options: dict[str, Any] = {"text": TEXT} | changed
+        settings = SampleSettings(ckpt="quickstart", **options)
         resolved = resolve(settings.request_for(None), model)
         (only,) = _folders(settings, resolved, model, [])
         return only

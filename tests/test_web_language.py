@@ -28,6 +28,7 @@ ODD = [
     "kicks ² times",
     "kicks x 3, then faster",
     "jumps 13 times",
+    "a person jumps followed by bowing",
     "constructor walks __proto__ toString",
     "он идёт вперёд",
     "一个人走路",

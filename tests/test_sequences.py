@@ -175,22 +175,6 @@ def test_lengths_out_of_range_are_refused(model, seconds, usual, message):
         part_frames(model, "walks", parts, [usual] * len(parts), is_sequence=timed, loop=False)
 
 
-@pytest.mark.parametrize(
-    ("model", "seconds", "usual", "frames"),
-    [
-        (sized(20, 60), [None], 2.0, [2]),
-        (sized(20, 60), [None], 60.4, [60]),
-        (sized(20, 60), [2.0, 0.5], None, [40, 10]),
-        (sized(20, 60), [300.0, 300.0], None, [6000, 6000]),
-        (sized(20, 40, 10), [0.05], None, [1]),
-    ],
-)
-def test_the_shortest_and_the_longest_motions_are_not_refused(model, seconds, usual, frames):
-    parts = [("walks", duration) for duration in seconds]
-    options = {"is_sequence": seconds != [None], "loop": False}
-    assert part_frames(model, "walks", parts, [usual] * len(parts), **options) == frames
-
-
 def test_one_window_changes_nothing_and_two_are_averaged():
     x, t, mask = (
         torch.randn(2, 20, 3),

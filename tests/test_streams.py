@@ -33,10 +33,8 @@ from flame_mdm.sampling import streams as streams_module
 from flame_mdm.sampling import waypoints
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.keywords import SamplerKeywords
-from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.sampling.placement import Placement
 from flame_mdm.sampling.reading import decoded, with_features
-from flame_mdm.sampling.resolution import resolve
 from flame_mdm.sampling.streams import (
     OnlineCleanup,
     Schedule,
@@ -392,28 +390,6 @@ def test_samples_of_a_text_with_shared_noise_are_the_same_stream(model):
     assert_same(one.joints, other.joints)
     seeded = generate(model, "a person walks", seconds=1, shared_noise=True, seed=1)[0]
     assert not np.allclose(one.joints, seeded.joints, atol=1e-3)
-
-
-@pytest.mark.parametrize("count", [CONTEXT, CONTEXT - 1])
-def test_a_motion_that_is_continued_has_at_least_as_many_frames_as_the_model_reads(
-    model, walk, count
-):
-    features = torch.from_numpy(walk.features[:count])
-    begun = decoded(model.representation, features, "", "begun")
-    request = SamplingRequest(texts="a person walks", after=begun)
-    if count < CONTEXT:
-        for name, read in (
-            ("start", starting_point),
-            ("after", lambda *_: resolve(request, model)),
-        ):
-            with pytest.raises(UserError, match=f"{name}=begun: the motion has 9 frames"):
-                read(model, begun)
-        return
-    prefix, _ = starting_point(model, begun)
-    torch.testing.assert_close(prefix[0], model.representation.normalize(features))
-    before = resolve(request, model).before
-    assert before is not None
-    assert torch.equal(before, features)
 
 
 def test_a_person_stands_still_before_the_first_block(model):

@@ -127,3 +127,44 @@ def test_damaged_files_are_named_with_their_line(files, old, new, message):
         (files / name).write_text((files / name).read_text().replace(old, new))
     with pytest.raises(UserError, match=message):
         asf.read(files / "07_01.amc", 120)
+
+
+@pytest.mark.parametrize("order", ["XYZ", "ZYX", "YXZ"])
+def test_angles_of_an_axis_line_are_about_x_y_and_z_and_are_applied_in_the_order_of_its_letters(
+    files, order: str
+):
+    angles = {"X": 20, "Y": 30, "Z": 40}
+    text = SKELETON.replace("axis 0 0 90 XYZ", f"axis 20 30 40 {order}")
+    (files / "07.asf").write_text(text)
+    expected = Rotation.identity()
+    for letter in order:
+        expected = Rotation.from_euler(letter.lower(), angles[letter], degrees=True) * expected
+    bones, _ = asf.read_skeleton(files / "07.asf")
+    np.testing.assert_allclose(bones["arm"].axes.as_matrix(), expected.as_matrix(), atol=1e-12)
+
+
+ORDER, AXIS = "   order RZ RX TZ TX RY TY\n", "   axis ZXY\n"
+
+
+@pytest.mark.parametrize("lines", [ORDER + AXIS, AXIS + ORDER])
+def test_the_root_has_its_own_order_of_numbers_and_of_rotations(files, lines: str):
+    start, end = SKELETON.index("   order"), SKELETON.index("   position")
+    (files / "07.asf").write_text(SKELETON[:start] + lines + SKELETON[end:])
+    text = MOTION.replace("10 20 30 0 0 0", "0 0 30 10 0 20")
+    text = text.replace("10 20 30 0 0 90", "90 0 30 10 0 20")
+    (files / "07_01.amc").write_text(text.replace("0 0 0 10 20 30", "30 10 3 1 20 2"))
+    motion = asf.read(files / "07_01.amc", 120)
+    roots = [[10, 20, 30], [10, 20, 30], [1, 2, 3]]
+    np.testing.assert_allclose(motion.positions()[:, 0], roots, atol=1e-12)
+    # first about z, then about x, then about y
+    turned = Rotation.from_euler("zxy", [30, 10, 20], degrees=True).as_matrix()
+    np.testing.assert_allclose(motion.rotations()[2, 0], turned, atol=1e-12)
+
+
+def test_the_skeleton_of_a_motion_comes_before_that_of_its_subject_and_of_its_folder(tmp_path):
+    names = ["07_01.asf", "07.asf", "someone.asf"]
+    for name in names:
+        (tmp_path / name).touch()
+    for name in names:
+        assert asf.skeleton_of(tmp_path / "07_01.amc").name == name
+        (tmp_path / name).unlink()

@@ -2,6 +2,7 @@
 
 import math
 import sys
+from itertools import product
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats import body as body_module
 from flame_mdm.formats.body import fit_body, proportions
 from flame_mdm.formats.motion import Motion
-from flame_mdm.formats.people import HEADS, load_body
+from flame_mdm.formats.people import HEADS, SHAPE, bake, load_body, shape_of, with_helpers
 from flame_mdm.formats.poses import _smooth, solve
 from flame_mdm.formats.posture import _flat_foot, _toes, complete, world_rotations
 from flame_mdm.representations.skeleton import JOINT, KIT21, SMPL22
@@ -439,3 +440,99 @@ def test_toes_bend_against_the_pitch_of_the_foot_until_it_leaves_the_floor():
     bends = Rotation.from_matrix(_toes(feet, heights)).as_rotvec(degrees=True)
     np.testing.assert_allclose(bends[:, 0], list(cases.values()), atol=1e-9)
     np.testing.assert_allclose(bends[:, 1:], 0, atol=1e-9)
+
+
+HIPS, ARMS = ["left_hip", "right_hip"], ["left_collar", "right_collar"]
+ARMS += ["left_shoulder", "right_shoulder"]
+
+
+@pytest.mark.parametrize(
+    ("bones", "factor", "part", "axis", "size"),
+    [
+        (HIPS, 2.0, "pelvis", 0, 1.25),
+        (HIPS, 0.5, "pelvis", 0, 0.8),
+        (ARMS, 2.0, "spine3", 0, 1.25),
+        (ARMS, 0.5, "spine3", 0, 0.8),
+        (["neck"], 2.0, "spine3", 1, 1.6),
+        (["neck"], 0.5, "spine3", 1, 0.6),
+        # between hips and shoulders
+        (HIPS, 1.2, "spine1", 0, 1.2 - 0.35 * 0.2),
+        (HIPS, 1.2, "spine2", 0, 1.2 - 0.75 * 0.2),
+        (HIPS, 1.2, "spine3", 0, 1.0),
+    ],
+)
+@pytest.mark.parametrize("scale", [1.0, 1.1])
+def test_parts_of_the_trunk_have_limits_relative_to_the_limbs(
+    scale: float, bones: list[str], factor: float, part: str, axis: int, size: float
+):
+    offsets = scale * mannequin().rest
+    offsets[[JOINT[bone] for bone in bones]] *= factor
+    fit, wide = proportions(mannequin(), offsets)
+    assert wide == pytest.approx(scale)
+    assert fit[JOINT[part]][axis, axis] == pytest.approx(scale * size)
+
+
+@pytest.mark.parametrize("joint", ["left_knee", "right_wrist"])
+@pytest.mark.parametrize(
+    ("factor", "fits"), [(0.41, True), (0.39, False), (2.49, True), (2.51, False)]
+)
+def test_a_limb_may_have_two_fifths_to_five_halves_of_its_usual_length(joint, factor, fits):
+    offsets = mannequin().rest.copy()
+    offsets[JOINT[joint]] *= factor
+    if fits:
+        proportions(mannequin(), offsets)
+        return
+    with pytest.raises(UserError, match=f"the bone that ends at {joint} is"):
+        proportions(mannequin(), offsets)
+
+
+def test_a_body_of_anny_has_the_points_normals_and_axes_of_the_model(monkeypatch):
+    monkeypatch.setitem(sys.modules, "anny", SimpleNamespace(Anny=StandIn))
+    figure, size = bake(shape_of([])), 0.9 + 0.2 * 0.45
+    points = figure["points"] / 20000
+    moved = points - points[0]
+    np.testing.assert_allclose(
+        moved, size * (mannequin().points - mannequin().points[0]), atol=1e-4
+    )
+    normals = figure["normals"] / np.linalg.norm(figure["normals"], axis=1, keepdims=True)
+    assert (normals * mannequin().normals).sum(1).mean() > 0.98
+    np.testing.assert_array_equal(figure["triangles"], mannequin().triangles)
+    joints, limbs = figure["joints"], [JOINT["left_knee"], JOINT["right_wrist"], JOINT["head"]]
+    np.testing.assert_allclose(
+        joints[limbs] - joints[JOINT["left_hip"]],
+        size * (mannequin().joints[limbs] - mannequin().joints[JOINT["left_hip"]]),
+        atol=1e-9,
+    )
+    turned = degrees(figure["turns"] @ mannequin().stored["turns"].mT)
+    assert turned.max() < 35  # the feet differ most
+    assert (figure["weights"].astype(int).sum(1) == 255).all()
+
+
+def test_each_shape_of_anny_has_a_file_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("flame_mdm.formats.people.bake", lambda shape: mannequin().stored)
+    shapes = ["", *(f" {name}={value}" for name in SHAPE for value in (0.1, 0.125))]
+    for shape in shapes:
+        load_body(f"anny{shape}")
+    assert len(list((tmp_path / "flame-mdm").iterdir())) == len(shapes) == 9
+
+
+def test_helper_bones_take_the_upper_part_of_a_limb_and_the_lower_part_of_a_forearm():
+    joints, along = np.array(ADULT[:22]), np.array([0.1, 0.2, 0.475, 0.6, 0.75, 0.9])
+    for side, (joint, is_forearm) in product(
+        ("left", "right"), (("hip", False), ("shoulder", False), ("elbow", True))
+    ):
+        start = JOINT[f"{side}_{joint}"]
+        end = SMPL22.parents.index(start)
+        bone = joints[end] - joints[start]
+        across = np.cross(bone, [0.3, 0.1, 1])  # the distance from the bone does not matter
+        weights = np.zeros((len(along), 22))
+        weights[:, start], weights[:, end] = 0.8, 0.2
+        helped = with_helpers(joints[start] + along[:, None] * bone + across, weights, joints)
+        share = np.clip((along - 0.2) / 0.55, 0, 1)
+        share = share**2 * (3 - 2 * share)
+        helper = ANCHORS.index(start, 22)
+        expected = 0.8 * (share if is_forearm else 1 - share)
+        np.testing.assert_allclose(helped[:, helper], expected, atol=1e-12)
+        np.testing.assert_allclose(helped[:, start], 0.8 - expected, atol=1e-12)
+        np.testing.assert_allclose(helped.sum(1), 1)

@@ -25,7 +25,7 @@ from flame_mdm.formats.cleanup import (
     cleaned,
     cleanup,
 )
-from flame_mdm.formats.faults import find_faults
+from flame_mdm.formats.faults import depths, find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import JOINT, SKELETONS, SMPL22
@@ -432,3 +432,37 @@ def test_a_toe_is_lifted_to_one_centimeter_below_the_floor(depth: float, lifted:
     leg = next(chain[1:] for chain in SMPL22.chains if chain[-1] == toe)
     _lift(motion, leg, 0.2)
     np.testing.assert_allclose(motion[4, toe] - before[4, toe], [0, lifted, 0], atol=1e-3)
+
+
+@pytest.mark.parametrize(("side", "other"), [("left", "right"), ("right", "left")])
+def test_a_contact_of_a_toe_holds_this_foot_alone(side: str, other: str):
+    slides = posed(30, root=np.arange(30)[:, None] * [0.006, 0, 0] + [0, 0.955, 0])
+    contacts = np.zeros((30, 4))
+    contacts[8:16, SMPL22.feet.index(JOINT[f"{side}_foot"])] = 1
+    motion = cleanup(slides.joints, FPS, SMPL22, contacts)
+    held, free = (
+        np.linalg.norm(np.diff(motion[8:17, JOINT[f"{name}_foot"]][:, [0, 2]], axis=0), axis=1)
+        for name in (side, other)
+    )
+    assert held.max() < 0.001
+    assert free.min() > 0.005
+
+
+@pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
+def test_a_hand_in_the_body_leaves_it_away_from_the_axis_and_to_its_own_side(
+    monkeypatch, side: str, sign: int
+):
+    joints = np.tile(posed(1).joints.astype(float), (9, 1, 1))
+    wrist, elbow = JOINT[f"{side}_wrist"], JOINT[f"{side}_elbow"]
+    joints[:, wrist] = (joints[:, 0] + joints[:, JOINT["neck"]]) / 2 + [0, 0, 0.03]
+    joints[:, elbow] = joints[:, wrist] + [0, 0, 0.25]
+    depth, away = depths(joints, SMPL22.joints, side)
+    assert depth[0, 1] > depth[0, 2]  # the wrist is deeper than the hand
+    shifts: list[np.ndarray] = []
+    monkeypatch.setattr(
+        "flame_mdm.formats.cleanup.bend", lambda motion, arm, shift: shifts.append(shift)
+    )
+    _push_out(joints, SMPL22, side, FPS)
+    direction = away[4, 1] + 0.7 * sign * np.array([1.0, 0, 0])
+    expected = depth[4, 1] * direction / np.linalg.norm(direction)
+    np.testing.assert_allclose(shifts[0][4], expected, atol=2e-3)

@@ -18,7 +18,7 @@ from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.rifke import Rifke
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22
-from flame_mdm.representations.smpl import SMPL
+from flame_mdm.representations.smpl import ADULT, SMPL
 from flame_mdm.sampling.reading import read_motion, with_features
 
 ROTATED = [SMPL, Rot6D, Motion272]
@@ -127,3 +127,43 @@ def test_a_skeleton_without_rotations_is_refused():
     ):
         raw_motion(motion, SMPL())
     assert torch.is_tensor(raw_motion(motion, Rifke()).values)
+
+
+def test_the_middle_of_a_foot_of_kit_is_halfway_from_the_ankle_to_the_toes():
+    joints = synthetic("kick").joints.astype(float)
+    kit = kit_joints(joints) * [-1, 1, 1]
+    for side in ("left", "right"):
+        ankle, toes = (joints[:, SMPL22.joints.index(f"{side}_{n}")] for n in ("ankle", "foot"))
+        middle = kit[:, KIT21.joints.index(f"{side}_foot")]
+        np.testing.assert_allclose(middle, (ankle + toes) / 2, atol=1e-9)
+
+
+def test_the_note_states_the_mean_and_the_largest_error_in_centimeters():
+    motion = synthetic("kick")
+    raw = raw_motion(Motion(motion.joints, 20), SMPL(20.0))
+    decoded = SMPL(20.0).decode(SMPL(20.0).encode(raw.values)).numpy()[:, :22]
+    legs = [SMPL22.joints.index(f"{s}_{n}") for s in ("left", "right") for n in ("knee", "ankle")]
+    lengths = np.linalg.norm(SMPL22.bones(torch.from_numpy(motion.joints)), axis=-1).mean(0)
+    scale = np.linalg.norm(np.array(ADULT[:22])[legs], axis=1).sum() / lengths[legs].sum()
+    apart = 100 * np.linalg.norm(decoded - scale * motion.joints, axis=-1)
+    errors = re.search(r"mean error ([\d.]+) cm, max ([\d.]+) cm", raw.note)
+    assert errors is not None
+    assert [float(error) for error in errors.groups()] == pytest.approx(
+        [apart.mean(), apart.max()], abs=0.06
+    )
+
+
+@pytest.mark.parametrize("knows_rotations", [True, False])
+def test_an_accelerated_path_is_kept_between_frames(knows_rotations: bool):
+    times, later = np.arange(11)[:, None] / 20, np.arange(26)[:, None] / 50
+    way = np.array([1.0, 0.4, -2.0])
+    motion = posed(11, root=[0.1, 0.9, 0.3] + times**2 * way)
+    if not knows_rotations:
+        motion = Motion(motion.joints, 20)
+    joints = raw_motion(motion, HumanML(fps=50.0)).values.numpy()[:, 0]
+    np.testing.assert_allclose(joints - joints[0], later**2 * way, atol=1e-5)
+    # AMASS's coordinates: z is up and x is opposite
+    path = raw_motion(motion, SMPL(50.0)).values.numpy()[:, :3]
+    np.testing.assert_allclose(path - path[0], later**2 * way[[0, 2, 1]] * [-1, 1, 1], atol=1e-4)
+    resampled = motion.resampled(50.0).joints[:, 0]
+    np.testing.assert_allclose(resampled - resampled[0], later**2 * way, atol=1e-5)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 from support.analytic import euler_to_matrix
 from support.glb import Glb
 from support.motions import degrees, largest_step, posed, sway, synthetic
@@ -333,3 +335,36 @@ def test_the_twist_of_the_spine_is_shared_evenly():
         vectors = rotation.matrix_to_axis_angle(solved.rotations[:, joint])
         turned = torch.rad2deg(vectors[:, 1])
         torch.testing.assert_close(turned, torch.full_like(turned, 20.0), rtol=0, atol=1.5)
+
+
+@pytest.mark.parametrize("fps", [20.0, 60.0])
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("limb", [("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "foot")])
+def test_a_limb_twists_as_its_bend_shows_smoothed_over_a_tenth_of_a_second(limb, side, fps):
+    """The weights of two cues: the squared bend, and 0.15 squared for the direction of the parent.
+
+    The arm is bent by 40 degrees. The leg is straight, so its foot counts as a bend with a sine of
+    0.3. The direction of the bend jumps after half of the time.
+    """
+    frames = round(2 * fps)
+    start, middle, end, *foot = (SMPL22.joints.index(f"{side}_{name}") for name in limb)
+    joints = np.tile(np.array(posed().joints[0], float), (frames, 1, 1))
+    axis = joints[0, middle] - joints[0, start]
+    axis /= np.linalg.norm(axis)
+    hinge = np.cross(axis, [0, 0, -1 if foot else 1])
+    hinge /= np.linalg.norm(hinge)
+    angles = np.radians(np.where(np.arange(frames) < frames // 2, 60, -45))
+    turned = Rotation.from_rotvec(angles[:, None] * axis)
+    bend, sine = np.radians(0 if foot else 40), 0.3 if foot else np.sin(np.radians(40))
+    lower = turned.apply(np.cos(bend) * axis + np.sin(bend) * np.cross(hinge, axis))
+    length = np.linalg.norm(joints[0, end] - joints[0, middle])
+    joints[:, end] = joints[:, middle] + length * lower
+    if foot:
+        joints[:, foot[0]] = joints[:, end] + 0.12 * turned.apply(np.cross(axis, hinge))
+    shown = sine * np.stack([np.cos(angles), np.sin(angles)], 1)
+    shown = gaussian_filter1d(shown, 0.1 * fps, axis=0, mode="nearest")
+    weighted = np.linalg.norm(shown, axis=1, keepdims=True) * shown + [0.15**2, 0]
+    twist = np.arctan2(weighted[:, 1], weighted[:, 0])
+    solved = solve(torch.from_numpy(joints), fps).rotations[:, start].numpy()
+    expected = Rotation.from_rotvec(twist[:, None] * axis).as_matrix()
+    assert degrees(solved.mT @ expected).max() < 0.1

@@ -14,13 +14,14 @@ from support.motions import synthetic
 from support.refusals import bounded
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats import fbx, fbx_scene, glb_animation
+from flame_mdm.formats import fbx, fbx_scene, fbx_writer, glb_animation
 from flame_mdm.formats.animated import AnimatedNodes
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.fbx import Int, Record, Short
 from flame_mdm.formats.fbx_scene import CUBIC, Curve
 from flame_mdm.formats.retarget import preset, presets
-from flame_mdm.formats.rigged import RiggedClip, rigged
+from flame_mdm.formats.rigged import Material, RiggedClip, Skin, rigged
+from flame_mdm.visualize.body import MATERIALS
 
 MILLIMETER = 1e-3
 RIGS = [None, *presets()]
@@ -531,3 +532,196 @@ def test_faults_of_the_scene_are_named(change: str, tmp_path: Path):
     with bounded(), pytest.raises(UserError, match=FAULTS[change]) as raised:
         fbx_scene.read(path)
     assert "\n" not in str(raised.value)
+
+
+def with_settings(tmp_path: Path, **values: float) -> AnimatedNodes:
+    """The scene of `animated` with other numbers in its settings."""
+    animated(tmp_path)
+    root = fbx.read(tmp_path / "scene.fbx")
+    settings = root.first("GlobalSettings")
+    block = settings.first("Properties70") if settings else None
+    assert block is not None
+    for name, value in values.items():
+        block.add("P", name, "double", "Number", "", float(value))
+    fbx.write(tmp_path / "scene.fbx", root)
+    return fbx_scene.read(tmp_path / "scene.fbx")
+
+
+@pytest.mark.parametrize(
+    ("settings", "start", "end"),
+    [
+        ({"UpAxis": 2, "FrontAxis": 1, "FrontAxisSign": -1}, (0, 0, -1), (3, 0, -1)),  # 3ds Max
+        ({"UpAxis": 0, "CoordAxis": 1, "CoordAxisSign": -1}, (-1, 0, 0), (-1, 3, 0)),
+        ({"UpAxisSign": -1, "CoordAxisSign": -1}, (0, -1, 0), (-3, -1, 0)),
+        ({"FrontAxisSign": -1}, (0, 1, 0), (3, 1, 0)),  # not right-handed
+        ({"UnitScaleFactor": 2.54}, (0, 0.0254, 0), (0.0762, 0.0254, 0)),
+        ({"UnitScaleFactor": 0}, (0, 0.01, 0), (0.03, 0.01, 0)),
+    ],
+)
+def test_a_scene_is_turned_to_y_up_and_z_forward_and_scaled_to_meters(
+    settings: dict, start: tuple, end: tuple, tmp_path: Path
+):
+    motion = with_settings(tmp_path, **settings)
+    np.testing.assert_allclose(motion.positions[[0, -1], 1], [start, end], atol=1e-6)
+    unit = settings.get("UnitScaleFactor", 100) or 1
+    assert motion.unit == pytest.approx(0.01 * unit)
+
+
+def test_defaults_of_models_come_before_their_own_properties_and_rotations_may_be_inactive(
+    tmp_path: Path,
+):
+    angles = {"Lcl Rotation": (90.0, 90.0, 0.0)}
+    inactive = animated(
+        tmp_path, RotationActive=(0.0,), RotationOrder=(5.0,), PreRotation=(9.0, 9.0, 9.0), **angles
+    )
+    np.testing.assert_allclose(inactive.positions[0, 1], [1, 0, 0], atol=1e-9)
+    for values, expected in (({}, [0, 0, 1]), ({"PreRotation": (-90.0, 0.0, 0.0)}, [0, 0, -1])):
+        animated(tmp_path, **values)
+        root = fbx.read(tmp_path / "scene.fbx")
+        definitions = root.add("Definitions")
+        for kind, degrees in (("Geometry", 45.0), ("Model", 90.0)):
+            template = definitions.add("ObjectType", kind).add("PropertyTemplate", "FbxNode")
+            block = template.add("Properties70")
+            block.add("P", "PreRotation", "Vector3D", "Vector", "", degrees, 0.0, 0.0)
+        fbx.write(tmp_path / "scene.fbx", root)
+        motion = fbx_scene.read(tmp_path / "scene.fbx")
+        np.testing.assert_allclose(motion.positions[0, 1], expected, atol=1e-9)
+
+
+def test_attributes_of_a_curve_apply_to_as_many_keys_as_they_say():
+    record = Record("AnimationCurve")
+    record.add("KeyTime", fbx_scene.TICKS * np.array([1, 2, 4], "<i8"))
+    record.add("KeyValueFloat", np.array([0, 2, -2], "<f4"))
+    record.add("KeyAttrFlags", np.array([CUBIC, 4], "<i4"))
+    record.add("KeyAttrDataFloat", np.array([1, 2, 9, 9, 3, 4, 9, 9], "<f4"))
+    record.add("KeyAttrRefCount", np.array([2, 1], "<i4"))
+    curve = fbx_scene._curve(record)
+    assert curve.times.tolist() == [1, 2, 4]
+    assert curve.flags.tolist() == [CUBIC, CUBIC, 4]
+    assert curve.slopes.tolist() == [[1, 2], [1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize("length", range(1, 18))
+def test_the_end_of_a_file_is_aligned_to_16_bytes(length: int, tmp_path: Path):
+    """As in files of Autodesk's SDK: 1 to 16 zeros, the version, 120 zeros and a constant."""
+    root = Record("")
+    root.add("A" * length)
+    fbx.write(tmp_path / "a.fbx", root)
+    content = (tmp_path / "a.fbx").read_bytes()
+    start = content.index(fbx.FOOTER_ID)
+    assert content[start - 13 : start] == bytes(13)  # the end of the list of records
+    after = start + 16 + 4
+    aligned = 16 * (after // 16 + 1)
+    assert content[start + 16 : aligned] == bytes(aligned - start - 16)
+    assert content[aligned : aligned + 4] == struct.pack("<I", 7400)
+    assert content[aligned + 4 :] == bytes(120) + fbx.FOOTER_END
+
+
+def test_arrays_and_records_of_a_file_are_limited_together(tmp_path: Path, monkeypatch):
+    root = Record("")
+    for _ in range(2):
+        root.add("Parent").add("Array", np.arange(62, dtype="<f8"))
+    fbx.write(tmp_path / "a.fbx", root)
+    for name, limit, message in (
+        ("EXPANDED_LIMIT", 992, "arrays take more than"),
+        ("MAX_RECORDS", 4, "4 records|3 records"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(fbx, name, limit)
+            assert len(fbx.read(tmp_path / "a.fbx").children) == 2
+            patch.setattr(fbx, name, limit - 1)
+            with pytest.raises(UserError, match=message):
+                fbx.read(tmp_path / "a.fbx")
+
+
+def test_a_mesh_has_its_triangles_normals_materials_and_texture_at_each_corner():
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 3.0]])
+    skin = Skin(
+        name="cloth",
+        points=points,
+        normals=points / 4,
+        triangles=np.array([[0, 1, 2], [3, 0, 2]]),
+        palette=(Material("red", (1, 0, 0)), Material("blue", (0, 0, 1))),
+        materials=np.array([1, 0]),
+        ordered=(0,),
+        bones=np.zeros((4, 1), int),
+        weights=np.ones((4, 1)),
+        binds=np.eye(4)[None],
+        uvs=points[:, :2] / 2,
+    )
+    record = Record("Geometry")
+    fbx_writer._geometry(record, skin)
+    np.testing.assert_array_equal(record.value("Vertices").reshape(-1, 3), 100 * points)
+    assert record.value("PolygonVertexIndex").tolist() == [0, 1, ~2, 3, 0, ~2]
+    layers = {name: record.first(f"LayerElement{name}") for name in ("Normal", "UV", "Material")}
+    for name, values, width in (("Normal", "Normals", 3), ("UV", "UV", 2)):
+        layer = layers[name]
+        assert layer is not None
+        assert layer.value("MappingInformationType") == "ByPolygonVertex"
+        corners = layer.value(values).reshape(-1, width)[layer.value(f"{values}Index")]
+        stored = skin.normals if name == "Normal" else skin.uvs
+        np.testing.assert_array_equal(corners, stored[skin.triangles.ravel()])
+    assert layers["Material"] is not None
+    assert layers["Material"].value("Materials").tolist() == [1, 0]
+
+
+def test_each_bone_moves_the_vertices_of_its_cluster_and_materials_have_their_colors():
+    kick = clip("unreal")
+    scene = fbx_writer._Writer(kick).scene()
+    objects, connections = scene.first("Objects"), scene.first("Connections")
+    assert objects is not None
+    assert connections is not None
+    names = {
+        record.properties[0]: record.properties[1].partition("\0")[0]
+        for record in objects.all("Model")
+    }
+    above = {
+        record.properties[2]: names[record.properties[1]]
+        for record in connections.all("C")
+        if record.properties[1] in names and record.properties[0] == "OO"
+    }
+    (skin,) = kick.skins
+    weights = np.zeros((len(skin.points), len(kick.joints)))
+    for cluster in objects.all("Deformer"):
+        if cluster.properties[2] == "Cluster":
+            joint = kick.joints.index(above[cluster.properties[0]])
+            weights[cluster.value("Indexes"), joint] += cluster.value("Weights")
+    expected = np.zeros_like(weights)
+    for bones, shares in zip(skin.bones.T, skin.weights.T, strict=True):
+        expected[np.arange(len(expected)), np.array(skin.ordered)[bones]] += shares
+    np.testing.assert_allclose(weights, expected, atol=1e-12)
+    colors = []
+    for material in objects.all("Material"):
+        block = material.first("Properties70")
+        assert block is not None
+        colors.append(255 * np.array(next(block.all("P")).properties[4:]))
+    np.testing.assert_allclose(colors, MATERIALS, atol=1e-9)
+
+
+@pytest.mark.parametrize("fps", [20.0, 29.97, 30.0, 60.0])
+def test_a_take_ends_with_its_last_key(fps: float):
+    kick = replace(clip(None), fps=fps, skins=())
+    scene = fbx_writer._Writer(kick).scene()
+    objects, takes = scene.first("Objects"), scene.first("Takes")
+    settings = scene.first("GlobalSettings")
+    assert objects is not None
+    assert takes is not None
+    assert settings is not None
+    keys = next(objects.all("AnimationCurve")).value("KeyTime")
+    exact = np.arange(len(kick.turns)) / fps * fbx_scene.TICKS
+    assert np.abs(keys - exact).max() <= 0.5 + 1e-3
+    take = takes.first("Take")
+    assert take is not None
+    for name in ("LocalTime", "ReferenceTime"):
+        span = take.first(name)
+        assert span is not None
+        assert span.properties == [0, keys[-1]]
+    blocks = [settings, next(objects.all("AnimationStack"))]
+    times = {
+        entry.properties[0]: entry.properties[4]
+        for block in blocks
+        for entry in (block.first("Properties70") or Record("")).all("P")
+        if entry.properties[1] == "KTime"
+    }
+    ends = dict.fromkeys(("LocalStop", "ReferenceStop", "TimeSpanStop"), keys[-1])
+    assert times == {**ends, "TimeSpanStart": 0}

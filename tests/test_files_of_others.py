@@ -25,7 +25,7 @@ from flame_mdm.data.adaptation import check_clips
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
-from flame_mdm.formats import ENDINGS, SCENES, checks, glb
+from flame_mdm.formats import ENDINGS, SCENES, checks, glb, motions_in
 from flame_mdm.formats.layouts import UP, Layout, head_height
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read, read_recording
@@ -642,3 +642,82 @@ def test_a_body_two_centimeters_below_the_floor_is_reported():
     assert checks.below_floor(joints) == ""
     joints[:5, 10, 1] = [-0.5] * 4 + [-0.026]
     assert checks.below_floor(joints).startswith("the feet are 3 cm below the floor")
+
+
+@pytest.mark.parametrize(
+    ("turns", "is_rest"),
+    [
+        ({}, True),
+        ({"left_elbow": (0, -15, 0)}, True),
+        ({"left_elbow": (0, -40, 0)}, False),
+        ({"right_knee": (15, 0, 0)}, True),
+        ({"right_knee": (40, 0, 0)}, False),
+        ({"left_shoulder": (0, 0, -50), "right_shoulder": (0, 0, 50)}, True),
+        ({"left_shoulder": (0, 0, -75), "right_shoulder": (0, 0, 75)}, False),  # the arms hang
+        ({"right_shoulder": (0, 0, 8)}, True),
+        ({"right_shoulder": (0, 0, 20)}, False),  # lower than the left arm
+        ({"left_hip": (0, 0, 15)}, True),
+        ({"left_hip": (0, 0, 40)}, False),
+    ],
+)
+def test_a_rest_pose_has_straight_limbs_and_both_arms_at_one_height(turns: dict, is_rest: bool):
+    pose = posed(1, **turns).joints[0].astype(float)
+    assert checks._is_rest_pose(pose) == is_rest
+
+
+@pytest.mark.parametrize(
+    ("fps", "jumps", "calm", "left_out"),
+    [
+        (20, [0.16], [0.0] * 9, 1),
+        (20, [0.14], [0.0] * 9, 0),  # 15 cm
+        (20, [0.3], [0.09] * 9, 1),
+        (20, [0.3], [0.11] * 9, 0),  # three times the steps after it
+        (20, [0.3], [*[0.0] * 8, 0.2], 1),  # of eight frames
+        (20, [0.3], [*[0.0] * 7, 0.2], 0),
+        (60, [0.08, 0.08], [0.0] * 9, 2),
+        (60, [0.07, 0.07], [0.0] * 9, 0),
+        (60, [0.16, 0.16, 0.05], [0.0] * 9, 2),  # at most 0.04 s
+    ],
+)
+def test_a_jump_from_a_rest_pose_is_long_and_longer_than_the_following_steps(
+    fps: float, jumps: list[float], calm: list[float], left_out: int
+):
+    joints = np.tile(posed(1).joints.astype(float), (1 + len(jumps) + len(calm), 1, 1))
+    wrist = SMPL22.joints.index("left_wrist")
+    joints[:, wrist, 2] += np.cumsum([0, *jumps, *calm])
+    joints += np.arange(len(joints))[:, None, None] * [0, 0, 0.3]  # the whole body moves on
+    assert checks.rest_frames(joints, fps) == left_out
+
+
+@pytest.mark.parametrize("padding", [0, 2**20 - 30, 2**20 - 12, 2**20 - 3])
+def test_joints_of_a_json_file_are_noticed_wherever_they_begin(tmp_path: Path, padding: int):
+    """Files are searched in blocks of a mebibyte."""
+    text = json.dumps({"fps": 20, "joints": [[[0, 0, 0]]]})
+    (tmp_path / "a.json").write_text(" " * padding + text)
+    (tmp_path / "b.json").write_text(" " * padding + text.replace("joints", "points"))
+    assert [path.name for path in motions_in(tmp_path)] == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    "name", ["ours.npz", "joints.npz", "amass.npz", "a.json", "a.bvh", "a.glb", "a.fbx", "a.vrma"]
+)
+def test_an_accelerated_path_is_kept_between_the_frames_of_every_kind_of_file(
+    name: str, tmp_path: Path
+):
+    times, later = np.arange(11)[:, None] / 20, np.arange(26)[:, None] / 50
+    way = np.array([1.0, 0.4, -2.0])
+    headings = 2 * np.pi / 6 * np.arange(11)  # 60 degrees per frame
+    motion = posed(11, root=[0.1, 0.9, 0.3] + times**2 * way, heading=headings)
+    if name == "amass.npz":
+        np.savez(tmp_path / name, **amass(motion))
+    elif name == "joints.npz":
+        np.savez(tmp_path / name, joints=motion.joints, fps=20)
+    else:
+        motion.save(tmp_path / name)
+    again = read(tmp_path / name, resample_to=50)
+    assert (again.fps, len(again.joints)) == (50, 26)
+    np.testing.assert_allclose(again.joints[:, 0] - again.joints[0, 0], later**2 * way, atol=1e-4)
+    if name in ("amass.npz", "a.bvh"):  # rotations turn at a constant rate
+        left = again.joints[:, SMPL22.joints.index("left_hip")] - again.joints[:, 0]
+        angles = np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
+        np.testing.assert_allclose(angles - angles[0], 20 * np.pi / 3 * later[:, 0], atol=1e-3)

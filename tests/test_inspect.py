@@ -1,5 +1,6 @@
 """Faults of motions, the command that shows them, and perturbations of real motions against closed forms."""
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -460,3 +461,46 @@ def test_the_selected_animation_is_read_from_each_file_of_a_folder(tmp_path, mon
         _, total, motions = read_motions(str(source), settings, [])
         assert (total, len(list(motions))) == (count, count)
     assert selected == ["Wave"] * 3
+
+
+@pytest.mark.parametrize("fps", [20, 30, 60])
+def test_faults_last_for_seconds_and_have_speeds_per_second_at_any_rate(fps: int):
+    def kinds_of(change: Change) -> set[str]:
+        joints = np.repeat(posed(1).joints.astype(float), 4 * fps, 0)
+        joints -= [0, joints[..., 1].min(), 0]
+        change(joints)
+        return {fault.kind for fault in find_faults(Motion(joints, fps))}
+
+    def moving(speed: float, steps: int, begin: int = 20) -> Change:
+        """A body that moves for some steps and stands before and after them."""
+
+        def change(joints: np.ndarray) -> None:
+            count = np.clip(np.arange(len(joints)) - begin, 0, steps)
+            joints[..., 0] += speed / fps * count[:, None]
+
+        return change
+
+    def aloft(speed: float, frames: int) -> Change:
+        def change(joints: np.ndarray) -> None:
+            moving(speed, len(joints), 0)(joints)
+            joints[20 : 20 + frames, :, 1] += 0.06
+
+        return change
+
+    def popping(acceleration: float) -> Change:
+        def change(joints: np.ndarray) -> None:
+            joints[30, AT["head"], 2] += acceleration / 2 / fps**2
+
+        return change
+
+    for kind, faulty, sound in (
+        ("skating", moving(0.55, math.ceil(0.4 * fps)), moving(0.55, math.ceil(0.4 * fps) - 1)),
+        ("skating", moving(0.55, fps), moving(0.45, fps)),
+        ("pop", popping(210), popping(190)),
+        ("floating", aloft(0.5, math.ceil(0.8 * fps)), aloft(0.5, math.ceil(0.8 * fps) - 1)),
+        ("floating", aloft(0.19, math.ceil(0.3 * fps) + 1), aloft(0.21, math.ceil(0.5 * fps))),
+        ("frozen", moving(0.019, 9 * fps, 0), moving(0.021, 9 * fps, 0)),
+        ("frozen", moving(0.5, 9 * fps, fps), moving(0.5, 9 * fps, fps - 1)),
+    ):
+        assert kind in kinds_of(faulty), kind
+        assert kind not in kinds_of(sound), kind

@@ -22,11 +22,14 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
-from flame_mdm.formats.resampling import frame_pairs, frame_rate
+from flame_mdm.formats.resampling import check_tree, frame_pairs, frame_rate
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.motion272 import Motion272
+from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.editing import edit
-from flame_mdm.sampling.reading import read_motion
+from flame_mdm.sampling.reading import read_motion, with_features
 
 
 @pytest.fixture(scope="module")
@@ -266,3 +269,65 @@ def test_angles_of_a_bvh_file_have_orders_far_from_gimbal_lock(tmp_path: Path):
         if channels:
             assert order == ("YXZ" if joint.endswith("shoulder") else "YZX"), joint
     assert tree.channels[0][:3] == ("Xposition", "Yposition", "Zposition")
+
+
+@pytest.mark.parametrize(
+    ("frames", "joints", "size", "fits"),
+    [
+        (1000, 1000, 0, True),  # a million positions in files of any size
+        (1001, 1000, 0, False),
+        (2000, 1000, 8_000_000, True),  # four bytes for each position
+        (2001, 1000, 8_000_000, False),
+        (25_000, 1000, 10**12, True),  # 25 million positions in all
+        (25_001, 1000, 10**12, False),
+        (500_000, 1, 0, True),
+        (500_001, 1, 0, False),
+    ],
+)
+def test_a_file_may_have_as_many_frames_as_its_size_and_its_joints_allow(
+    frames: int, joints: int, size: int, fits: bool
+):
+    if fits:
+        check_tree(frames, joints, size)
+        return
+    with pytest.raises(UserError, match=rf"^{frames:,} frames"):
+        check_tree(frames, joints, size)
+
+
+def test_a_motion_may_have_a_million_positions_after_upsampling():
+    assert len(frame_pairs(50_000, 10, 20, 10)[0]) == 99_999
+    assert len(frame_pairs(50_000, 20, 10, 100)[0]) == 25_000  # fewer than before
+    with pytest.raises(UserError, match="would become 100,001 frames at 20 frames per second"):
+        frame_pairs(50_001, 10, 20, 10)
+
+
+def test_texts_notes_and_the_name_of_a_motion_stay_at_another_rate(walk: Motion):
+    motion = replace(walk, text="walks", id="take", notes=("a note",), cleanup=True)
+    motion.features = np.zeros((len(walk.joints), 263), np.float32)
+    resampled = motion.resampled(60.0)
+    kept = ("text", "id", "notes", "cleanup", "skeleton")
+    assert [getattr(resampled, key) for key in kept] == [getattr(motion, key) for key in kept]
+    assert not resampled.features.size
+    assert motion.resampled(motion.fps) is motion
+
+
+def test_the_summary_of_a_file_states_errors_in_millimeters(tmp_path: Path):
+    motion = posed(3)
+    for offset, line in ((0.004, "mean joint error 4 mm, max 4 mm"), (0.02, "20 mm, max 20 mm: ")):
+        moved = Motion(motion.joints + np.array([offset, 0, 0]), 20, poses=motion.poses)
+        summary = moved.save(tmp_path / "a.bvh")
+        assert line in summary
+        assert ("in frame" in summary) == (offset == 0.02)
+
+
+@pytest.mark.parametrize("kind", [None, SMPL, Rot6D, Motion272])
+def test_rotations_of_a_file_of_this_project_have_its_joints(kind: Any, tmp_path: Path):
+    path = np.linspace((0.2, 0.955, 0.1), (0.5, 0.955, 1.0), 9)
+    motion = posed(9, root=path, heading=0.7, left_knee=(40, 0, 0), right_elbow=(0, 30, 0))
+    if kind is not None:
+        motion = with_features(kind(20.0), motion)
+        motion.poses = None
+    motion.save(tmp_path / "a.npz")
+    again = read(tmp_path / "a.npz")
+    assert again.poses is not None
+    np.testing.assert_allclose(again.poses.joints(), motion.joints[:, :22], atol=1e-4)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter1d
 from support.motions import posed
 from support.npm import node
 from support.refusals import error_of
@@ -920,3 +921,80 @@ def test_clips_have_neighbors_so_that_filters_do_not_mix_them():
     second = [7, 5, 6, 7, 5, 6, 7, 5, 6, 7, 5, 6]
     assert joints[:, 0, 1].tolist() == first + second
     assert [joints[part, 0, 1].tolist() for part in slices] == [[1, 2, 3], [5, 6, 7, 5]]
+
+
+@pytest.mark.parametrize("fps", [20.0, 60.0])
+def test_a_planted_toe_is_slower_than_a_quarter_meter_per_second_and_lower_than_5_centimeters(
+    fps: float,
+):
+    left, right = JOINT["left_foot"], JOINT["right_foot"]
+    for speed, height, is_planted in (
+        (0.24, 0.0, True),
+        (0.26, 0.0, False),
+        (0.0, 0.049, True),
+        (0.0, 0.051, False),
+    ):
+        joints = np.zeros((90, 22, 3))
+        joints[:, left, 0] = speed / fps * np.arange(90)
+        joints[:, left, 1] = height
+        contacts = planted_toes(joints + np.array([0, 0.3, 0]), fps)  # the floor is at 0.3 m
+        assert contacts[:, 0].all() == contacts[:, 0].any() == is_planted, (speed, height)
+        assert contacts[:, 1].all()
+    # contacts and gaps of a tenth of a second count
+    for frames in (round(0.1 * fps) - 1, round(0.1 * fps)):
+        joints = np.zeros((90, 22, 3))
+        joints[40:, right, 1] = 0.2
+        joints[60 : 60 + frames, right, 1] = 0.0
+        joints[20 : 20 + frames, left, 1] = 0.2
+        long_enough = frames >= 0.1 * fps
+        contacts = planted_toes(joints, fps)
+        assert contacts[60 : 60 + frames, 1].all() == contacts[60, 1] == long_enough
+        assert contacts[20 : 20 + frames, 0].any() != long_enough
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0, 60.0])
+def test_the_root_is_below_the_pelvis_and_faces_ahead_smoothed_over_seconds(fps: float):
+    rng = np.random.default_rng(0)
+    headings = np.linspace(0, 9, 80) + np.repeat([0, 0.4], 40)  # more than a whole turn to the left
+    pelvis = np.array([1, 0.955, 2]) + rng.normal(0, 0.01, (80, 3)).cumsum(0)
+    motion = grounded(posed(80, heading=headings, root=pelvis).joints, fps)
+    smooth = {"sigma": 0.15 * fps, "axis": 0, "mode": "nearest"}
+    np.testing.assert_allclose(motion.heading, gaussian_filter1d(headings, **smooth), atol=1e-4)
+    path = gaussian_filter1d(pelvis[:, [0, 2]], **smooth)
+    np.testing.assert_allclose(motion.path, path, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "is_taken"), [(0.58, False), (0.62, True), (1.55, True), (1.65, False)]
+)
+def test_a_turn_may_be_smaller_or_larger_than_requested_within_limits(ratio, is_taken):
+    motion = grounded(synthetic("a person turns").joints, 20)
+    begin, end = moving(motion)
+    angle = np.degrees(motion.heading[end] - motion.heading[begin])
+    assert angle > 45  # to the left
+    clip = turn(motion, angle / ratio, motion.local[0])
+    assert (clip is not None) == is_taken
+
+
+def test_the_cycle_of_a_gait_is_the_pair_of_frames_that_differ_least(walk: GroundedMotion):
+    """From a landing of the left foot, 0.5 to 1.8 s long, at a steady speed."""
+    fps, poses, stands = walk.fps, walk.local, walk.contacts[:, 0]
+    along, _ = progress(walk, 0)
+    even = gaussian_filter1d(along, 0.2 * fps, mode="nearest")
+    steady = even > 0.85 * np.percentile(even, 90)
+    begin, end = moving(walk)
+    speeds = np.gradient(poses, axis=0) * fps
+    differences = {}
+    for first in range(begin + round(0.5 * fps), end - round(0.5 * fps) + 1):
+        for last in range(first + round(0.5 * fps), first + round(1.8 * fps) + 1):
+            lands = stands[first] and not stands[first - 1]
+            if lands and last <= end - round(0.5 * fps) and steady[first : last + 1].all():
+                apart = np.linalg.norm(poses[first] - poses[last], axis=1).mean()
+                changed = np.linalg.norm(speeds[first] - speeds[last], axis=1).mean()
+                changed += abs(even[first] - even[last])
+                differences[first, last] = apart + 0.1 * changed
+    assert len(differences) > 5
+    cycle = find_cycle(walk, 0)
+    assert cycle is not None
+    assert (cycle.first, cycle.last) == min(differences, key=lambda pair: differences[pair])
+    assert cycle.difference == pytest.approx(min(differences.values()))

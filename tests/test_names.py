@@ -1,19 +1,23 @@
 """Names of joints: every spelling of a known skeleton is recognized, and ambiguous ones are refused."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.motions import synthetic
+from support.motions import posed, synthetic
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import (
     LAYOUTS,
+    UNITS,
     _spelled,
     _variants,
+    check_feet,
+    check_order,
     check_size,
     find_layout,
     leg_length,
@@ -21,6 +25,7 @@ from flame_mdm.formats.layouts import (
 from flame_mdm.formats.names import best_match, spelled, spellings
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import ADULT
 
 MIXAMO = [str(LAYOUTS["Mixamo"].map[joint]) for joint in SMPL22.joints]
 
@@ -295,3 +300,88 @@ def test_legs_of_adults_and_children_have_limits(leg: float, children: bool, fit
         return
     with pytest.raises(UserError, match=r"human legs are (0\.25|0\.6) to 1\.2 m long"):
         check_size(joints, 1.0, children)
+
+
+MARKS = (("Left", "Right"), ("left", "right"), ("L", "R"), ("l", "r"))
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_joints_on_the_left_are_called_left(name: str):
+    layout = LAYOUTS[name]
+    sided = {joint: source for joint, source in layout.map.items() if joint.startswith("left_")}
+    assert len(sided) == 8
+    for joint, source in sided.items():
+        other = layout.map["right_" + joint.removeprefix("left_")]
+        names, others = ([source], [other]) if isinstance(source, str) else (source, other)
+        for left, right in zip(names, others, strict=True):
+            mirrored = {
+                left[:start] + opposite + left[start + len(mark) :]
+                for mark, opposite in MARKS
+                for start in range(len(left))
+                if left.startswith(mark, start)
+            }
+            assert right in mirrored or right == left, (joint, left, right)
+
+
+@pytest.mark.parametrize("name", list(UNITS)[1:])
+def test_the_unit_in_which_the_legs_of_a_file_are_of_usual_length_is_proposed(name: str):
+    assert UNITS["feet"] == pytest.approx(12 * UNITS["inches"])
+    assert UNITS["the unit of CMU's recordings"] == pytest.approx(0.0254 / 0.45, rel=1e-6)
+    joints = synthetic().joints[:3].astype(float)
+    joints *= 0.83 / leg_length(joints) / UNITS[name]
+    with pytest.raises(
+        UserError, match=rf"The unit may be {UNITS[name]:.6g} \({re.escape(name)}\)"
+    ):
+        check_size(joints, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("lower", "both", "fits"),
+    [
+        (20, 0, True),  # a person who kneels on one knee
+        (20, 5, True),
+        (20, 6, False),
+        (11, 11, False),
+        (9, 9, True),  # most of the time, the lower foot points forward
+    ],
+)
+def test_feet_point_backward_if_the_lower_one_mostly_does_and_both_often_do(lower, both, fits):
+    joints = np.tile(posed(1).joints.astype(float), (20, 1, 1))
+    at = {joint: number for number, joint in enumerate(SMPL22.joints)}
+    joints[:, [at["right_ankle"], at["right_foot"]], 1] += 0.2
+    for side, frames in (("left", lower), ("right", both)):
+        ankle, foot = at[f"{side}_ankle"], at[f"{side}_foot"]
+        joints[:frames, foot, 2] = 2 * joints[:frames, ankle, 2] - joints[:frames, foot, 2]
+    if fits:
+        check_feet(joints)
+        return
+    with pytest.raises(UserError, match="the toes point backwards"):
+        check_feet(joints)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "change", "fault"),
+    [
+        (1.45, 0.0, ""),
+        (1.55, 0.0, "left and right limbs differ"),
+        (1.0, 0.24, ""),
+        (1.0, 0.26, "the limbs change"),
+    ],
+)
+def test_limbs_of_a_body_in_the_right_order_are_as_long_as_their_counterparts_and_keep_their_length(
+    ratio: float, change: float, fault: str
+):
+    joints = np.zeros((10, 22, 3))
+    steps = 1 + change * np.resize([1, -1], 10)
+    for parent, joint in SMPL22.edges:
+        name = SMPL22.joints[joint]
+        is_limb = name.endswith(("knee", "ankle", "elbow", "wrist"))
+        size = (ratio if name.startswith("left") else 1) * steps if is_limb else np.ones(10)
+        joints[:, joint] = joints[:, parent] + size[:, None] * ADULT[joint]
+    if not fault:
+        check_order(joints, 22, "SMPL")
+        return
+    with pytest.raises(
+        UserError, match=rf"22 joints like SMPL, but not in the same order: {fault}"
+    ):
+        check_order(joints, 22, "SMPL")

@@ -807,3 +807,102 @@ def test_units_of_files_of_known_skeletons():
     units = {name: preset(name, posed().posed()).unit for name in presets()}
     assert units.pop("cmu") == pytest.approx(0.0254 / 0.45)
     assert set(units.values()) == {0.01}
+
+
+@pytest.mark.parametrize("part", ["trunk", "legs"])
+@pytest.mark.parametrize(("degrees", "is_upright"), [(38, True), (52, False)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_trunk_and_legs_of_a_rest_pose_may_lean_by_45_degrees(part, degrees, is_upright, sign):
+    legs = [JOINT[f"{s}_{name}"] for s in SIDES for name in ("knee", "ankle", "foot")]
+    moved = legs if part == "legs" else [n for n in range(3, 22) if n not in legs]
+
+    def lean(positions: np.ndarray) -> None:
+        turn = Rotation.from_euler("x", sign * degrees, degrees=True).as_matrix()
+        start = positions[[JOINT["left_hip"], JOINT["right_hip"]]].mean(0)
+        positions[moved] = start + (positions[moved] - start) @ turn.T
+        for side in SIDES:  # the feet point ahead
+            ankle, foot = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
+            positions[foot] = positions[ankle] + OFFSETS[foot]
+
+    if is_upright:
+        standing(lean)
+        return
+    with pytest.raises(UserError, match=r"not upright: it leans by \d+ degrees"):
+        standing(lean)
+
+
+@pytest.mark.parametrize("size", [0.8, 1.25])
+def test_the_path_and_the_steps_of_a_character_are_scaled_to_its_legs(size: float):
+    def resized(positions: np.ndarray) -> None:
+        for side in SIDES:
+            for name, above in (("knee", "hip"), ("ankle", "knee"), ("foot", "ankle")):
+                joint, parent = JOINT[f"{side}_{name}"], JOINT[f"{side}_{above}"]
+                scale = 1 if name == "foot" else size
+                positions[joint] = positions[parent] + scale * OFFSETS[joint]
+
+    path = np.linspace((0.1, 0.8, 0.2), (0.5, 0.8, 1.5), 5)
+    bent: dict[str, Any] = {f"{side}_hip": (-40, 0, 0) for side in SIDES}
+    bent |= {f"{side}_knee": (70, 0, 0) for side in SIDES}
+    bent |= {f"{side}_ankle": (-30, 0, 0) for side in SIDES}
+    motion = posed(5, root=path, **bent)
+    joints = motion.joints.astype(float)
+    joints[..., 1] -= joints[..., 1].min() - 0.05
+    world = world_rotations(motion.posed().rotations.numpy())
+    character = standing(resized)
+    _, positions, _ = follow(character, joints, OFFSETS, np.tile(np.eye(3), (22, 1, 1)), world)
+    hips, toes = ([JOINT[f"{side}_{name}"] for side in SIDES] for name in ("hip", "foot"))
+    middle = positions[:, hips].mean(1)[:, [0, 2]]
+    np.testing.assert_allclose(middle, size * joints[:, hips].mean(1)[:, [0, 2]], atol=1e-6)
+    np.testing.assert_allclose(
+        positions[:, toes][..., [0, 2]], size * joints[:, toes][..., [0, 2]], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        positions[:, toes, 1], size * (joints[:, toes, 1] - joints[..., 1].min()), atol=0.01
+    )
+    for parent, joint in SMPL22.edges:
+        bone = np.linalg.norm(positions[:, joint] - positions[:, parent], axis=1)
+        rest = np.linalg.norm(character.rig.positions[joint] - character.rig.positions[parent])
+        np.testing.assert_allclose(bone, rest, atol=1e-9)
+
+
+def test_a_part_of_a_character_has_its_weights_texture_and_joints(tmp_path: Path):
+    """Weights add up to 1, v is measured from below, and a skin without matrices is bound as it is stored."""
+    binary = glb.Binary()
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
+    uvs = np.array([[0, 0.25], [1, 0], [0.5, 1]], "<f4")
+    attributes = {
+        "POSITION": binary.add(points, bounds=True),
+        "TEXCOORD_0": binary.add(uvs.ravel()),
+        "JOINTS_0": binary.add(np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 1, 1, 0]], "u1")),
+        "WEIGHTS_0": binary.add(
+            np.array([[0.2, 0.2, 0, 0], [3, 1, 0, 0], [0, 0.5, -0.5, 0]], "<f4")
+        ),
+    }
+    binary.accessors[attributes["TEXCOORD_0"]] |= {"type": "VEC2", "count": 3}
+    bare = {"attributes": {"POSITION": attributes["POSITION"]}}
+    document = {
+        "asset": {"version": "2.0"},
+        "nodes": [
+            {"name": "cloth", "mesh": 0, "skin": 0},
+            {"children": [2, 0], "translation": [1, 0, 0]},
+            {"children": [3], "translation": [0, 2, 0]},
+            {"translation": [0, 0, 3]},
+        ],
+        "meshes": [{"primitives": [{"attributes": attributes}, bare]}],
+        "skins": [{"joints": [3, 2]}],
+    }
+    binary.save(tmp_path / "a.glb", document)
+    file = glb.read(tmp_path / "a.glb")
+    assert file.nodes == (1, 2, 0, 3)
+    bound, fixed = character_meshes.meshes(file)
+    assert (bound.name, fixed.name) == ("cloth 1", "cloth 2")
+    assert bound.triangles.tolist() == fixed.triangles.tolist() == [[0, 1, 2]]
+    np.testing.assert_allclose(bound.uvs, [[0, 0.75], [1, 1], [0.5, 0]], atol=1e-7)
+    assert bound.ordered == (3, 1)
+    assert bound.bones.tolist() == [[0, 1, 0, 0], [1, 0, 0, 0], [0, 1, 1, 0]]
+    weights = [[0.5, 0.5, 0, 0], [0.75, 0.25, 0, 0], [0, 1, 0, 0]]
+    np.testing.assert_allclose(bound.weights, weights, atol=1e-7)
+    np.testing.assert_allclose(bound.binds[:, :3, 3], [[-1, -2, -3], [-1, -2, 0]])
+    # without joints, a part moves with the node of its mesh
+    assert fixed.ordered == (2,)
+    np.testing.assert_allclose(bound.normals, [[0, 0, 1]] * 3)

@@ -17,7 +17,7 @@ from support.refusals import bounded
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
 from flame_mdm.formats import fbx_scene, glb, glb_animation, scenes, vrma
-from flame_mdm.formats.animated import AnimatedNodes
+from flame_mdm.formats.animated import AnimatedNodes, choose
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
@@ -406,3 +406,72 @@ def test_nodes_at_the_tips_of_bones_are_end_sites():
     )
     names = ("Hips", "Foot", "Foot.end", "Head", "Head.end", "Hips.end", "Foot.end")
     assert scenes.joint_names(nodes) == (*names, "End", "a")
+
+
+def test_an_animation_is_chosen_by_its_name_before_its_number():
+    takes = [("2", "first"), ("Walk", "second"), ("10", "third")]
+    choices = {
+        None: "first",
+        "2": "first",
+        "1": "first",
+        3: "third",
+        "Walk": "second",
+        "10": "third",
+    }
+    assert {key: choose(takes, key)[1] for key in choices} == choices
+    for key in ("0", "4", "walk", "-1", ""):
+        with pytest.raises(UserError, match=r"no such animation.* 1 2, 2 Walk, 3 10$"):
+            choose(takes, key)
+    many = [(f"take {number}", "") for number in range(1, 23)]
+    with pytest.raises(UserError, match=r"19 take 19, 20 take 20 and 2 more$"):
+        choose(many, "23")
+
+
+def test_numbers_of_a_glb_file_may_be_interleaved_and_normalized(tmp_path: Path):
+    """Four bytes and two floats per vertex, after eight bytes of something else."""
+    rows = np.zeros(3, [("bytes", "i1", 4), ("floats", "<f4", 2)])
+    rows["bytes"] = [[127, -127, -128, 0], [64, 1, 2, 3], [5, 6, 7, 8]]
+    rows["floats"] = [[0.5, 1.5], [2.5, 3.5], [4.5, 5.5]]
+    content = bytes(8) + rows.tobytes()
+    accessors = [
+        {"bufferView": 0, "componentType": 5120, "type": "VEC4", "count": 3, "normalized": True},
+        {"bufferView": 0, "componentType": 5126, "type": "VEC2", "count": 3, "byteOffset": 4},
+    ]
+    turned = [0.0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 7, 8, 9, 1]  # columns
+    document = {
+        "asset": {"version": "2.0"},
+        "nodes": [{"translation": [1, 0, 0]}, {"matrix": turned, "children": [0]}],
+    }
+    views = [{"buffer": 0, "byteOffset": 8, "byteLength": len(content) - 8, "byteStride": 12}]
+    glb.Binary(content, views, accessors).save(tmp_path / "a.glb", document)
+    file = glb.read(tmp_path / "a.glb")
+    expected = np.maximum(rows["bytes"] / 127, -1)
+    np.testing.assert_allclose(glb.numbers(file, 0, "VEC4"), expected, atol=1e-12)
+    np.testing.assert_array_equal(glb.numbers(file, 1, "VEC2"), rows["floats"])
+    # the node above turns x to y, doubles it and moves it
+    assert (file.nodes, file.parents) == ((1, 0), (-1, 0))
+    np.testing.assert_allclose(file.worlds[1, :3, 3], [7, 10, 9])
+    np.testing.assert_allclose(file.worlds[1] @ [0, 1, 0, 1], [5, 10, 9, 1])
+
+
+@pytest.mark.parametrize("fps", [12.5, 24.0, 29.97, 30.0, 60.0, 120.0])
+def test_an_animation_has_as_many_frames_as_were_written_at_any_rate(fps: float, tmp_path: Path):
+    """Times have single precision. The longer one of two tracks counts."""
+    for frames in (2, 8, 30, 59, 60, 101, 239):
+        binary = glb.Binary()
+        moves = np.zeros((frames, 3), "f4")
+        moves[:, 0] = np.arange(frames)
+        animation = binary.animation("walk", fps, [("translation", 0, moves)])
+        short = binary.animation("walk", fps, [("translation", 1, moves[: frames // 2 + 1])])
+        short["channels"][0]["sampler"] = 1
+        joined = {key: animation[key] + short[key] for key in ("samplers", "channels")}
+        document = {
+            "asset": {"version": "2.0", "extras": {"fps": fps}},
+            "nodes": [{"name": "a"}, {"name": "b"}],
+            "animations": [joined],
+        }
+        binary.save(tmp_path / "a.glb", document)
+        positions = glb_animation.read(tmp_path / "a.glb").positions
+        np.testing.assert_allclose(positions[:, 0, 0], np.arange(frames), atol=1e-3)
+        held = np.minimum(np.arange(frames), frames // 2)
+        np.testing.assert_allclose(positions[:, 1, 0], held, atol=1e-3)

@@ -27,8 +27,10 @@ from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation, vrma
 from flame_mdm.formats.animated import AnimatedNodes
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.motion import Motion
-from flame_mdm.formats.retarget import presets
+from flame_mdm.formats.retarget import preset, presets
+from flame_mdm.formats.rigged import MATERIAL_NAMES, rigged
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.body import MATERIALS
 
 MILLIMETER = 1e-3
 FRAMES = [0, 7, 20, 39]
@@ -601,3 +603,28 @@ def test_a_motion_without_a_body_is_written_as_bones(tmp_path: Path):
     line = giant.save(tmp_path / "giant.fbx")
     assert "without a body" in line
     assert fbx_scene.read(tmp_path / "giant.fbx").positions.shape[1] == 22
+
+
+def test_usd_files_have_linear_colors_for_their_triangles_and_boxes_around_the_person(
+    tmp_path: Path,
+):
+    Usd, UsdGeom, UsdShade = (pxr(name) for name in ("Usd", "UsdGeom", "UsdShade"))
+    motion = Motion(synthetic("kick").joints[20:23], 20)
+    motion.save(tmp_path / "kick.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "kick.usdc"))
+    poses, fitted = motion.posed(), fit_body(motion)
+    (skin,) = rigged(poses, "kick", 20, preset(None, poses), fitted).skins
+    covered = 0
+    for number, (name, color) in enumerate(zip(MATERIAL_NAMES, MATERIALS, strict=True)):
+        shader = UsdShade.Shader(stage.GetPrimAtPath(f"/person/materials/{name}/surface"))
+        linear = list(shader.GetInput("diffuseColor").Get())
+        np.testing.assert_allclose(linear, (np.array(color) / 255) ** 2.2, atol=1e-6)
+        subset = UsdGeom.Subset(stage.GetPrimAtPath(f"/person/person/{name}"))
+        triangles = np.array(subset.GetIndicesAttr().Get())
+        np.testing.assert_array_equal(triangles, np.flatnonzero(skin.materials == number))
+        covered += len(triangles)
+    assert covered == len(skin.triangles)
+    boxes = UsdGeom.Boundable(stage.GetDefaultPrim()).GetExtentAttr()
+    for frame, joints in enumerate(poses.joints().numpy() + np.array([0, fitted.lift, 0])):
+        expected = [joints.min(0) - 0.25, joints.max(0) + 0.25]
+        np.testing.assert_allclose(np.array(boxes.Get(frame)), expected, atol=1e-4)

@@ -1,5 +1,6 @@
 import base64
 import io
+import json
 import sys
 import warnings
 from pathlib import Path
@@ -474,3 +475,81 @@ def test_a_caption_has_at_most_three_lines():
     assert len(lines) == 3
     assert lines[2].endswith(" …")
     assert render._lines(sway(text="walks"), None, 192, 192) == ["walks", "(no body fits)"]
+
+
+def test_the_bar_below_the_panels_grows_until_the_last_image(monkeypatch):
+    monkeypatch.setattr(
+        render, "_figure", lambda motion, body, frame, size: Image.new("RGB", (size, size), "white")
+    )
+    images = list(render._video([Figure(sway(4).joints, 20, text="a")] * 2, 20, 64, None))
+    rows = [np.asarray(image)[-3:] for image in images]
+    lengths = [(row == render.TRAIL).all(-1).all(0).sum() for row in rows]
+    assert lengths == pytest.approx([32, 64, 96, 128], abs=1)
+
+
+def test_a_page_holds_what_its_script_needs_to_draw_the_body(tmp_path):
+    """As in the page: the mesh is fitted to the body at rest, and then each bone moves it."""
+    turns: dict[str, Any] = {"left_hip": (-50, 10, 0), "left_knee": (70, 0, 0)}
+    motion = posed(3, 0.93, heading=[0.3, 1.5, 2.8], right_elbow=(0, 60, 0), **turns)
+    write_player(tmp_path / "p.html", [motion])
+    page = Page(tmp_path / "p.html")
+    (packed,), mesh = page.motions, json.loads(page.texts["body"])
+
+    def array(text: str, kind: str, width: int) -> np.ndarray:
+        return np.frombuffer(base64.b64decode(text), kind).reshape(-1, width).astype(float)
+
+    anchors, joints = mesh["anchors"], np.reshape(mesh["joints"], (22, 3))
+    weights = np.zeros((len(array(mesh["points"], "<i2", 3)), len(anchors)))
+    for bone, weight in zip(
+        array(mesh["bones"], "u1", 4).T, array(mesh["weights"], "u1", 4).T, strict=True
+    ):
+        weights[np.arange(len(weights)), bone.astype(int)] += weight / 255
+
+    def moved(points: np.ndarray, matrices: np.ndarray, start: Any, end: Any) -> np.ndarray:
+        by_bone = np.einsum("bij,vbj->vbi", matrices, points[:, None] - start[anchors])
+        return np.einsum("vb,vbi->vi", weights, by_bone + end[anchors])
+
+    fit = array(packed["body"]["fit"], "<f4", 9).reshape(-1, 3, 3)
+    rest = array(packed["body"]["rest"], "<f4", 3)
+    points = moved(array(mesh["points"], "<i2", 3) / 20000, fit[anchors], joints, rest)
+    bits = array(packed["body"]["turns"], "<u4", len(anchors)).astype(np.uint32)
+    drawn, _ = motion.try_fit()
+    assert drawn is not None
+    for frame, row in enumerate(bits):
+        parts = (np.stack([row >> 20, row >> 10, row], 1) & 1023) / 1023 - 0.5
+        quaternions = [
+            np.insert(part, largest, np.sqrt(1 - (part**2).sum()))
+            for part, largest in zip(2**0.5 * parts, row >> 30, strict=True)
+        ]
+        turned = Rotation.from_quat(quaternions).as_matrix()
+        ends = unpacked(packed)[frame] + [0, packed["body"]["lift"], 0]
+        vertices = moved(points, turned, rest, ends)
+        np.testing.assert_allclose(vertices, drawn.skinned(frame)[0], atol=3e-3)
+
+
+def test_lines_on_the_ground_are_at_whole_meters():
+    joints = sway(3).joints.astype(float)
+
+    def picture(offset: list[float]) -> np.ndarray:
+        figure = Figure(joints + np.array(offset), 20)
+        return np.asarray(render._figure(figure, None, 1, 96)).astype(int)
+
+    first = picture([0, 0, 0])
+    assert np.abs(picture([2, 0, -3]) - first).mean() < 0.05
+    assert np.abs(picture([0.5, 0, 0]) - first).mean() > 0.5
+    assert np.abs(picture([0, 0, 0.5]) - first).mean() > 0.5
+
+
+def test_groups_neighbors_and_marks_of_a_page_belong_to_their_motions(tmp_path):
+    motions = [sway(4, id="a"), sway(5, id="b"), sway(6, id="c")]
+    marks = [[(1, 3, "pop", "head")], [], [(0, 2, "skating", "toe"), (4, 6, "pop", "knee")]]
+    options: dict[str, Any] = {"groups": ["x", "", "y"], "beside": ["", "a", ""], "marks": marks}
+    write_player(tmp_path / "p.html", motions, columns=3, about="<b>text</b>", **options)
+    page = Page(tmp_path / "p.html")
+    shown = [
+        [motion[key] for key in ("id", "group", "beside", "frames")] for motion in page.motions
+    ]
+    assert shown == [["a", "x", "", 4], ["b", "", "a", 5], ["c", "y", "", 6]]
+    assert [motion["marks"] for motion in page.motions] == json.loads(json.dumps(marks))
+    assert "<details><summary>About these motions</summary><div><b>text</b></div>" in page.source
+    assert "fixed = 3," in page.source

@@ -115,8 +115,7 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
     Parents precede their children.
     """
     lines = read_lines(path)
-    root = Bone(np.zeros(3), Rotation.identity(), "XYZ", (*MOVES, *TURNS))
-    read: dict[str, Bone] = {"root": root}
+    read = {"root": Bone(np.zeros(3), Rotation.identity(), "XYZ", (*MOVES, *TURNS))}
     parents: dict[str, str] = {}
     section, fields = "", dict[str, list[str]]()
     for words in lines:
@@ -126,7 +125,8 @@ def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
         elif section == ":units" and words == ["angle", "rad"]:
             lines.fail("angles in radians are not supported")
         elif section == ":root" and word == "order":
-            read["root"] = root._replace(freedoms=tuple(word.upper() for word in words[1:]))
+            freedoms = tuple(word.upper() for word in words[1:])
+            read["root"] = read["root"]._replace(freedoms=freedoms)
         elif section == ":root" and word == "axis":
             read["root"] = read["root"]._replace(order=_order(lines, words[1:]))
         elif (

@@ -34,7 +34,7 @@ $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install -q --upgrade pip uv==0.13.9
 	$(VENV)/bin/python tools/install.py -e '.[dev,offline,video,demo,docs,onnx,usd]'
-	@$(VENV)/bin/python -m compileall -qq -j 0 -x '$(UNUSED)' $(VENV)/lib || true # on all cores; some packages hold files for other versions
+	@$(VENV)/bin/python -m compileall -qq -j 0 -x '$(UNUSED)' $(VENV)/lib flame_mdm evaluators || true # on all cores; some packages hold files for other versions
 	@touch $@
 
 test: $(READY) ## run all tests except those that require external tools

@@ -13,6 +13,7 @@ from flame_mdm.config import EXPERIMENTS, compose, instantiate, parameters
 from flame_mdm.processes import samplers as sampler_functions
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
+from flame_mdm.safe_io import read_package_yaml
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.task import GeneratorTask
 
@@ -53,7 +54,8 @@ def denoisers() -> Iterator[tuple[str, dict[str, Any]]]:
     """The options of `experiments/denoiser` that differ in more than their sizes."""
     seen = []
     for path in sorted((EXPERIMENTS / "denoiser").glob("*.yaml")):
-        config = part("denoiser", path.stem) | {"dropout": 0.0}
+        config: Any = read_package_yaml(path)
+        config |= {"dropout": 0.0}
         config |= {key: value for key, value in TINY.items() if key in config}
         config |= {"max_frames": 20} if "max_frames" in config else {}
         if config not in seen:

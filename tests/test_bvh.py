@@ -227,3 +227,15 @@ def test_damaged_files_are_named_with_the_line(parse, subtests):
     for end in range(len(whole) - 3):  # what follows could be the shorter number that was meant
         with pytest.raises(UserError, match=r"arm\.bvh, line \d+: "):
             parse(whole[:end])
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fps"),
+    [
+        ("0.0333333", 30), ("0.033333", 30), ("0.016667", 60), ("0.0166667", 60), ("0.041667", 24),
+        ("0.008333", 120), ("0.00833333", 120), ("0.04", 25), ("0.0333667", 29.97), ("0.05", 20),
+    ],
+)  # fmt: skip
+def test_rounded_frame_times_are_whole_rates(seconds: str, fps: float, parse):
+    assert parse(ARM.replace("0.0333333", seconds)).fps == pytest.approx(fps, abs=1e-4)
+    assert (parse(ARM.replace("0.0333333", seconds)).fps == fps) == (fps != 29.97)

@@ -56,6 +56,20 @@ def hints(kind: type, without: Sequence[str] = ()) -> dict[str, Any]:
     }
 
 
+def test_cleanup_uses_the_contacts_that_the_model_predicts(model, monkeypatch):
+    contacts: list[np.ndarray | None] = []
+
+    def cleaned(motion: Motion, predicted: np.ndarray | None = None) -> Motion:
+        contacts.append(predicted)
+        return motion
+
+    monkeypatch.setattr(generation, "cleaned", cleaned)
+    (motion,) = flame_mdm.generate(model, TEXT, cleanup=True, **FAST)
+    assert contacts[0] is not None
+    np.testing.assert_array_equal(contacts[0], model.representation.contacts(motion.features))
+    assert contacts[0].shape == (len(motion.joints), 4)
+
+
 def test_keywords_of_generate_and_edit_have_the_names_and_types_of_the_fields_of_requests():
     options, editing = hints(SamplerOptions), hints(EditRequest)
     sampling = hints(SamplingRequest, without=["texts", "options", "editing"])

@@ -11,6 +11,7 @@ from lightning import LightningModule
 from lightning.pytorch.callbacks import EMAWeightAveraging, WeightAveraging
 from torch import nn
 from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
@@ -160,6 +161,20 @@ def test_a_resumed_average_keeps_the_initial_weights_before_its_first_update():
     average.on_train_start(trainer, model)
     average.on_train_batch_start(trainer, model, None, 0)
     torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], initial)
+
+
+def test_a_new_average_starts_from_weights_that_changed_after_it_was_made():
+    """The text encoder is pretrained, or a teacher is copied, before the first step."""
+    model = Tiny()
+    average: Any = MovingAverage(0.5, from_initial_weights=True)
+    average._average_model = AveragedModel(model)
+    with torch.no_grad():
+        model.layer.weight += 1
+    trainer: Any = SimpleNamespace(global_step=0)
+    average.on_train_start(trainer, model)
+    average.on_train_batch_start(trainer, model, None, 0)
+    (averaged,) = (p for p in average.averages if p.shape == model.layer.weight.shape)
+    torch.testing.assert_close(averaged, model.layer.weight.detach())
 
 
 def test_a_resumed_average_goes_on():

@@ -499,3 +499,17 @@ def test_whole_batches_of_32_motions_are_retrieved(count: int, batches: int):
     assert 0 < top < 1
     assert (top * 32 * batches) % 1 == pytest.approx(0, abs=1e-9)
     assert values["dissimilar_t2m_top1"] is None, "without an encoder"
+
+
+@pytest.mark.parametrize(
+    ("seams", "windows"),
+    [((30,), 1), ((29,), 0), ((30, 90), 2), ((91,), 0), ((30, 60, 90), 3), ((), 0)],
+)
+def test_a_transition_counts_if_the_motion_contains_its_whole_window(seams, windows):
+    """Windows of 60 frames begin 30 frames before a seam; the motion has 120 frames."""
+    part = (np.searchsorted(seams, np.arange(120), side="right") % 2).astype(bool)
+    kept = torch.from_numpy(part)[None, :, None].expand(1, 120, 22)
+    metric = TransitionJerk(20.0, window=60)
+    mask = torch.ones(1, 120, dtype=torch.bool)
+    metric.update(torch.zeros(1, 120, 22, 3), mask, kept, keys=torch.tensor([0]))
+    assert metric.compute()["windows"] == windows

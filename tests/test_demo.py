@@ -68,6 +68,22 @@ def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_t
     assert [key for key, _ in parse_qsl(EDITED.query())] == keys
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"guidance_scale": 0.0}, {"seed": 0}, {"cleanup": False, "split": False}, {"text": ""},
+        {"guidance_scale": 0.0, "seconds": 0.5, "samples": 1}, {"path": ((0.0, 0.0),)},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_values_of_zero_and_false_are_part_of_a_link(options: dict[str, Any]):
+    request = DemoRequest(**options)
+    assert parsed(request.query()) == request
+    values = dict(parse_qsl(request.query()))
+    for name, value in options.items():
+        assert (name in values) == (value != ""), name
+
+
 MOST: dict[str, tuple[Any, Any]] = {
     "text": ("x" * 300, "x" * 301),
     "seconds": (30, 30.1),

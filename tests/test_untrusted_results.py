@@ -96,7 +96,7 @@ def test_table_specs(attacked, bad):
     attacked("tables", "table=mdm_9", says="unknown table 'mdm_9'. Did you mean mdm_")
 
 
-@pytest.mark.parametrize("part", ["denoiser", "process", "representation"])
+@pytest.mark.parametrize("part", ["denoiser", "process", "representation", "optimizer"])
 def test_a_recipe_that_a_spec_names_runs_no_code(attacked, bad, part: str):
     recipe = f"defaults: [quickstart, _self_]\n{part}: {{_target_: logging.basicConfig}}\n"
     (bad / "recipe.yaml").write_text(recipe)

@@ -30,8 +30,10 @@ MODULES = {
     "condition": ("flame_mdm.conditions",),
     "representation": ("flame_mdm.representations",),
     "data": ("flame_mdm.data",),
+    "optimizer": ("torch.optim",),
+    "trainer": ("lightning.pytorch.trainer",),
 }
-"""Modules whose classes a checkpoint's configuration may name, by part of the configuration."""
+"""Modules whose classes an untrusted configuration may name, by part of the configuration."""
 RENAMED = {
     "flame_mdm.task.MotionGeneration": "flame_mdm.task.GeneratorTask",
     "flame_mdm.training.distillation.ConsistencyDistillation": "flame_mdm.training.distillation.DistillationTask",

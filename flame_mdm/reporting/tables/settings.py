@@ -7,7 +7,6 @@ from typing import Any
 from hydra.utils import get_class
 
 from flame_mdm.config import Config, compose, instantiate, parameters, trust
-from flame_mdm.config.building import MODULES
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.reporting.tables.format import Cell, Line, Part
 from flame_mdm.reporting.tables.specs import LABELS
@@ -22,11 +21,13 @@ def hyperparameters(name: str) -> dict[str, Any]:
     Unset keys have the default values of their classes.
 
     Raises:
-        UserError: If the recipe does not exist, or if it names a class that is not part of this
-            project and that the user does not trust (see `flame_mdm.config.trust`).
+        UserError: If the recipe does not exist, or if it names a class that
+            `flame_mdm.config.trust` does not permit.
     """
     config = compose(name)
-    trust({part: config[part] for part in MODULES if part in config}, f"recipe {name}")
+    # The classes of these parts are imported or instantiated below
+    read = {"representation", *(key.partition(".")[0] for key in HYPERPARAMETERS if "." in key)}
+    trust({part: config[part] for part in config if part in read}, f"recipe {name}")
     settings = {key: value(config, key) for key in HYPERPARAMETERS if "." in key} | _sizes(config)
     return {key: setting for key, setting in settings.items() if setting is not None}
 

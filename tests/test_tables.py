@@ -588,45 +588,11 @@ def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
     assert names.index("flame_9") + 1 == names.index("flame_10")
 
 
-def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evaluator(
-    folder, monkeypatch
-):
+def ranks_of_diversity(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, printed: list[dict[str, Any]]
+) -> dict[str, int]:
+    """Returns the ranks of the reported rows in the column Diversity, with these published rows."""
     published = folder / "published.yaml"
-    theirs = {"source": "their repository", "evaluator": "a corrected evaluator"}
-    printed = [
-        {"label": "Real", "real": True, "values": {"Diversity": "9.5"}},
-        {"label": "near", "values": {"Diversity": "9.4"}},
-        {"label": "far", "values": {"Diversity": "8.1"}},
-        {"label": "Real, corrected", "real": True, "values": {"Diversity": "8.0"}, **theirs},
-        {"label": "near, corrected", "values": {"Diversity": "8.1"}, **theirs},
-        {"label": "far, corrected", "values": {"Diversity": "9.4"}, **theirs},
-    ]
-    part = {"evaluator": "an evaluator", "source": "a paper", "rows": printed}
-    published.write_text(json.dumps({"spec": {"Text-to-motion": part}}))
-    monkeypatch.setattr(builder, "PUBLISHED", published)
-    lines = rows(folder)
-    index = 2  # of the column Diversity
-    ranked = {
-        line.label: cell.rank
-        for line in lines.values()
-        if line.kind == "reported" and (cell := line.cells[index])
-    }
-    assert ranked == {"near": 1, "far": 2, "near, corrected": 1, "far, corrected": 2}
-    text = rendered(made(folder), "md")
-    assert "†: Reported in a paper. Measured with an evaluator." in text
-    assert "††: Reported in their repository. Measured with a corrected evaluator." in text
-
-
-def test_rows_of_a_source_without_real_motions_are_ranked_by_the_real_row_of_another_source(
-    folder, monkeypatch
-):
-    published = folder / "published.yaml"
-    theirs = {"source": "their repository", "evaluator": "the same evaluator"}
-    printed = [
-        {"label": "Real", "real": True, "values": {"Diversity": "9.5"}},
-        {"label": "near", "values": {"Diversity": "9.4"}, **theirs},
-        {"label": "far", "values": {"Diversity": "12.1"}, **theirs},
-    ]
     part = {"evaluator": "an evaluator", "source": "a paper", "rows": printed}
     published.write_text(json.dumps({"spec": {"Text-to-motion": part}}))
     monkeypatch.setattr(builder, "PUBLISHED", published)
@@ -636,6 +602,38 @@ def test_rows_of_a_source_without_real_motions_are_ranked_by_the_real_row_of_ano
         for line in rows(folder).values()
         if line.kind == "reported" and (cell := line.cells[index])
     }
+    return ranked
+
+
+def test_a_corrected_table_is_ranked_by_its_own_real_row_and_names_its_own_evaluator(
+    folder, monkeypatch
+):
+    theirs = {"source": "their repository", "evaluator": "a corrected evaluator"}
+    printed = [
+        {"label": "Real", "real": True, "values": {"Diversity": "9.5"}},
+        {"label": "near", "values": {"Diversity": "9.4"}},
+        {"label": "far", "values": {"Diversity": "8.1"}},
+        {"label": "Real, corrected", "real": True, "values": {"Diversity": "8.0"}, **theirs},
+        {"label": "near, corrected", "values": {"Diversity": "8.1"}, **theirs},
+        {"label": "far, corrected", "values": {"Diversity": "9.4"}, **theirs},
+    ]
+    ranked = ranks_of_diversity(folder, monkeypatch, printed)
+    assert ranked == {"near": 1, "far": 2, "near, corrected": 1, "far, corrected": 2}
+    text = rendered(made(folder), "md")
+    assert "†: Reported in a paper. Measured with an evaluator." in text
+    assert "††: Reported in their repository. Measured with a corrected evaluator." in text
+
+
+def test_rows_of_a_source_without_real_motions_are_ranked_by_the_real_row_of_another_source(
+    folder, monkeypatch
+):
+    theirs = {"source": "their repository", "evaluator": "the same evaluator"}
+    printed = [
+        {"label": "Real", "real": True, "values": {"Diversity": "9.5"}},
+        {"label": "near", "values": {"Diversity": "9.4"}, **theirs},
+        {"label": "far", "values": {"Diversity": "12.1"}, **theirs},
+    ]
+    ranked = ranks_of_diversity(folder, monkeypatch, printed)
     assert ranked == {"near": 1, "far": 2}
 
 

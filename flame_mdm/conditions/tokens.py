@@ -1,6 +1,6 @@
 """A small text encoder that is trained with the model and requires no download."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -82,6 +82,7 @@ class LearnedTokens(ConditionEncoder):
             max_words,
             pretrain_steps,
         )
+        self.attend: Callable[..., Tensor] = functional.scaled_dot_product_attention
         self.words = nn.Embedding(buckets, features)
         self.positions = nn.Parameter(
             nn.init.normal_(torch.empty(max_words + 1, features), std=0.02)
@@ -198,9 +199,7 @@ class LearnedTokens(ConditionEncoder):
         )
         query, key, value = qkv.unflatten(2, (3, attention.num_heads, -1)).permute(2, 0, 3, 1, 4)
         dropout = attention.dropout if self.training else 0.0
-        y = functional.scaled_dot_product_attention(
-            query, key, value, token_mask[:, None, None], dropout
-        )
+        y = self.attend(query, key, value, attn_mask=token_mask[:, None, None], dropout_p=dropout)
         x = x + layer.dropout1(
             attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, index))
         )

@@ -114,10 +114,16 @@ class TransformerLayer(nn.Module):
             memory: (B, S, C), the keys and values of cross-attention.
             memory_mask: (B, S) bool, True for real entries, or None if all entries are real.
         """
-        x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
+        x = self.self_norm(self._residual(x, self.self_attention(x, mask)))
         if self.cross_attention is not None and self.cross_norm is not None:
-            x = self.cross_norm(x + self.dropout(self.cross_attention(x, memory_mask, memory)))
-        return self.feed_forward_norm(x + self.dropout(self.feed_forward(x)))
+            y = self.cross_attention(x, memory_mask, memory)
+            x = self.cross_norm(self._residual(x, y))
+        return self.feed_forward_norm(self._residual(x, self.feed_forward(x)))
+
+    def _residual(self, x: Tensor, y: Tensor) -> Tensor:
+        """Adds the output y of a sublayer to its input x, both (B, N, C), with dropout."""
+        # On a CPU, adding tensors of different precision takes 10 times as long as converting one.
+        return x + self.dropout(y).to(x.dtype)
 
 
 class Transformer(nn.Module):

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.asf import write_amc, write_asf
 from support.fixtures import SHARED
 from support.glb import changed
@@ -27,8 +28,9 @@ from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
 from flame_mdm.formats import ENDINGS, SCENES, checks, glb, motions_in
 from flame_mdm.formats.layouts import UP, Layout, head_height
-from flame_mdm.formats.motion import Motion
-from flame_mdm.formats.readers import read, read_recording
+from flame_mdm.formats.motion import AMASS_AXES, Motion, amass_parameters, motion_of_poses
+from flame_mdm.formats.readers import PELVIS, read, read_recording
+from flame_mdm.representations import rotation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.sampling.reading import read_motion
@@ -721,3 +723,25 @@ def test_an_accelerated_path_is_kept_between_the_frames_of_every_kind_of_file(
         left = again.joints[:, SMPL22.joints.index("left_hip")] - again.joints[:, 0]
         angles = np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
         np.testing.assert_allclose(angles - angles[0], 20 * np.pi / 3 * later[:, 0], atol=1e-3)
+
+
+@pytest.mark.parametrize("up", TURNED)
+def test_rotations_of_a_file_with_any_up_axis_are_converted_to_the_axes_of_amass(
+    tmp_path: Path, up: str
+):
+    """The file contains the same body, turned about the origin."""
+    motion = posed(4, heading=[0.0, 0.5, 1.0, 1.5], left_elbow=(0, -70, 0))
+    motion = motion_of_poses(
+        replace(motion.posed(), root=motion.posed().root + torch.tensor([0.3, 0, -0.8])), 20
+    )
+    poses = motion.posed()
+    np.savez(tmp_path / "a.npz", **amass(motion, up))
+    recording = read_recording(tmp_path / "a.npz", up=up)
+    assert recording.smpl is not None
+    translation, turns = recording.smpl
+    matrices = rotation.quaternion_to_matrix(turns[:, :22])
+    np.testing.assert_allclose(matrices[:, 0], AMASS_AXES @ poses.rotations[:, 0], atol=1e-6)
+    np.testing.assert_allclose(matrices[:, 1:], poses.rotations[:, 1:], atol=1e-6)
+    pelvis = translation + torch.tensor(PELVIS, dtype=torch.float64)
+    np.testing.assert_allclose(pelvis, amass_parameters(poses)[1], atol=1e-6)
+    np.testing.assert_allclose(recording.motion.joints[:, 0], pelvis @ AMASS_AXES, atol=1e-6)

@@ -275,6 +275,14 @@ def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path, change
     np.testing.assert_allclose(walked, kick.joints[-1, 0] - kick.joints[0, 0], atol=0.01)
 
 
+def test_a_file_of_a_bvh_character_has_the_frame_rate_of_the_motion(kick: Motion, tmp_path: Path):
+    own_bvh(tmp_path / "hero.bvh", kick, "z up")
+    faster = Motion(kick.joints[:5], 30)
+    summary = faster.save(tmp_path / "out.bvh", character=tmp_path / "hero.bvh")
+    assert "5 frames at 30 per second" in summary
+    assert bvh.read(tmp_path / "out.bvh").fps == 30
+
+
 def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(
     kick: Motion, tmp_path: Path, subtests
 ):

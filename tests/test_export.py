@@ -16,7 +16,7 @@ from torch import Tensor
 
 from flame_mdm.data import amass
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh
+from flame_mdm.formats import ENDINGS, WRITTEN, bvh
 from flame_mdm.formats.body import fit_body
 from flame_mdm.formats.layouts import tree_layout
 from flame_mdm.formats.motion import Motion
@@ -368,3 +368,19 @@ def test_a_limb_twists_as_its_bend_shows_smoothed_over_a_tenth_of_a_second(limb,
     solved = solve(torch.from_numpy(joints), fps).rotations[:, start].numpy()
     expected = Rotation.from_rotvec(twist[:, None] * axis).as_matrix()
     assert degrees(solved.mT @ expected).max() < 0.1
+
+
+@pytest.mark.parametrize("ending", sorted({*WRITTEN} - {".mp4"}))
+def test_extensions_in_capitals_are_those_in_small_letters(tmp_path, ending: str):
+    if ending.startswith(".usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed: pip install flame-mdm[usd]")
+    motion = posed(2, left_knee=(60, 0, 0))
+    summaries = []
+    for name in ("a", "A"):
+        file = tmp_path / (name + (ending.upper() if name == "A" else ending))
+        summaries.append(motion.save(file).removeprefix(f"{file}: "))
+        assert file.stat().st_size > 0
+    assert summaries[0] == summaries[1]
+    if ending in ENDINGS:
+        again = read(tmp_path / f"A{ending.upper()}", fps=20)
+        np.testing.assert_array_equal(again.joints, read(tmp_path / f"a{ending}", fps=20).joints)

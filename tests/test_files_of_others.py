@@ -745,3 +745,17 @@ def test_rotations_of_a_file_with_any_up_axis_are_converted_to_the_axes_of_amass
     pelvis = translation + torch.tensor(PELVIS, dtype=torch.float64)
     np.testing.assert_allclose(pelvis, amass_parameters(poses)[1], atol=1e-6)
     np.testing.assert_allclose(recording.motion.joints[:, 0], pelvis @ AMASS_AXES, atol=1e-6)
+
+
+def test_hidden_folders_are_skipped_but_a_folder_may_be_below_a_hidden_one(tmp_path: Path):
+    root = tmp_path / ".cache" / "mine"
+    names = (
+        *("a.npz", "deep/b.BVH", ".git/c.bvh", "deep/.cache/er/d.npy", ".e.npz", "F_STAGEII.NPZ"),
+        *("f_stagei.npz", "G_STAGEI.NPZ", "male/Shape.npz", "deep/__MACOSX/h.npz", "notes.txt"),
+    )
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    (root / "i.npy").mkdir()
+    listed = [path.relative_to(root).as_posix() for path in motions_in(root)]
+    assert listed == sorted(["F_STAGEII.NPZ", "a.npz", "deep/b.BVH"])

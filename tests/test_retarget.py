@@ -283,6 +283,14 @@ def test_a_file_of_a_bvh_character_has_the_frame_rate_of_the_motion(kick: Motion
     assert bvh.read(tmp_path / "out.bvh").fps == 30
 
 
+def test_the_summary_of_a_glb_character_counts_all_nodes(kick: Motion, tmp_path: Path):
+    kick.save(tmp_path / "hero.glb", rig="soma")
+    count = len(glb.read(tmp_path / "hero.glb").names)
+    assert count == 24 + 2  # 24 joints, the node of the mesh, and the node that raises the person
+    summary = kick.save(tmp_path / "out.glb", character=tmp_path / "hero.glb")
+    assert summary.endswith("22 of 26 joints follow the motion, 4 keep their angle")
+
+
 def test_a_bvh_character_whose_body_cannot_turn_or_move_is_refused(
     kick: Motion, tmp_path: Path, subtests
 ):

@@ -878,12 +878,13 @@ def test_a_click_in_a_stream_names_a_waypoint_or_a_point_on_the_floor_within_20_
 
 @pytest.mark.parametrize(
     ("count", "columns", "expected"),
-    [(1, 0, 1), (2, 0, 2), (3, 0, 3), (4, 0, 3), (5, 4, 4), (30, 0, 3)],
+    [(1, 0, 1), (2, 0, 2), (3, 0, 3), (4, 0, 3), (5, 4, 4), (6, 0, 3)],
 )
 def test_panels_of_a_page_are_as_large_as_the_window_allows(
     tmp_path, count: int, columns: int, expected: int
 ):
-    write_player(tmp_path / "p.html", [sway(2, id=str(k)) for k in range(count)], columns=columns)
+    figures = [Figure(sway(1).joints, 20, id=str(k)) for k in range(count)]
+    write_player(tmp_path / "p.html", figures, columns=columns)
     style, starts, scrolls = in_page(
         tmp_path / "p.html",
         "main.style.gridTemplateColumns",
@@ -893,3 +894,58 @@ def test_panels_of_a_page_are_as_large_as_the_window_allows(
     assert style == f"repeat({expected}, minmax(0, 1fr))"
     assert starts == [1 + k % expected for k in range(count)]
     assert scrolls == (count > 3)
+
+
+def test_limbs_of_a_picture_are_drawn_from_back_to_front_and_the_shadow_is_on_the_ground(
+    monkeypatch,
+):
+    """A body that jumps: its shadow is straight below it, a quarter as large before it is enlarged."""
+    joints = sway(3).joints + np.array([0, 0.5, 0])
+    figure, drawn = Figure(joints, 20), []
+
+    def capsule(pen: Any, a: Any, b: Any, radius: float, color: Any, grow: float = 0) -> None:
+        drawn.append((np.array(a), np.array(b), radius, color, grow))
+
+    monkeypatch.setattr(render, "_capsule", capsule)
+    render._figure(figure, None, 1, 96)
+    edges = SMPL22.edges
+    dark, limbs = drawn[: len(edges)], drawn[len(edges) :]
+    x, y, z = joints[:, 0].mean(0)
+    project = render._camera(np.array([x, max(0.85, y - 0.25), z]), 192)
+    below = project(joints[1] * [1, 0, 1]) * [0.25, 0.25, 0.25, 1]
+    for (parent, joint), (a, b, _, color, grow) in zip(edges, dark, strict=True):
+        np.testing.assert_allclose([a, b], [below[parent], below[joint]])
+        assert (color, grow) == (255, 0)
+
+    rims, fills = limbs[::2], limbs[1::2]
+    depths = [a[3] + b[3] for a, b, *_ in fills]
+    assert len(fills) == len(edges) + 1  # and the head
+    assert depths == sorted(depths, reverse=True)
+    at, thick = project(joints[1]), radii(SMPL22)
+    for rim, fill in zip(rims, fills, strict=True):
+        np.testing.assert_allclose([rim[0], rim[1]], [fill[0], fill[1]])
+        side = next(key for key, color in SIDE_COLORS.items() if color == fill[3])
+        assert rim[3] == render.RIM_COLORS[side]
+        assert (rim[4], fill[4]) == (pytest.approx(0.75), 0)
+        if fill[2] == 0.085:
+            assert side == 0
+            continue
+        (parent, joint) = next(
+            edge
+            for edge in edges
+            if np.allclose(at[edge[1]], fill[1]) and thick[edge[1]] == fill[2]
+        )
+        names = [SMPL22.joints[number].split("_")[0] for number in (parent, joint)]
+        expected = {"left": 1, "right": -1}.get(names[1], 0) if names[0] == names[1] else 0
+        assert side == expected
+
+
+def test_a_page_contains_the_mesh_if_any_of_its_motions_has_a_body(tmp_path):
+    for motions, is_drawn in (
+        ([sway(2, skeleton=KIT21), posed(2)], True),
+        ([posed(2), Figure(posed(2).joints, 20)], True),
+        ([sway(2, skeleton=KIT21)], False),
+    ):
+        write_player(tmp_path / "p.html", motions)
+        mesh = json.loads(Page(tmp_path / "p.html").texts["body"])
+        assert (mesh is not None) == is_drawn

@@ -190,8 +190,8 @@ class Motion(PosedFigure):
         elif ending == ".json":
             summary = _write_json(self, path)
         elif ending == ".npy":
-            with atomic_write(path) as temporary:
-                np.save(temporary, self.joints)
+            with atomic_write(path) as temporary, temporary.open("wb") as file:
+                np.save(file, self.joints)
             summary = f"joints {self.joints.shape} in meters, y up; the file does not contain the frame rate"
         else:
             summary = _write_video(self, path, body)
@@ -299,8 +299,8 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
             "mocap_frame_rate": motion.fps,
         }
         summary += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
-    with atomic_write(path) as temporary:
-        np.savez_compressed(temporary, **content, **facts)
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **content, **facts)
     return summary
 
 

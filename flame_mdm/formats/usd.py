@@ -31,7 +31,8 @@ def write(path: Path, clip: RiggedClip) -> None:
         ) from error
 
     with atomic_write(path) as temporary, tempfile.TemporaryDirectory() as folder:
-        ending = ".usdc" if path.suffix == ".usdz" else path.suffix
+        suffix = path.suffix.lower()
+        ending = ".usdc" if suffix == ".usdz" else suffix
         file = Path(folder) / f"motion{ending}"
         stage = Usd.Stage.CreateNew(str(file))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -48,7 +49,7 @@ def write(path: Path, clip: RiggedClip) -> None:
             _mesh(stage, skin)
         _extent(stage, root, clip)
         stage.GetRootLayer().Save()
-        if path.suffix == ".usdz":
+        if suffix == ".usdz":
             package = Path(folder) / "motion.usdz"
             UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(file)), str(package))
             file = package

@@ -725,3 +725,36 @@ def test_a_take_ends_with_its_last_key(fps: float):
     }
     ends = dict.fromkeys(("LocalStop", "ReferenceStop", "TimeSpanStop"), keys[-1])
     assert times == {**ends, "TimeSpanStart": 0}
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+def test_contacts_in_fbx_files_are_held_until_the_frame_in_which_they_change(
+    fps: float, tmp_path: Path
+):
+    poses = synthetic("kick").posed()
+    contacts = np.zeros((12, 2), bool)
+    contacts[3:7, 0], contacts[:5, 1], contacts[9:, 1] = True, True, True
+    clip = rigged(poses, "kick", fps, preset("mixamo", poses))
+    fbx_writer.write(tmp_path / "a.fbx", clip.part(slice(2, 14), "kick", contacts))
+    root = fbx.read(tmp_path / "a.fbx")
+    objects, connections = root.first("Objects"), root.first("Connections")
+    assert objects is not None
+    assert connections is not None
+    records = {record.properties[0]: record for record in objects.children}
+    targets = {
+        (record.properties[1], name): record.properties[2]
+        for record in connections.children
+        for name in record.properties[3:]
+    }
+    for name, planted in zip(("LeftFootContact", "RightFootContact"), contacts.T, strict=True):
+        ((node, bone),) = ((child, parent) for (child, to), parent in targets.items() if to == name)
+        assert records[bone].properties[1].startswith("mixamorig:Hips\x00")
+        (number,) = (
+            child for (child, to), parent in targets.items() if (to, parent) == (f"d|{name}", node)
+        )
+        curve = fbx_scene._curve(records[number])
+        frames = [0, *(np.flatnonzero(np.diff(planted)) + 1)]
+        np.testing.assert_allclose(curve.times * fps, frames, atol=1e-6)
+        for later in (0.0, 0.5, 0.9):
+            values = curve.at((np.arange(12) + later) / fps)
+            np.testing.assert_array_equal(values, planted)

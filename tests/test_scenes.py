@@ -475,3 +475,18 @@ def test_an_animation_has_as_many_frames_as_were_written_at_any_rate(fps: float,
         np.testing.assert_allclose(positions[:, 0, 0], np.arange(frames), atol=1e-3)
         held = np.minimum(np.arange(frames), frames // 2)
         np.testing.assert_allclose(positions[:, 1, 0], held, atol=1e-3)
+
+
+def test_all_animations_of_a_file_have_the_rate_of_the_densest_keys(tmp_path: Path):
+    """A pose with a key per second is sampled as often as the walk in the same file."""
+    binary, moves = glb.Binary(), np.zeros((61, 3), "f4")
+    moves[:, 0] = np.arange(61)
+    walk = binary.animation("walk", 60, [("translation", 0, moves)])
+    pose = binary.animation("pose", 1, [("translation", 0, moves[:3])])
+    document = {"asset": {"version": "2.0"}, "nodes": [{"name": "a"}], "animations": [walk, pose]}
+    binary.save(tmp_path / "a.glb", document)
+    for name, frames, end in (("walk", 61, 60), ("pose", 121, 2)):
+        nodes = glb_animation.read(tmp_path / "a.glb", name)
+        assert (nodes.animation, nodes.fps, len(nodes.positions)) == (name, 60, frames)
+        expected = np.linspace(0, end, frames)
+        np.testing.assert_allclose(nodes.positions[:, 0, 0], expected, atol=1e-4)

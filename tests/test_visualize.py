@@ -949,3 +949,41 @@ def test_a_page_contains_the_mesh_if_any_of_its_motions_has_a_body(tmp_path):
         write_player(tmp_path / "p.html", motions)
         mesh = json.loads(Page(tmp_path / "p.html").texts["body"])
         assert (mesh is not None) == is_drawn
+
+
+@pytest.mark.parametrize("tinted", [False, True])
+def test_the_body_of_a_page_has_the_pixels_of_its_projected_triangles(tmp_path, tinted: bool):
+    """Pictures have the same camera, light and rasterization, but other sizes."""
+    motion = posed(1, heading=0.4, left_elbow=(0, -60, 0))
+    write_player(tmp_path / "p.html", [motion])
+    at, size, shown, halves = in_page(
+        tmp_path / "p.html",
+        f"element('tint').checked = {json.dumps(tinted)}; const m = motions[0]; strokes.length = 0;"
+        " [m.canvas.width, m.canvas.height] = [150, 200]; draw(m, 0); const [points] = skinned(m, 0);"
+        " Array.from({ length: mesh.count }, (_, v) => {"
+        " const p = m.project(points[3 * v], points[3 * v + 1], points[3 * v + 2]);"
+        " return [p.x, p.y, p.depth]; })",
+        "strokes.find(({ name }) => name === 'drawImage').words.slice(1)",
+        "[...new Uint32Array(strokes.find(({ name }) => name === 'putImageData').words[0].data.buffer)]",
+        "Array.from({ length: mesh.count }, (_, v) => sideOf(motions[0], v))",
+    )
+    fitted, _ = motion.try_fit()
+    assert fitted is not None
+    _, normals = fitted.skinned(0)
+    colors, points = fitted.mesh.colors, np.array(at)
+    if tinted:
+        side = np.array(halves)[:, None]
+        ends = np.where(side > 0, SIDE_COLORS[1], SIDE_COLORS[-1])
+        colors = np.array(SIDE_COLORS[0]) + np.abs(side) * (ends - np.array(SIDE_COLORS[0]))
+    expected = np.zeros((200, 150, 3), np.uint8)
+    shaded = render._shaded(normals, colors)
+    render._rasterize(expected, points[:, :2], points[:, 2], shaded, fitted.mesh.triangles)
+    left, top, width, height = size
+    pixels = np.array(shown, np.uint32).view("u1").reshape(int(height), int(width), 4)
+    drawn = np.zeros_like(expected)
+    drawn[int(top) : int(top + height), int(left) : int(left + width)] = pixels[..., :3]
+    body = expected.any(-1)
+    assert body.sum() > 1000
+    assert (drawn.any(-1) != body).sum() < 20
+    difference = np.abs(drawn[body].astype(int) - expected[body])
+    assert difference.mean() < 2

@@ -13,10 +13,14 @@ import torch
 from support.pages import result
 
 from evaluators.callback import Evaluate
+from evaluators.collectives import processes
 from evaluators.evaluation import Evaluation, evaluate
 from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, _values
 from evaluators.extractors import Extractor
+from evaluators.metrics import make_metrics
+from evaluators.metrics.distribution import frechet_distance
+from evaluators.metrics.samples import SampleMetric
 from evaluators.plan import Plan, open_data
 from evaluators.protocol import FOLDER, DrawnClip, Protocol, load_protocol, protocol_names
 from evaluators.results import Outcome, Scores, _cell, _checkpoint, _intervals, mean_cost, show
@@ -1000,3 +1004,278 @@ def test_the_hash_of_a_protocol_is_that_of_its_content_not_of_its_name(tmp_path:
     )
     assert original.sha256 == copy.sha256 != other.sha256
     assert (copy.name, copy.title) == ("copy", "copy-1")
+
+
+def metrics_of_protocols() -> dict[str, SampleMetric]:
+    """One metric per class and number of motions per text, of all protocols."""
+    metrics: dict[str, SampleMetric] = {}
+    for name in protocol_names():
+        protocol = loaded(name)
+        several = protocol.multimodality
+        of_all = make_metrics(protocol.metrics | (several.metrics if several else {}))
+        for metric in of_all.values():
+            number = getattr(metric, "samples", 1)
+            metrics[f"{type(metric).__name__} of {number}"] = metric
+    return metrics
+
+
+# Units of values and directions in which they improve, which are not those of most values: "" and
+# "higher", or "lower" of a distance, an error or a fault.
+UNITS: dict[str, str] = {
+    **{"MutualInformationDivergence": "nats", "JointVariance": "m^2", "Jitter": "m/s^3"},
+    **dict.fromkeys(("Penetration", "Floating", "DisplacementErrors", "KeptDrift"), "m"),
+    **{"KimodoConstraints": "m", "KimodoConstraints/root2d_acc": "", "NearestTraining/joints": "m"},
+    **{"TransitionJerk": "m/frame^3", "TransitionJerk/windows": ""},
+    **{"MBenchQuality": "m/frame", "MBenchQuality/ground_penetration": "m"},
+    **dict.fromkeys(("MBenchQuality/foot_floating", "MBenchQuality/measured"), ""),
+    **{"KimodoQuality": "m/s", "KimodoQuality/contact_consistency": ""},
+    **dict.fromkeys((f"KimodoQuality/{name}" for name in ("skate_ratio", "low", "measured")), ""),
+    "TemosPositionErrors": "1,000 KIT units",
+}
+HIGHER = {
+    *("ActionAccuracy", "MotionCLIPScore", "MutualInformationDivergence", "TextsForMotion"),
+    *("MotionsForText", "SideAccuracy", "AttributeAccuracy", "TMRRetrieval", "ClaimAccuracy"),
+    *("MultiPositiveRPrecision", "PrecisionRecall"),
+    *("KimodoConstraints/root2d_acc", "KimodoQuality/contact_consistency"),
+}
+NEITHER = {
+    *("Diversity", "ActionMultimodality", "TextMultimodality", "PairedMultimodality"),
+    *("JointVariance", "NearestTraining/joints", "NearestTraining/features"),
+    *("TransitionJerk/windows", "MultiPositiveRPrecision/positives", "ClaimAccuracy/decided"),
+    *(f"MultiPositiveRPrecision/chance_top{k}" for k in (1, 2, 3)),
+    *("ClaimAccuracy/captions", "MBenchQuality/dynamic_degree", "KimodoQuality/low"),
+    *("KernelMotionDistance/std", "MBenchQuality/measured", "KimodoQuality/measured"),
+    "PhysicalFootContact/measured",
+}
+
+
+def test_every_value_has_the_unit_and_the_direction_that_its_docstring_states():
+    for title, metric in metrics_of_protocols().items():
+        kind = title.split()[0]
+        for part in metric.names or [""]:
+            name = f"{kind}/{part}" if part else kind
+            unit = UNITS.get(name, UNITS.get(kind, ""))
+            if kind == "FlamePositionErrors":
+                unit = "m^2" if "ave" in part.split("_") else "m"
+            assert metric.unit_of(part) == unit, name
+            direction = name in HIGHER or kind in HIGHER
+            if part.endswith("median"):
+                direction = False
+            if name in NEITHER or kind in NEITHER:
+                direction = None
+            assert metric.direction_of(part) is direction, name
+
+
+def test_metrics_declare_what_audits_and_tables_show_of_them():
+    """The value that sums up the others, whether it sees meaning, and whether it depends on the count."""
+    published = {"MBenchQuality", "KimodoQuality", "PhysicalFootContact"}
+    physics = published | {"FootSkating", "Penetration", "Floating", "Jitter", "StaticShare"}
+    without = published | {
+        *("DisplacementErrors", "KeptDrift", "FlamePositionErrors", "TemosPositionErrors"),
+        *("KimodoConstraints", "PrecisionRecall", "TMRRetrieval", "TransitionJerk"),
+    }
+    sums_up = {
+        **dict.fromkeys(("TextsForMotion", "MotionsForText", "MultiPositiveRPrecision"), "top3"),
+        **{"AttributeAccuracy": "all", "ClaimAccuracy": "all", "SideAccuracy": "hand_or_path"},
+        **{"KernelMotionDistance": "mean", "NearestTraining": "copies"},
+        **dict.fromkeys(without, None),
+    }
+    of_sets = {"FrechetMotionDistance", "KernelMotionDistance", "PrecisionRecall"}
+    for title, metric in metrics_of_protocols().items():
+        kind = title.split()[0]
+        assert metric.summary == sums_up.get(kind, ""), kind
+        assert metric.summary in {None, "", *metric.names}
+        assert metric.sees_meaning == (kind not in physics), kind
+        assert metric.depends_on_count == (kind in of_sets), kind
+        assert metric.exact == ("all" if kind == "AttributeAccuracy" else None), kind
+        retrieves = kind in ("TextsForMotion", "MotionsForText")
+        assert metric.audited == (("top1", "top3") if retrieves else None), kind
+
+
+def test_protocols_have_the_conditions_extractors_and_tolerances_that_their_files_explain():
+    extractors: dict[str, tuple[str, dict[str, Any]]] = {
+        "action_to_motion": ("ClassifierExtractor", {"kind": "humanact12"}),
+        "action_to_motion_legacy": (
+            "ClassifierExtractor",
+            {"kind": "humanact12", "random_start": True},
+        ),
+        "action_to_motion_uestc": ("ClassifierExtractor", {"kind": "uestc"}),
+        "action_to_motion_own": ("OwnClassifierExtractor", {}),
+        "synthetic": ("MotionCLIPExtractor", {"path": "motion_clip_synthetic"}),
+        "text_to_motion_mardm": ("T2MExtractor", {}),
+        "text_to_motion_mardm_clip": ("MARDMClipExtractor", {}),
+        "text_to_motion_t2m_legacy": ("T2MExtractor", {"full_length": True}),
+        "text_to_motion_t2m_own": ("OwnT2MExtractor", {}),
+        "unconditioned_humanact12": ("UnconstrainedExtractor", {}),
+        "unconditioned_humanact12_legacy": ("UnconstrainedExtractor", {}),
+    }
+    for name in protocol_names():
+        protocol = loaded(name)
+        condition = {"action": "action", "unconditioned": "none"}.get(name.split("_")[0], "text")
+        assert protocol.condition == condition, name
+        t2m = "T2MExtractor" if "t2m" in name else "MotionCLIPExtractor"
+        target, options = extractors.get(name, (t2m, {}))
+        needs_none = name.startswith(("latency", "reconstruction")) or name.endswith("between_2026")
+        config = None if needs_none else {"_target_": f"evaluators.extractors.{target}"} | options
+        assert protocol.extractor == config, name
+    tolerances = {
+        data: {metric: bounds[1] for metric, bounds in values.items()}
+        for name in ("text_to_motion_t2m", "action_to_motion", "action_to_motion_uestc")
+        for data, values in loaded(name).expected.items()
+    }
+    tops = [f"motions_for_text/top{k}" for k in (1, 2, 3)]
+    assert tolerances == {
+        "humanml3d": {
+            **dict.fromkeys(tops, 0.02),
+            **{"mm_dist": 0.1, "diversity": 0.4, "fid": 0.02},
+        },
+        "kit": {**dict.fromkeys(tops, 0.03), **{"mm_dist": 0.1, "diversity": 0.5, "fid": 0.05}},
+        "humanact12": {"fid": 0.1, "accuracy": 0.02, "diversity": 0.3, "multimodality": 0.3},
+        "uestc": {"fid": 1.0, "accuracy": 0.02, "diversity": 1.0, "multimodality": 0.5},
+    }
+    assert loaded("text_to_motion_t2m_dip").expected == loaded("text_to_motion_t2m").expected
+
+
+def test_captions_are_compared_by_the_mean_of_minilms_outputs_for_all_their_words():
+    metrics = loaded("text_to_motion_2026").metrics
+    encoder = metrics["tmr"]["encoder"]
+    assert encoder == metrics["multi_positive_minilm"]["encoder"]
+    options = {"pooling": "mean", "normalize": True, "max_tokens": 256, "features": 384}
+    assert {name: encoder[name] for name in options} == options
+    assert "encoder" not in metrics["multi_positive_equal"]
+    for name in ("motions_for_text", "multi_positive_equal", "multi_positive_minilm"):
+        assert metrics[name]["normalize"], "features of a motion-CLIP are compared by their cosine"
+
+
+def test_an_evaluation_with_a_checkpoint_alone_measures_the_test_split_as_its_keys_state():
+    request = EvaluationRequest(ckpt="x")
+    defaults = {
+        **{"which": "last", "split": "test", "seed": 0, "resamples": 0, "data_root": ""},
+        **{"quick": False, "force": False, "multimodality": True, "protocol": None},
+        **{"replications": None, "samples": None, "batch_size": None, "extractor": None},
+    }
+    assert {name: getattr(request, name) for name in defaults} == defaults
+    assert request.options == SamplerOptions()
+    assert (request.editing.method, request.editing.until, request.editing.strength) == (None,) * 3
+    edited = EvaluationRequest(ckpt="x", method="mfm", until=0.0).editing
+    assert (edited.method, edited.until, edited.strength) == ("mfm", 0.0, None)
+    assert EvaluationRequest(ckpt="x", strength=0.5).editing.strength == 0.5
+    config = {"ckpt": "x", "guidance_scale": 0.0, "eta": 1.0, "seed": 3, "out": "a.json"}
+    composed = EvaluationRequest.of(config)
+    assert (composed.options.guidance_scale, composed.options.eta) == (0.0, 1.0)
+    assert (composed.seed, composed.out) == (3, "a.json")
+    callback = Evaluate("synthetic", "none", every_n_steps=10)
+    assert (callback.samples, callback.replications, callback.batch_size) == (256, 1, 64)
+
+
+def test_an_evaluation_in_training_logs_each_value_with_its_interval_and_that_of_real_motions(
+    monkeypatch,
+):
+    callback = Evaluate("synthetic", "none", every_n_steps=10)
+    monkeypatch.setattr("evaluators.callback.sampling_options", lambda *_: (None, {}))
+    monkeypatch.setattr("evaluators.callback.Generator", lambda *_, **__: None)
+    monkeypatch.setattr("evaluators.callback.GeneratorTask", SimpleNamespace)
+    tables: list[Any] = []
+    monkeypatch.setattr("evaluators.callback.log_table", lambda *table: tables.append(table))
+
+    def of(mean: float | None, ci: float | None = None, unit: str = "") -> Value:
+        return Value(mean=mean, ci=ci, replications=2, n=64, unit=unit)
+
+    real = {"fid": of(0.0), "jitter": of(9.0, unit="m/s^3"), "mid": of(None)}
+    rounds = iter(
+        [({"fid": of(0.5, 0.1), "jitter": of(8.0, 0.2, "m/s^3")}, real), ({"mid": of(2.0)}, None)]
+    )
+    asked: list[bool] = []
+
+    def run(source: Any, *, ground_truth: bool, force: bool) -> Any:
+        asked.append(ground_truth)
+        values, of_real = next(rounds)
+        return SimpleNamespace(values=values, ground_truth=of_real)
+
+    protocol = SimpleNamespace(name="p")
+    callback.evaluation = cast(Any, SimpleNamespace(protocol=protocol, clips=None, run=run))
+    logged: list[tuple[dict[str, float], bool]] = []
+    module: Any = SimpleNamespace(
+        generator=None, log_dict=lambda values, logger=True: logged.append((values, logger))
+    )
+    trainer: Any = SimpleNamespace(global_step=10, is_global_zero=True, loggers=["board"])
+    for step in (10, 20):
+        trainer.global_step = step
+        callback.on_validation_epoch_start(trainer, module)
+        callback.on_validation_epoch_end(trainer, module)
+    assert asked == [True, False], "real motions are measured once"
+    (curves, shown), (selecting, also), (last, _), (rest, _) = logged
+    assert (shown, also, rest) == (True, False, {})
+    assert curves == {
+        **{"val/p/fid": 0.5, "val/p/fid/ci": 0.1, "val/p/fid/real": 0.0},
+        **{"val/p/jitter (m/s^3)": 8.0, "val/p/jitter (m/s^3)/ci": 0.2},
+        "val/p/jitter (m/s^3)/real": 9.0,
+    }
+    assert selecting == {"val/p/jitter": 8.0, "val/p/jitter/ci": 0.2}
+    assert last == {"val/p/mid": 2.0}, "without the values of the evaluation before"
+    head = ["metric", "mean", "ci", "replications", "n", "unit", "real motions"]
+    rows = [["fid", 0.5, 0.1, 2, 64, "", 0.0], ["jitter", 8.0, 0.2, 2, 64, "m/s^3", 9.0]]
+    assert tables == [
+        ("board", "evaluation/p", head, rows, 9),
+        ("board", "evaluation/p", head, [["mid", 2.0, None, 2, 64, "", None]], 19),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("device", "rank", "gpus", "used"),
+    [
+        (None, None, 2, "cuda:0"),
+        (None, "1", 2, "cuda:1"),
+        (None, "3", 2, "cuda:1"),
+        (None, "1", 0, "cpu"),
+        ("cpu", "1", 2, "cpu"),
+        ("cuda:1", "0", 2, "cuda:1"),
+    ],
+)
+def test_a_process_uses_the_gpu_of_its_local_rank_unless_a_device_is_chosen(
+    device: str | None, rank: str | None, gpus: int, used: str, monkeypatch
+):
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+    if rank is not None:
+        monkeypatch.setenv("LOCAL_RANK", rank)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    checked: list[str] = []
+    monkeypatch.setattr("evaluators.collectives.check_device", checked.append)
+    with processes(device) as chosen:
+        assert chosen == used
+    assert checked == [used]
+
+
+def test_a_bootstrap_draws_as_many_motions_as_each_of_two_unequal_sets_has():
+    metrics = {
+        name: {"_target_": f"evaluators.metrics.{target}"}
+        for name, target in (
+            ("fid", "distribution.FrechetMotionDistance"),
+            ("diversity", "diversity.Diversity"),
+        )
+    }
+    metrics["diversity"] |= cast(Any, {"pairs": 5, "replace": True})
+    random = torch.Generator().manual_seed(0)
+    sets = {
+        name: {
+            "generated": torch.randn(count, 3, generator=random),
+            "keys": torch.tensor([key(name, number) for number in range(count)]),
+        }
+        for name, count in (("generated", 7), ("real", 12))
+    }
+    evaluator = Evaluator(None, metrics, HumanML())
+    drawn = evaluator.resample(sets["generated"], {}, sets["real"], 5, 3)
+    draws = np.random.default_rng(key("bootstrap", 5))
+    for number in range(3):
+        chosen = [
+            sets[name]["generated"][torch.from_numpy(draws.integers(count, size=count))].double()
+            for name, count in (("generated", 7), ("real", 12))
+        ]
+        distance = frechet_distance(*chosen).item()
+        assert drawn["fid"][number] == pytest.approx(distance, rel=1e-6)
+    assert len(set(drawn["diversity"])) == 3
+    other = evaluator.resample(sets["generated"], {}, sets["real"], 6, 3)
+    assert not set(drawn["fid"]) & set(other["fid"]), "another seed draws other motions"
+    assert evaluator.resample(sets["generated"], {}, sets["real"], 5, 0) == {}

@@ -902,3 +902,48 @@ DEFAULTS: list[tuple[Any, dict[str, Any]]] = [
 def test_metrics_without_options_are_those_of_the_papers(metric: Any, options: dict[str, Any]):
     """As their docstrings state; protocols leave these options out."""
     assert {name: getattr(metric, name) for name in options} == options
+
+
+def test_the_diversity_of_resamples_is_the_mean_over_all_pairs_of_drawn_motions():
+    """A motion may be paired with itself, as in the draws of the protocols."""
+    random = torch.Generator().manual_seed(0)
+    features = torch.randn(5, 3, generator=random, dtype=torch.float64)
+    weights = np.array([[1, 1, 1, 1, 1, 9], [0, 3, 1, 0, 1, 9]])
+    metric = diversity.Diversity(pairs=300, replace=True)
+    (values,) = metric.weighted({"generated": features}, weights).values()
+    for value, times in zip(values, weights, strict=True):
+        drawn = features.repeat_interleave(torch.from_numpy(times[:5]), 0)
+        pairs = [(a - b).norm().item() for a in drawn for b in drawn]
+        assert value == pytest.approx(np.mean(pairs))
+    many = diversity.Diversity(pairs=20_000, replace=True)
+    assert values[0] == pytest.approx(many.value(features), rel=0.02)
+
+
+def test_the_variance_of_joints_is_that_of_the_motions_of_each_text_in_any_order():
+    random, frames = torch.Generator().manual_seed(0), (4, 7, 5)
+    motions = [torch.randn(3, length, 2, 3, generator=random) for length in frames]
+    expected = np.mean([x.double().var(0).sum(-1).mean().item() for x in motions])
+    listed = [(text, motion) for text, of_text in enumerate(motions) for motion in of_text]
+    metric = diversity.JointVariance(samples=3)
+    for number in torch.randperm(9, generator=random).tolist():
+        text, motion = listed[number]
+        mask = torch.ones(1, len(motion), dtype=torch.bool)
+        groups, names = torch.tensor([[30, 10, 20][text]]), torch.tensor([(number * 5) % 9])
+        metric.update(motion[None], mask, groups=groups, keys=names)
+    assert metric.compute() == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_median_rank_of_an_even_number_of_texts_is_between_two_ranks():
+    similarity = torch.tensor(
+        [
+            [9.0, 1.0, 2.0, 3.0],  # rank 1 of its motion
+            [5.0, 4.0, 1.0, 2.0],  # rank 2
+            [3.0, 4.0, 2.0, 1.0],  # rank 3
+            [4.0, 3.0, 2.0, 1.0],  # rank 4
+        ]
+    )
+    values = whole_set_retrieval(similarity)
+    assert values["t2m_median"] == 2.5
+    assert [values[f"t2m_top{k}"] for k in TMR_TOP] == [0.25, 0.5, 0.75, 1, 1]
+    # The ranks in the columns are 1, 1.5 (a tie), 2 (a tie of three) and 3.5
+    assert values["m2t_median"] == 1.75

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -850,3 +851,105 @@ def test_an_example_lasts_three_seconds_at_any_rate(attributes: Attributes):
     slow, fast = example(attributes, 10), example(attributes, 30)
     assert (len(slow), len(fast), len(example(attributes))) == (30, 90, 60)
     assert slow.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "shown"), [row for row in LIMITS if row[0] not in ("dodge", "knock")]
+)
+def test_checks_need_the_same_seconds_at_twice_the_frame_rate(
+    name: str, changes: dict[str, Any], shown: dict[str, Any]
+):
+    twice = {
+        part: np.repeat(path, 2, axis=0) if np.ndim(path) == 2 else path
+        for part, path in changes.items()
+    }
+    view = replace(standing_view(40, **twice), fps=40.0)
+    assert check(name, view) == ({"action": name, **shown} if shown else {})
+
+
+@pytest.mark.parametrize(("path", "dodges"), [(0.31, True), (0.29, False)])
+def test_a_dodge_is_faster_than_60_centimeters_per_second_at_any_rate(path: float, dodges: bool):
+    for fps in (20.0, 40.0):
+        share = np.clip(np.arange(fps) / fps * 2, 0, 1)[:, None]  # within half a second
+        view = standing_view(int(fps), pelvis=[0.0, 0.95, 0.0] + share * [path, 0.0, 0.0])
+        shown = check("dodge", replace(view, fps=fps))
+        assert shown == ({"action": "dodge", "direction": "left"} if dodges else {}), fps
+
+
+def resting(frames: int) -> np.ndarray:
+    """A body of the synthetic set that stands still."""
+    return np.repeat(example({"action": "stand"}, FPS)[:1].astype(np.float64), frames, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("distance", "stride", "leaps"),
+    [(0.46, 0.0, True), (0.44, 0.0, False), (0.46, 0.27, False), (0.46, 0.23, True)],
+)
+def test_a_leap_covers_45_centimeters_with_both_feet_side_by_side(
+    distance: float, stride: float, leaps: bool
+):
+    body = resting(80)
+    body[30:50, :, 1] += 0.15
+    body[..., 2] += distance * np.clip((np.arange(80) - 30) / 20, 0, 1)[:, None]
+    body[:, 10, 2] += stride + body[0, 11, 2] - body[0, 10, 2]
+    assert (read_attributes(body, FPS) == {"action": "leap"}) == leaps
+
+
+@pytest.mark.parametrize("fps", [20, 30])
+@pytest.mark.parametrize(("sway", "dances"), [(0.039, True), (0.034, False)])
+def test_a_dance_sways_by_three_and_a_half_centimeters_to_each_side(
+    sway: float, dances: bool, fps: int
+):
+    body = resting(4 * fps)
+    body[..., 0] += sway * np.sin(2 * np.pi * np.arange(4 * fps) / fps)[:, None]
+    assert (read_attributes(body, fps) == {"action": "dance"}) == dances
+    assert read_attributes(body[: int(1.2 * fps)], fps) != {"action": "dance"}, "it sways once"
+
+
+@pytest.mark.parametrize(
+    ("hanging", "low", "picks"),
+    [(0.85, 0.41, True), (0.85, 0.43, False), (0.72, 0.41, True), (0.7, 0.41, False)],
+)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_hand_that_picks_up_comes_within_42_centimeters_of_the_floor(
+    hanging: float, low: float, picks: bool, side: str
+):
+    body = resting(80)
+    floor, wrist = body[:, (10, 11), 1].min(), SMPL22.joints.index(f"{side}_wrist")
+    body[:, wrist, 1], body[30:42, wrist, 1] = floor + hanging, floor + low
+    expected = {"action": "pick", "side": side} if picks else None
+    assert (read_attributes(body, FPS) == expected) == picks
+    assert picks or read_attributes(body, FPS).get("action") != "pick"
+
+
+@pytest.mark.parametrize(
+    ("down", "between", "squats"),
+    [(0.19, 0.0, 2), (0.17, 0.0, 0), (0.19, 0.09, 2), (0.19, 0.11, 1)],
+)
+def test_squats_lower_the_pelvis_by_18_centimeters_and_raise_it_again(
+    down: float, between: float, squats: int
+):
+    body = resting(100)
+    body[30:42, 0, 1] -= down
+    body[42:54, 0, 1] -= between
+    body[54:66, 0, 1] -= down
+    expected = {"action": "squat", "count": squats} if squats else {"action": "stand"}
+    assert read_attributes(body, FPS) == expected
+
+
+@pytest.mark.parametrize(("later", "throws"), [(14, True), (15, False)])
+def test_a_throw_takes_half_a_second_at_any_rate(later: int, throws: bool):
+    wrist = np.tile([-0.2, 0.85, 0.0], (90, 1))
+    wrist[20] = -0.2, 1.41, 0.09
+    wrist[21 : 20 + later] = -0.2, 1.41, 0.11
+    wrist[20 + later :] = -0.2, 1.3, 0.39
+    view = standing_view(90, right_wrist=wrist)
+    shown = _arms(view.smooth, view.forward, 30.0)
+    assert (shown == {"action": "throw", "side": "right"}) == throws
+
+
+@pytest.mark.parametrize(("frames", "salutes"), [(13, True), (12, False)])
+def test_a_salute_lasts_two_fifths_of_a_second_at_any_rate(frames: int, salutes: bool):
+    view = arm_view(frames, 30, left_wrist=np.array([0.2, 1.6, 0.0]))
+    shown = _arms(view.smooth, view.forward, 30.0)
+    assert (shown == {"action": "salute", "side": "left"}) == salutes

@@ -39,6 +39,7 @@ class PublishedPhysics(Timed, JointMean):
 
     higher_is_better = False
     summary = None
+    directions: Mapping[str, bool | None] = {"measured": None}
     # The only frame rate at which the values are defined, or None for any frame rate
     required_fps: float | None = None
 
@@ -109,7 +110,7 @@ class MBenchQuality(PublishedPhysics):
     names = (*parts, "measured")
     unit = "m/frame"
     units: Mapping[str, str] = {"ground_penetration": "m", "foot_floating": "", "measured": ""}
-    directions: Mapping[str, bool | None] = {"dynamic_degree": None}
+    directions: Mapping[str, bool | None] = {"dynamic_degree": None, "measured": None}
     required_fps = 20
 
     def __init__(self, fps: float, toes: Sequence[int] = (10, 11)):
@@ -228,7 +229,11 @@ class KimodoQuality(PublishedPhysics):
         "contact_consistency": "",
         "measured": "",
     }
-    directions: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
+    directions: Mapping[str, bool | None] = {
+        "low": None,
+        "contact_consistency": True,
+        "measured": None,
+    }
 
     def update(
         self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None

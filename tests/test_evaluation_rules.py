@@ -1279,3 +1279,117 @@ def test_a_bootstrap_draws_as_many_motions_as_each_of_two_unequal_sets_has():
     other = evaluator.resample(sets["generated"], {}, sets["real"], 6, 3)
     assert not set(drawn["fid"]) & set(other["fid"]), "another seed draws other motions"
     assert evaluator.resample(sets["generated"], {}, sets["real"], 5, 0) == {}
+
+
+def test_results_of_baselines_and_files_have_names_that_state_how_they_differ(monkeypatch):
+    representation = SimpleNamespace(to=lambda device: None)
+    store = SimpleNamespace(info={"dataset": "d"})
+    data = SimpleNamespace(representation=representation, store=store, clips=lambda split: None)
+    network: list[Any] = [None]
+    sizes: dict[str, Any] = {}
+
+    def opened(name: str, clips: Any, representation: Any, model: Any, **size: Any) -> Any:
+        return protocol_of(**sizes).resized(100, **size)
+
+    monkeypatch.setattr("evaluators.plan.open_data", lambda request, model: data)
+    monkeypatch.setattr("evaluators.plan.set_bones", lambda *_: None)
+    monkeypatch.setattr("evaluators.plan.open_protocol", opened)
+    monkeypatch.setattr("evaluators.plan.Baseline", lambda *_: None)
+    files = SimpleNamespace(files=["a", "b", "c"])
+    monkeypatch.setattr("evaluators.plan.SampleFolder", lambda *_: files)
+    monkeypatch.setattr(Protocol, "open_extractor", lambda *_: network[0])
+
+    def plan_of(**keys: Any) -> Plan:
+        subject = {} if "from_samples" in keys else {"baseline": "real"}
+        return Plan(EvaluationRequest(data={"a": 1}, protocol="p", **subject | keys), "cpu")
+
+    options: list[tuple[dict[str, Any], str]] = [
+        ({}, ""),
+        ({"split": "val"}, "-val"),
+        ({"split": "test", "seed": 0}, ""),
+        ({"seed": 1}, "-seed1"),
+        ({"samples": 20}, "-20"),
+        ({"replications": 3}, "-3x"),
+        ({"replications": 20}, ""),
+        ({"quick": True}, "-quick"),
+        ({"quick": True, "samples": 7, "replications": 1}, "-quick"),
+        ({"split": "train", "seed": 2, "samples": 20, "replications": 3}, "-train-seed2-20-3x"),
+    ]
+    for keys, suffix in options:
+        assert plan_of(**keys).path == Path(f"runs/baselines/d/p-1/real{suffix}.json")
+    network[0] = SimpleNamespace(sha256="0123456789abcdef")
+    assert plan_of(seed=1, replications=3).path.name == "real-seed1-01234567-3x.json"
+    assert plan_of(out="x/y.json").path == Path("x/y.json")
+    assert (plan_of().batch_size, plan_of(batch_size=8).batch_size) == (64, 8)
+    for samples in (None, 500):
+        sizes |= {"samples": samples, "batch_size": samples and 1}
+        plan = plan_of(from_samples="x/y")
+        assert plan.path == Path("x/y/p-1-01234567.json")
+        assert (plan.protocol.replications, plan.protocol.samples) == (3, None)
+        assert plan.protocol.resized_samples == (samples is not None)
+    assert plan_of(batch_size=8).batch_size == 8, "that of a protocol that measures time"
+    assert plan_of().batch_size == 1
+
+
+def test_the_chosen_extractor_replaces_that_of_the_protocol(monkeypatch):
+    opened: list[Any] = []
+
+    def instantiated(config: Any, *, path: str, device: Any) -> Any:
+        opened.append((path, device))
+        return SimpleNamespace(check=lambda *checked: opened.append(checked))
+
+    monkeypatch.setattr("evaluators.protocol.instantiate", instantiated)
+    representation: Any = SimpleNamespace(mean=SimpleNamespace(device="there"))
+    named = protocol_of(extractor={"_target_": "x", "path": "a"})
+    for path, used in ((None, "a"), ("b", "b")):
+        assert named.open_extractor(path, representation, "d") is not None
+        assert opened[-2:] == [(used, "there"), (representation, "d")]
+    assert named.open_extractor("none", representation, "d") is None
+    assert protocol_of().open_extractor("b", representation, "d") is None
+    with pytest.raises(UserError, match="needs a feature extractor"):
+        protocol_of(extractor={"_target_": "x"}).open_extractor(None, representation, "d")
+
+
+def test_a_drawn_clip_has_the_tags_of_its_caption_and_the_attributes_that_rules_read():
+    tags = [["a/DET"], ["b/NOUN", "c/VERB"]]
+    facts = {"action": "walk", "count": 0, "while": "wave", "take": 3, "tokens": tags}
+    clip = entry_of("x", 50, 2, **facts)
+    row = DrawnClip("x", clip, np.arange(50), 1, "x")
+    assert (row.text, row.tokens(row.text), row.tokens("x 0")) == ("x 1", tags[1], tags[0])
+    assert row.tokens("another caption") is None
+    assert row.requested == {"action": "walk", "count": 0, "while": "wave"}
+    assert replace(row, clip=entry_of("x", 50, 2)).tokens("x 0") is None
+
+
+def test_a_clip_that_is_one_frame_longer_than_the_motion_has_two_windows():
+    clips = clips_of(np.arange(100, dtype=np.float32)[:, None])
+    rows = [replace(row, frames=np.arange(99)) for row in rows_of([1] * 40)]
+    motions = Baseline("real", clips, "text", 0)("", rows, 0).features
+    assert {int(motion[0, 0]) for motion in motions} == {0, 1}
+    whole = [replace(row, frames=np.arange(100)) for row in rows]
+    motions = Baseline("real", clips, "text", 0)("", whole, 0).features
+    assert {(int(motion[0, 0]), len(motion)) for motion in motions} == {(0, 100)}
+
+
+@pytest.mark.parametrize("condition", ["text", "action"])
+def test_motions_of_two_captions_or_actions_in_equal_numbers_can_be_shuffled(
+    condition: str,
+):
+    entries = [
+        SimpleNamespace(length=1, captions=["a", "b"], action=number % 2) for number in range(8)
+    ]
+    rows = [
+        DrawnClip(f"{number}", cast(Any, entry), np.array([number]), number % 2, "")
+        for number, entry in enumerate(entries)
+    ]
+    clips = clips_of(np.arange(8, dtype=np.float32)[:, None])
+
+    def shuffled(seed: int, replication: int, count: int = 8) -> list[int]:
+        chosen = rows if count == 8 else [*rows[:6], rows[0]]
+        baseline = Baseline("shuffled", clips, condition, seed)
+        return [int(motion[0, 0]) for motion in baseline("", chosen, replication).features]
+
+    assert sorted(shuffled(0, 0)) == list(range(8))
+    assert all((new - number) % 2 for number, new in enumerate(shuffled(0, 0)))
+    with pytest.raises(UserError, match="4 of 7 motions have the same caption or label"):
+        shuffled(0, 0, 7)

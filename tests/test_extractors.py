@@ -5,7 +5,7 @@ import pickle
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from support.fixtures import (
 )
 from support.stores import write_words
 from torch import Tensor, nn
+from torchmetrics import MeanMetric
 
 from evaluators.extractors import (
     CLASSIFIERS,
@@ -37,9 +38,12 @@ from evaluators.extractors import (
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
 from evaluators.extractors.mardm import MARDMClip
+from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask
 from evaluators.extractors.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained
 from evaluators.extractors.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
 from evaluators.extractors.t2m_training import T2MTask
+from evaluators.extractors.training import ExtractorTask
+from evaluators.metrics.alignment import MotionsForText, MultimodalDistance
 from flame_mdm.batch import length_mask
 from flame_mdm.checkpoints.released_weights import load_strictly
 from flame_mdm.config import compose, instantiate
@@ -47,6 +51,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations.essential import Essential
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.seeds import key
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])
 
@@ -602,3 +607,126 @@ def test_a_motion_fits_its_texts_by_the_mean_cosine_of_its_parts():
     parts: Any = SimpleNamespace(parts=(("60", 0, 2), ("90", 2, 5)), text="x", features=along)
     assert extractor.fit([whole, parts]) == pytest.approx([3 / 13**0.5, (0.5 + 1) / 2])
     assert calls == [["90"], ["60"]], "no caption is encoded twice"
+
+
+def test_a_random_start_is_drawn_from_a_normal_distribution_for_each_seed():
+    network = ActionGRU(num_joints=2, hidden=300)
+    states = network.random_state([3, 4, 3])
+    assert states.shape == (2, 3, 300)
+    assert torch.equal(states[:, 0], states[:, 2])
+    assert torch.equal(network.random_state([4])[:, 0], states[:, 1])
+    rows = states[:, :2].flatten(0, 1)
+    assert rows.mean().item() == pytest.approx(0, abs=0.1)
+    assert rows.std().item() == pytest.approx(1, abs=0.1)
+    assert (torch.corrcoef(rows) - torch.eye(4)).abs().max() < 0.2, "layers have their own draws"
+
+
+def test_draws_of_a_training_step_depend_on_seed_step_and_rank():
+    def drawn(seed: int, step: int, rank: int) -> float:
+        task: Any = SimpleNamespace(seed=seed, global_rank=rank)
+        ExtractorTask.seed_step(task, step)
+        return torch.rand(1).item()
+
+    settings = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    assert len({drawn(*setting) for setting in settings}) == 4
+    assert [drawn(*setting) for setting in settings] == [drawn(*setting) for setting in settings]
+
+
+@pytest.mark.parametrize(
+    ("rank", "clips", "counts"), [(0, 1, True), (1, 1, False), (1, 2, True), (1, 3, True)]
+)
+def test_validation_clips_that_every_rank_has_count_once(rank: int, clips: int, counts: bool):
+    datamodule = SimpleNamespace(val=range(clips))
+    distance = MultimodalDistance()
+    task: Any = SimpleNamespace(
+        global_rank=rank,
+        trainer=SimpleNamespace(datamodule=datamodule, world_size=2),
+        val_metrics={"loss": MeanMetric(), "mm_dist": distance, "top": MotionsForText(pool=2)},
+        device="cpu",
+    )
+    batch: Any = SimpleNamespace(ids=["a", "b"], text=["x", "x"])
+    motion, text = torch.zeros(2, 3), torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 1.0]])
+    ExtractorTask.update_samples(task, batch, generated=motion, text=text)
+    assert distance.compute() == (3.0 if counts else None)
+    if counts:
+        assert distance.keys[0].tolist() == [key("motion", "a"), key("motion", "b")]
+        (captions,) = task.val_metrics["top"].text_keys
+        assert captions.tolist() == [key("caption", "x")] * 2
+
+
+def test_a_validation_logs_every_value_that_can_be_computed_and_begins_anew():
+    loss, distance, few = MeanMetric(), MultimodalDistance(), MotionsForText(pool=32)
+    enough, empty = MotionsForText(pool=2), MultimodalDistance()
+    pairs = {"generated": torch.eye(3), "text": torch.eye(3), "text_keys": torch.arange(3)}
+    for metric in (few, enough):
+        metric.update(**pairs, keys=torch.arange(3))
+    distance.update(generated=torch.eye(3), text=torch.zeros(3, 3), keys=torch.arange(3))
+    loss.update(torch.tensor([0.0, 0.5]))
+    logged: dict[str, tuple[float, bool]] = {}
+
+    def log(name: str, value: Any, *, prog_bar: bool) -> None:
+        logged[name] = (float(value), prog_bar)
+
+    metrics = {"loss": loss, "mm_dist": distance, "few": few, "top": enough, "empty": empty}
+    task: Any = SimpleNamespace(val_metrics=metrics, log=log)
+    ExtractorTask.on_validation_epoch_end(task)
+    tops = {f"val/top_top{k}": (1.0, False) for k in (1, 2, 3)}
+    assert logged == {"val/loss": (0.25, True), "val/mm_dist": (1.0, False)} | tops
+    assert (distance.compute(), few.compute()["top1"], loss.weight.item()) == (None, None, 0)
+    few.update(**pairs, keys=torch.arange(3))
+    failing: Any = SimpleNamespace(val_metrics={"loss": few}, log=log)
+    with pytest.raises(UserError, match="got 3 motions, but needs at least 32"):
+        ExtractorTask.on_validation_epoch_end(failing)
+
+
+def test_the_validation_loss_of_a_classifier_is_the_mean_over_motions_of_unequal_batches():
+    batches = [torch.tensor([[2.0, 0.0], [0.0, 1.0], [3.0, 0.0]]), torch.tensor([[0.0, 4.0]])]
+    labels = [torch.tensor([0, 1, 1]), torch.tensor([0])]
+    updated: list[dict[str, Tensor]] = []
+    reported: dict[str, Tensor] = {}
+    task: Any = SimpleNamespace(
+        val_metrics={"loss": MeanMetric()},
+        update_samples=lambda batch, **inputs: updated.append(inputs),
+        _classified=lambda number: (batches[number], labels[number]),
+        seed_step=lambda step: None,
+        report=reported.update,
+    )
+    losses = [
+        -row.log_softmax(0)[label].item()
+        for logits, right in zip(batches, labels, strict=True)
+        for row, label in zip(logits, right.tolist(), strict=True)
+    ]
+    for number in range(2):
+        step: Any = number
+        ClassifierTask.validation_step(task, step, number)
+        assert torch.equal(updated[number]["logits"], batches[number])
+        assert torch.equal(updated[number]["labels"], labels[number])
+    assert task.val_metrics["loss"].compute().item() == pytest.approx(np.mean(losses))
+    loss = ClassifierTask.training_step(task, cast(Any, 0), 0)
+    assert loss.item() == pytest.approx(np.mean(losses[:3]))
+    assert reported["train/loss"] is loss
+    assert reported["train/accuracy"].item() == pytest.approx(2 / 3)
+
+
+def test_the_temperature_of_a_motion_clip_begins_at_seven_hundredths():
+    network = MotionCLIP(
+        5, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0, max_frames=9, embedding_dim=3
+    )  # fmt: skip
+    reported: dict[str, Tensor] = {}
+    features = torch.randn(4, 4, generator=torch.Generator().manual_seed(0))
+    task: Any = SimpleNamespace(
+        network=network.eval(),
+        seed_step=lambda step: None,
+        text_features=lambda batch: network.text(features),
+        report=reported.update,
+    )
+    batch: Any = SimpleNamespace(
+        x=torch.randn(4, 6, 5), mask=length_mask(torch.tensor([6, 5, 4, 3]))
+    )
+    loss = MotionCLIPTask.training_step(task, batch, 0)
+    assert reported["train/temperature"].item() == pytest.approx(0.07)
+    cosines = nn.functional.cosine_similarity(
+        network(batch.x, batch.mask)[:, None], network.text(features)[None], dim=-1
+    )
+    both = [nn.functional.cross_entropy(x / 0.07, torch.arange(4)) for x in (cosines, cosines.T)]
+    torch.testing.assert_close(loss, (both[0] + both[1]) / 2)

@@ -1393,3 +1393,83 @@ def test_motions_of_two_captions_or_actions_in_equal_numbers_can_be_shuffled(
     assert all((new - number) % 2 for number, new in enumerate(shuffled(0, 0)))
     with pytest.raises(UserError, match="4 of 7 motions have the same caption or label"):
         shuffled(0, 0, 7)
+
+
+@pytest.mark.parametrize("lacking", [0, 1, 4])
+def test_one_clip_without_a_caption_or_a_label_is_enough_to_refuse_a_protocol(lacking: int):
+    entries = [replace(entry_of(f"{number}", 50), action=0) for number in range(5)]
+    entries[lacking] = entry_of(f"{lacking}", 50, 0)
+    clips = split_of(*entries)
+    clips.store = SimpleNamespace(info={"dataset": "d"})
+    for condition in ("text", "action"):
+        with pytest.raises(UserError, match=f"the data set d has clips without {condition}"):
+            protocol_of(condition=condition).check(clips, None)
+    protocol_of(condition="none").check(clips, None)
+
+
+@pytest.mark.parametrize("count", [64, 65, 130])
+def test_all_motions_are_measured_and_paired_however_many_there_are(count: int):
+    """Motion i has i % 3 + 3 frames and is 0.1 i m above the floor and above its real motion."""
+    targets = {"floating": "physics.Floating", "displacement": "reconstruction.DisplacementErrors"}
+    metrics = {name: {"_target_": f"evaluators.metrics.{x}"} for name, x in targets.items()}
+    evaluator = Evaluator(None, metrics, HumanML())
+    joints = [
+        torch.zeros(number % 3 + 3, 22, 3) + torch.tensor([0.0, 0.1 * number, 0.0])
+        for number in range(count)
+    ]
+    keys = torch.tensor([key(str(number)) for number in range(count)])
+    generated = {"joints": joints, "keys": keys}
+    paired = {"joints": [torch.zeros_like(motion) for motion in joints]}
+    values, reasons = evaluator.score(generated, paired, {}, seed=0)
+    frames, heights = np.arange(count) % 3 + 3, 0.1 * np.arange(count)
+    assert reasons == {}
+    assert values == pytest.approx(
+        {
+            "floating": (frames * heights).sum() / frames.sum(),
+            **dict.fromkeys(("displacement/ade", "displacement/fde"), heights.mean()),
+        }
+    )
+
+
+@pytest.mark.parametrize("condition", ["text", "action", "none"])
+def test_a_model_gets_the_seed_the_replication_and_the_condition_of_the_protocol(condition: str):
+    asked: list[tuple[Any, dict[str, Any]]] = []
+
+    def generate(batch: Any, options: Any, **more: Any) -> torch.Tensor:
+        asked.append((batch, {"options": options} | more))
+        return torch.arange(2 * 5 * 2).view(2, 5, 2)
+
+    model: Any = SimpleNamespace(
+        generate=generate,
+        device="cpu",
+        denoiser=SimpleNamespace(context_frames=0),
+        representation=SimpleNamespace(features=2, denormalize=lambda x: 10 * x),
+    )
+    entries = [replace(entry_of(name, 50), action=action) for name, action in (("a", 3), ("b", 0))]
+    rows = [
+        DrawnClip(entry.id, entry, np.arange(frames), 1, "")
+        for entry, frames in zip(entries, (5, 2), strict=True)
+    ]
+    options = SamplerOptions(guidance_scale=0.0)
+    source = Generator(
+        model,
+        protocol_of(condition=condition),
+        split_of(*entries),
+        options,
+        {},
+        4,
+        2,
+        progress=False,
+    )
+    motions = source._sample(rows, 3)
+    ((batch, more),) = asked
+    assert more == {
+        **{"options": options, "replication": 3, "seed": 4, "edit": None, "prefix": None},
+        "unconditioned": condition == "none",
+    }
+    assert (batch.ids, batch.x.shape, batch.mask.sum(1).tolist()) == (["a", "b"], (2, 5, 2), [5, 2])
+    assert batch.text == (["a 1", "b 1"] if condition == "text" else None)
+    assert batch.action is None or condition == "action"
+    assert condition != "action" or batch.action.tolist() == [3, 0]
+    np.testing.assert_array_equal(motions[0], 10 * np.arange(10).reshape(5, 2))
+    np.testing.assert_array_equal(motions[1], 10 * np.arange(10, 14).reshape(2, 2))

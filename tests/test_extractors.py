@@ -1,5 +1,6 @@
 """Networks that the papers evaluate with: the authors' outputs, and loading of the authors' files."""
 
+import hashlib
 import json
 import pickle
 from functools import partial
@@ -33,6 +34,7 @@ from evaluators.extractors import (
     MotionCLIPExtractor,
     OwnExtractor,
     OwnT2MExtractor,
+    ReleasedExtractor,
     T2MExtractor,
 )
 from evaluators.extractors.action_gru import ActionGRU
@@ -730,3 +732,48 @@ def test_the_temperature_of_a_motion_clip_begins_at_seven_hundredths():
     )
     both = [nn.functional.cross_entropy(x / 0.07, torch.arange(4)) for x in (cosines, cosines.T)]
     torch.testing.assert_close(loss, (both[0] + both[1]) / 2)
+
+
+def test_released_networks_are_made_for_the_data_of_their_authors(tmp_path, monkeypatch):
+    kinds = {
+        "humanact12": (ActionGRU, "model", "humanact12"),
+        "humanact12_unconstrained": (Unconstrained, None, "humanact12"),
+        "uestc": (UESTC, None, "uestc"),
+    }
+    assert kinds == CLASSIFIERS
+    for name in T2MExtractor.FILES:
+        (tmp_path / name).write_bytes(name.encode())
+    human, kit = ("humanml-legacy-smpl22", "humanml3d"), ("humanml-legacy-kit21", "kit")
+    monkeypatch.setattr(WordVectors, "read", lambda folder: None)
+    for features, data in ((263, human), (67, human), (251, kit), (64, kit)):
+        network = SimpleNamespace(mean=torch.zeros(features), used=60)
+        network.to = lambda device, network=network: network
+        monkeypatch.setattr("evaluators.extractors.load_t2m", lambda _, network=network: network)
+        extractor = T2MExtractor(str(tmp_path))
+        assert (extractor.made_for, extractor.used, extractor.full_length) == (data, 60, False)
+
+
+def test_the_hash_of_released_files_is_that_of_their_contents(tmp_path):
+    class OfTwo(MARDMClipExtractor):
+        FILES = ("a", "b")
+
+    class OfOne(MARDMClipExtractor):
+        FILES = ()
+
+    def hash_of(kind: type[MARDMClipExtractor], path: Path) -> str:
+        extractor = kind.__new__(kind)
+        ReleasedExtractor.__init__(extractor, str(path))
+        return extractor.sha256
+
+    (tmp_path / "a").write_bytes(b"1")
+    (tmp_path / "b").write_bytes(b"2")
+    hashes = [hashlib.sha256(content).hexdigest() for content in (b"1", b"2")]
+    assert hash_of(OfOne, tmp_path / "a") == hashes[0]
+    assert hash_of(OfTwo, tmp_path) == hashlib.sha256("".join(hashes).encode()).hexdigest()
+    for name in ("a", "b"):
+        before = hash_of(OfTwo, tmp_path)
+        (tmp_path / name).write_bytes(b"3")
+        assert hash_of(OfTwo, tmp_path) != before
+    (tmp_path / "b").unlink()
+    with pytest.raises(FileNotFoundError, match=r"b: no such file\. Use the path"):
+        hash_of(OfTwo, tmp_path)

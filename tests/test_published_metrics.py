@@ -513,3 +513,24 @@ def test_a_transition_counts_if_the_motion_contains_its_whole_window(seams, wind
     mask = torch.ones(1, 120, dtype=torch.bool)
     metric.update(torch.zeros(1, 120, 22, 3), mask, kept, keys=torch.tensor([0]))
     assert metric.compute()["windows"] == windows
+
+
+@pytest.mark.parametrize(
+    ("fps", "jerk"),
+    [
+        (20.0, 0.033031363),
+        (30.0, 0.016383045),
+        (30.0000001, 0.016383045),
+        (29.97, None),
+        (60.0, None),
+    ],
+)
+def test_the_area_of_a_still_transition_is_the_jerk_of_real_motions_at_its_frame_rate(
+    fps: float, jerk: float | None
+):
+    kept = torch.zeros(1, 30, 22, dtype=torch.bool)
+    kept[:, 15:] = True
+    metric = TransitionJerk(fps, window=13)
+    metric.update(torch.zeros(1, 30, 22, 3), torch.ones(1, 30) > 0, kept, keys=torch.arange(1))
+    area = None if jerk is None else pytest.approx(10 * jerk)
+    assert metric.compute() == {"peak": 0, "area": area, "windows": 1}

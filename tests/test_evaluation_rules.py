@@ -1183,7 +1183,10 @@ def test_an_evaluation_in_training_logs_each_value_with_its_interval_and_that_of
 
     real = {"fid": of(0.0), "jitter": of(9.0, unit="m/s^3"), "mid": of(None)}
     rounds = iter(
-        [({"fid": of(0.5, 0.1), "jitter": of(8.0, 0.2, "m/s^3")}, real), ({"mid": of(2.0)}, None)]
+        [
+            ({"fid": of(0.5, 0.1), "jitter": of(8.0, 0.2, "m/s^3")}, real),
+            ({"mid": of(2.0), "fid": of(0.4)}, None),
+        ]
     )
     asked: list[bool] = []
 
@@ -1212,12 +1215,14 @@ def test_an_evaluation_in_training_logs_each_value_with_its_interval_and_that_of
         "val/p/jitter (m/s^3)/real": 9.0,
     }
     assert selecting == {"val/p/jitter": 8.0, "val/p/jitter/ci": 0.2}
-    assert last == {"val/p/mid": 2.0}, "without the values of the evaluation before"
+    expected = {"val/p/mid": 2.0, "val/p/fid": 0.4, "val/p/fid/real": 0.0}
+    assert last == expected, "without the values of the evaluation before"
     head = ["metric", "mean", "ci", "replications", "n", "unit", "real motions"]
     rows = [["fid", 0.5, 0.1, 2, 64, "", 0.0], ["jitter", 8.0, 0.2, 2, 64, "m/s^3", 9.0]]
+    later = [["mid", 2.0, None, 2, 64, "", None], ["fid", 0.4, None, 2, 64, "", 0.0]]
     assert tables == [
         ("board", "evaluation/p", head, rows, 9),
-        ("board", "evaluation/p", head, [["mid", 2.0, None, 2, 64, "", None]], 19),
+        ("board", "evaluation/p", head, later, 19),
     ]
 
 

@@ -712,7 +712,8 @@ def test_the_validation_loss_of_a_classifier_is_the_mean_over_motions_of_unequal
 
 def test_the_temperature_of_a_motion_clip_begins_at_seven_hundredths():
     network = MotionCLIP(
-        5, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0, max_frames=9, embedding_dim=3
+        5, 4, latent_dim=8, ff_size=8, num_layers=1, num_heads=2, dropout=0.0, max_frames=9,
+        embedding_dim=3,
     )  # fmt: skip
     reported: dict[str, Tensor] = {}
     features = torch.randn(4, 4, generator=torch.Generator().manual_seed(0))

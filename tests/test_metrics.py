@@ -947,21 +947,3 @@ def test_the_median_rank_of_an_even_number_of_texts_is_between_two_ranks():
     assert [values[f"t2m_top{k}"] for k in TMR_TOP] == [0.25, 0.5, 0.75, 1, 1]
     # The ranks in the columns are 1, 1.5 (a tie), 2 (a tie of three) and 3.5
     assert values["m2t_median"] == 1.75
-
-
-def test_of_motions_with_equal_errors_of_the_root_the_first_one_is_best_and_worst():
-    """By their keys; the second joints are 3, 1 and 2 m off."""
-    real = torch.zeros(3, 4, 2, 3)
-    joints = real.clone()
-    joints[:, :, 1, 0] = torch.tensor([3.0, 1.0, 2.0])[:, None]
-    mask, group = torch.ones(3, 4, dtype=torch.bool), torch.zeros(3, dtype=torch.long)
-    metric = FlamePositionErrors(parents=[-1, 0], samples=3)
-    metric.update(joints, mask, real, mask, keys=torch.tensor([7, 9, 8]), groups=group)
-    values = metric.compute()
-    assert [values[f"{which}_ape_mean_local"] for which in ("best", "worst")] == [3, 3]
-    joints[1, :, 0, 0] = joints[1, :, 1, 0] = 5.0  # farther, with the same bone
-    metric = FlamePositionErrors(parents=[-1, 0], samples=3)
-    metric.update(joints, mask, real, mask, keys=torch.tensor([7, 9, 6]), groups=group)
-    values = metric.compute()
-    assert [values[f"{which}_ape_mean_local"] for which in ("best", "worst")] == [2, 0]
-    assert [values[f"{which}_ape_root"] for which in ("best", "worst")] == [0, 5]

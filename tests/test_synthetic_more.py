@@ -859,7 +859,7 @@ def test_an_example_lasts_three_seconds_at_any_rate(attributes: Attributes):
 def test_checks_need_the_same_seconds_at_twice_the_frame_rate(
     name: str, changes: dict[str, Any], shown: dict[str, Any]
 ):
-    twice = {
+    twice: dict[str, Any] = {
         part: np.repeat(path, 2, axis=0) if np.ndim(path) == 2 else path
         for part, path in changes.items()
     }

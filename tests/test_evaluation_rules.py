@@ -1305,7 +1305,7 @@ def test_results_of_baselines_and_files_have_names_that_state_how_they_differ(mo
     monkeypatch.setattr(Protocol, "open_extractor", lambda *_: network[0])
 
     def plan_of(**keys: Any) -> Plan:
-        subject = {} if "from_samples" in keys else {"baseline": "real"}
+        subject: dict[str, Any] = {} if "from_samples" in keys else {"baseline": "real"}
         return Plan(EvaluationRequest(data={"a": 1}, protocol="p", **subject | keys), "cpu")
 
     options: list[tuple[dict[str, Any], str]] = [
@@ -1474,7 +1474,7 @@ def test_a_model_gets_the_seed_the_replication_and_the_condition_of_the_protocol
     }
     assert (batch.ids, batch.x.shape, batch.mask.sum(1).tolist()) == (["a", "b"], (2, 5, 2), [5, 2])
     assert batch.text == (["a 1", "b 1"] if condition == "text" else None)
-    assert batch.action is None or condition == "action"
-    assert condition != "action" or batch.action.tolist() == [3, 0]
+    labels = None if batch.action is None else batch.action.tolist()
+    assert labels == ([3, 0] if condition == "action" else None)
     np.testing.assert_array_equal(motions[0], 10 * np.arange(10).reshape(5, 2))
     np.testing.assert_array_equal(motions[1], 10 * np.arange(10, 14).reshape(2, 2))

@@ -651,7 +651,8 @@ def test_validation_clips_that_every_rank_has_count_once(rank: int, clips: int, 
     ExtractorTask.update_samples(task, batch, generated=motion, text=text)
     assert distance.compute() == (3.0 if counts else None)
     if counts:
-        assert distance.keys[0].tolist() == [key("motion", "a"), key("motion", "b")]
+        (keys,) = cast(Any, distance.keys)
+        assert keys.tolist() == [key("motion", "a"), key("motion", "b")]
         (captions,) = task.val_metrics["top"].text_keys
         assert captions.tolist() == [key("caption", "x")] * 2
 

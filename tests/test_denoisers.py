@@ -18,6 +18,7 @@ from flame_mdm.denoisers.flame import FLAME, cosine_first_sinusoid
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.layers import TransformerLayer
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
+from flame_mdm.denoisers.target_encoders import TARGET_ENCODERS
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet, ResidualBlock
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_package_yaml
@@ -312,6 +313,79 @@ def test_guidance_and_dropping_keep_prefix_and_target(subtests) -> None:
     for name in ("prefix", "target", "target_mask"):
         with subtests.test(name=name):
             assert torch.equal(getattr(twice, name), torch.cat([getattr(cond, name)] * 2))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"input_token": "time"},
+        {"input_token": "condition"},
+        {"condition_frames": True, "context_frames": 3},
+        {"token_memory": True},
+        {"token_memory": True, "memory": "concat"},
+    ],
+)
+def test_the_embedding_of_a_target_is_added_to_the_time_wherever_the_time_is_read(
+    options: dict[str, Any],
+) -> None:
+    """A constant embedding can then be part of the last bias of the time."""
+    torch.manual_seed(0)
+    decoder = MDMDecoder(D, D, C, **TRANSFORMER, target_encoder="single", **options).double()
+    x_t, t, mask, cond = batch()
+    cond = replace(cond, target=torch.ones(3, 8, 4).double())
+    assert decoder.target is not None
+    embedding = decoder.target(cond)[0].detach()
+    expected = decoder(x_t, t, mask, cond)
+    decoder.target, last = None, decoder.condition.time_embedding[-1]
+    before = decoder(x_t, t, mask, cond)
+    last.bias.data += embedding  # type: ignore[operator, union-attr]
+    assert_same(decoder(x_t, t, mask, cond), expected)
+    assert (expected - before).abs().max() > 1e-4
+
+
+def test_options_of_conditions_do_nothing_without_a_condition() -> None:
+    inputs = batch()
+    for kind, options in (
+        (MDMDecoder, {"token_memory": True}),
+        (MDMDecoder, {"token_memory": True, "project_condition": False}),
+        (MDMEncoder, {"project_condition": False}),
+    ):
+        plain, with_options = (
+            kind(D, D, 0, **TRANSFORMER, **chosen).double()  # type: ignore[arg-type]
+            for chosen in ({}, options)
+        )
+        with_options.load_state_dict(plain.state_dict())
+        assert_same(with_options(*inputs), plain(*inputs))
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_target_encoders_have_the_requested_hidden_layers_but_multi_always_has_one(layers: int):
+    """A hidden layer consists of an activation and a linear layer of the output's width."""
+    for name, count, width in (("single", layers, 16), ("split", layers, 2), ("multi", 1, 16)):
+        encoder = TARGET_ENCODERS[name](16, layers)
+        networks: Any = [encoder.network] if name == "single" else encoder.networks
+        assert len(networks) == (1 if name == "single" else 8)
+        for network in networks:
+            kinds = [type(layer) for layer in network]
+            assert kinds == [nn.Linear, *[nn.SiLU, nn.Linear] * count], name
+            assert {layer.out_features for layer in network if type(layer) is nn.Linear} == {width}
+
+
+@pytest.mark.parametrize("over_batch", [False, True])
+def test_the_recurrence_runs_over_earlier_frames_or_over_earlier_motions(over_batch: bool) -> None:
+    torch.manual_seed(0)
+    options: dict[str, Any] = {"recur_over_batch": True} if over_batch else {}
+    gru = MDMGRU(D, D, C, latent_dim=16, num_layers=2, dropout=0.0, **options).double()
+    x_t, t, mask, cond = batch([11, 11, 11])
+    changed = x_t.clone()
+    changed[1, 4] += 1
+    moved = (gru(changed, t, mask, cond) - gru(x_t, t, mask, cond)).abs().amax(-1) > 1e-9
+    expected = torch.zeros(3, 11, dtype=torch.bool)
+    if over_batch:
+        expected[1:, 4] = True
+    else:
+        expected[1, 4:] = True
+    assert torch.equal(moved, expected)
 
 
 def test_bad_options_are_named(subtests) -> None:

@@ -719,3 +719,12 @@ def test_an_edit_has_the_motions_and_frames_of_the_mask(build, shape):
     options = {"sampler": "consistency", "num_inference_steps": 2}
     with pytest.raises(UserError, match="the shape of the edit does not match the motions"):
         sample(build(), pulled, drawn((2, 4, 2)), edit=Edit(known, half_kept(known)), **options)
+
+
+@pytest.mark.parametrize("build", [GaussianDiffusion, FlowMatching])
+@pytest.mark.parametrize("shape", [(1, 4, 2), (2, 1, 2), (2, 4, 1), (2, 5, 2)])
+def test_the_kept_part_of_an_edit_has_the_shape_of_its_motion(build, shape):
+    edit = Edit(torch.zeros(2, 4, 2), torch.zeros(shape, dtype=torch.bool))
+    options = {"sampler": "consistency", "num_inference_steps": 2}
+    with pytest.raises(UserError, match="the shape of the edit does not match the motions"):
+        sample(build(), pulled, drawn((2, 4, 2)), edit=edit, **options)

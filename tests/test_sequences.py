@@ -19,6 +19,7 @@ from flame_mdm.conditions import vocabulary
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
+from flame_mdm.losses import bone_lengths
 from flame_mdm.processes.guidance import Positions, reach
 from flame_mdm.processes.windows import blended, cover, spans
 from flame_mdm.sampling import targets as targets_module
@@ -360,6 +361,48 @@ def test_bones_have_their_median_length_in_the_frame_of_a_position_and_nearly_th
     share = np.exp(-0.5 * (1 / 0.5) ** 2)  # of the neighboring frames
     assert lengths.tolist() == pytest.approx([1, 1, 1, share + (1 - share) * 2, 3], abs=0.006)
     assert joints[2, 1, 1].item() == pytest.approx(0.3, abs=0.006)
+
+
+def two_joints(features: torch.Tensor) -> torch.Tensor:
+    """Joint positions (..., 2, 3) that are the first six of seven features."""
+    return features[..., :6].unflatten(-1, (2, 3))
+
+
+def test_each_motion_of_a_batch_reaches_positions_as_it_does_alone():
+    """The motions have bones of 1 m and 2 m, and other features that may change."""
+    x = 0.1 * torch.randn(2, 9, 7, generator=torch.Generator().manual_seed(0))
+    x[..., 4] += torch.tensor([1.0, 2.0])[:, None]
+    free = torch.ones(2, 9, 7, dtype=torch.bool)
+    free[0, :, 3], free[1, :, 5] = False, False
+    frames, joints, axes = torch.tensor([4, 4, 6]), torch.tensor([1, 1, 0]), torch.tensor([0, 2, 2])
+    goal = Positions(frames, joints, axes, torch.tensor([0.5, 0.4, 0.2]))
+    bones = torch.tensor([[4, 6], [0, 0], [1, 1]])
+    together = reach(x, two_joints, goal, bones, free, smoothness=1.0)
+    for row in range(2):
+        alone = reach(
+            x[row : row + 1], two_joints, goal, bones, free[row : row + 1], smoothness=1.0
+        )
+        torch.testing.assert_close(together[row], alone[0])
+        lengths = bone_lengths(two_joints(x[row]), [(0, 1)])[:, 0]
+        moved = bone_lengths(two_joints(together[row]), [(0, 1)])[:, 0]
+        assert moved[[4, 6]].tolist() == pytest.approx([lengths.median().item()] * 2, abs=0.006)
+        # Features that may not change or do not act on joints keep their values in all frames
+        assert torch.equal(together[row][~free[row]], x[row][~free[row]])
+        assert torch.equal(together[row, :, 6], x[row, :, 6])
+
+
+def test_frames_between_two_positions_have_lengths_between_their_own_and_the_median():
+    """The bone has a median of 1 m; the frame between two positions is 1.5 m long."""
+    x = torch.zeros(1, 7, 7)
+    x[0, :, 3] = torch.tensor([1.0, 1.0, 1.0, 1.5, 1.0, 1.0, 1.0])
+    free = torch.ones(1, 7, 7, dtype=torch.bool)
+    frames, joint, axis = torch.tensor([2, 4]), torch.tensor([1, 1]), torch.tensor([1, 1])
+    goal = Positions(frames, joint, axis, torch.tensor([0.1, 0.1]))
+    bones = torch.tensor([[2, 4], [0, 0], [1, 1]])
+    moved = reach(x, two_joints, goal, bones, free, smoothness=1.0)
+    lengths = bone_lengths(two_joints(moved[0]), [(0, 1)])[:, 0]
+    share = np.exp(-0.5)  # of the nearest position, not of both together
+    assert lengths[3].item() == pytest.approx(share + (1 - share) * 1.5, abs=0.006)
 
 
 def test_waypoints_joints_and_poses_are_reached(model, tmp_path):

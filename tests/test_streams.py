@@ -19,7 +19,7 @@ from torch import Tensor
 
 import flame_mdm
 from flame_mdm import generate, stream
-from flame_mdm.batch import Condition, Edit, MotionBatch
+from flame_mdm.batch import Condition, Edit, MotionBatch, length_mask
 from flame_mdm.data.standing import standing
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.denoisers import Denoiser
@@ -587,6 +587,61 @@ def test_noise_that_is_shared_is_the_same_for_all_names_also_block_by_block(mode
     torch.testing.assert_close(shared[0], shared[1])
     assert not torch.allclose(separate[0], separate[1], atol=1e-3)
     assert shared.shape[1] == BLOCK + 3
+
+
+def two_people(model: MotionGenerator, lengths: list[int]) -> tuple[MotionBatch, torch.Tensor]:
+    """A batch of two walking people, and the frames before it."""
+    standing, _ = starting_point(model, None)
+    prefix = torch.cat([standing, standing + 0.1])
+    mask = length_mask(torch.tensor(lengths))
+    x = torch.zeros(2, mask.shape[1], prefix.shape[2])
+    return MotionBatch(x, mask, ["a", "b"], text=["a person walks"] * 2), prefix
+
+
+def test_each_person_continues_from_the_frames_before_the_last_one_that_is_kept(model):
+    batch, prefix = two_people(model, [BLOCK, BLOCK])
+    cond = model.encode(batch)
+    options = SamplerOptions(num_inference_steps=2).over(model.sampler_options)
+    for kept in ([3, BLOCK], [BLOCK - 1, 1], [0, CONTEXT]):
+        blocks = Blocks(model, batch.ids, prefix, options)
+        both = torch.cat([prefix, blocks.sample(cond, torch.tensor(kept))], 1)
+        assert blocks.prefix is not None
+        for row, count in enumerate(kept):
+            assert torch.equal(blocks.prefix[row], both[row, count : count + CONTEXT])
+        assert blocks.number == 1
+
+
+def test_continued_motions_of_a_batch_end_in_zeros_and_are_those_of_each_person_alone(model):
+    lengths = [BLOCK + 5, 7]
+    batch, prefix = two_people(model, lengths)
+    options = SamplerOptions(num_inference_steps=2)
+    x = model.generate(batch, options, prefix=prefix, seed=3)
+    assert x.shape == batch.x.shape
+    for row, length in enumerate(lengths):
+        assert not x[row, length:].any()
+        alone = MotionBatch(
+            batch.x[:1, :length],
+            batch.mask[row : row + 1, :length],
+            batch.ids[row : row + 1],
+            text=["a person walks"],
+        )
+        expected = model.generate(alone, options, prefix=prefix[row : row + 1], seed=3)[0]
+        torch.testing.assert_close(x[row, :length], expected, rtol=0, atol=1e-3)
+
+
+def test_a_model_that_continues_motions_is_left_in_its_mode_and_samples_without_dropout():
+    model = built()
+    for module in model.denoiser.modules():
+        if isinstance(module, torch.nn.Dropout):
+            module.p = 0.5
+    batch, prefix = two_people(model, [5, 5])
+    options = SamplerOptions(num_inference_steps=2)
+    expected = model.eval().generate(batch, options, prefix=prefix)
+    assert not model.training
+    sampled = model.train().generate(batch, options, prefix=prefix)
+    torch.testing.assert_close(sampled, expected)
+    assert model.training
+    assert model.denoiser.training
 
 
 def test_what_such_a_model_cannot_do_is_said_in_one_line(model, walk, subtests):

@@ -28,7 +28,7 @@ from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
-from flame_mdm.signals import StopRequest
+from flame_mdm.signals import StopRequest, raise_received, stoppable
 from flame_mdm.training.checkpointing import LAST, AtomicCheckpoints, newest
 from flame_mdm.training.guards import lost_worker
 
@@ -129,6 +129,78 @@ def test_which_second_signal_ends_a_run_at_once(monkeypatch, subtests):
     for signum, code in ((signal.SIGTERM, "143"), (signal.SIGINT, "130")):
         with subtests.test(signum=signum, code=code), pytest.raises(SystemExit, match=code):
             request.note(signum, None)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "seconds", "stops"),
+    [
+        (signal.SIGINT, signal.SIGINT, 0.0, True),
+        (signal.SIGTERM, signal.SIGINT, 0.0, True),
+        (signal.SIGUSR1, signal.SIGINT, 0.0, True),
+        (signal.SIGTERM, signal.SIGTERM, 0.9, False),
+        (signal.SIGTERM, signal.SIGTERM, 1.1, True),
+        (signal.SIGINT, signal.SIGTERM, 9.0, False),
+        (signal.SIGUSR1, signal.SIGTERM, 9.0, False),
+        (signal.SIGUSR1, signal.SIGUSR1, 9.0, False),
+        (signal.SIGTERM, signal.SIGUSR2, 9.0, False),
+    ],
+)
+def test_a_signal_after_another_one_ends_a_run_at_once_or_is_noted(
+    monkeypatch, first: signal.Signals, second: signal.Signals, seconds: float, stops: bool
+):
+    times, killed = iter([100.0, 100.0 + seconds, 100.0 + seconds]), []
+    monkeypatch.setattr("flame_mdm.signals.time.monotonic", lambda: next(times))
+    monkeypatch.setattr("flame_mdm.signals.kill_children", lambda: killed.append(True))
+    request = StopRequest()
+    request.note(first, None)
+    assert request.signum == first
+    if stops:
+        with pytest.raises(SystemExit) as stopped:
+            request.note(second, None)
+        assert stopped.value.code == 128 + second
+    else:
+        request.note(second, None)
+        assert request.signum == second
+    assert killed == [True] * stops
+
+
+def test_a_command_ends_with_the_number_of_its_signal_also_if_a_library_reports_another_error():
+    def received(signum: signal.Signals, kind: str) -> int:
+        with stoppable([signal.SIGTERM, signal.SIGHUP]):
+            try:
+                signal.raise_signal(signum)
+            except SystemExit:
+                if kind == "swallowed":
+                    raise_received()
+                elif kind == "replaced":
+                    raise OSError("the cleanup failed") from None
+                raise
+        return 0
+
+    before = [signal.getsignal(signum) for signum in (signal.SIGTERM, signal.SIGHUP)]
+    for signum in (signal.SIGTERM, signal.SIGHUP):
+        for kind in ("raised", "swallowed", "replaced"):
+            with pytest.raises(SystemExit) as stopped:
+                received(signum, kind)
+            assert stopped.value.code == 128 + signum, kind
+            assert [
+                signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)
+            ] == before
+            raise_received()  # nothing is left of a signal that has ended its command
+    with pytest.raises(OSError, match="no signal"), stoppable([signal.SIGTERM]):
+        raise OSError("no signal")
+
+
+def test_ignored_signals_stay_ignored_and_an_interrupt_is_a_keyboard_interrupt():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stoppable([signal.SIGHUP, signal.SIGTERM]):
+            signal.raise_signal(signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        with pytest.raises(KeyboardInterrupt), stoppable([signal.SIGINT]):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch, subtests):

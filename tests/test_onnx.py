@@ -287,6 +287,108 @@ def test_the_runner_reads_the_words_that_the_package_reads(words: list[str]) -> 
         assert [tuple(row) for row in condition["condition"][0].tolist()] == [*rows, *padding]
 
 
+def test_unknown_content_words_are_named_once_and_a_text_without_a_known_one_is_refused() -> None:
+    functions = ["a", "person", "then"]
+    sampler = sampler_without_graphs(vocabulary=["a", "walks", "wave"], function_words=functions)
+    assert sampler.unknown("a person walked, then backflips and waves") == ["backflips", "and"]
+    assert sampler.unknown("Zigzag walks: ZIGZAG, hop") == ["zigzag", "hop"]
+    assert sampler.unknown("walking") == []
+    for text in ("a person backflips", "hops and hops", "a person", ""):
+        with pytest.raises(ValueError, match="the model knows no word for an action in this text"):
+            sampler.unknown(text)
+    without_words = sampler_without_graphs(vocabulary=[], function_words=functions)
+    assert without_words.unknown("a person backflips") == []
+
+
+@pytest.mark.parametrize(
+    ("fps", "options", "seconds", "seed", "frames"),
+    [
+        (12.5, [], None, 0, 38),
+        (20, ["seed=7"], None, 7, 60),
+        (30, ["seconds=1.5", "seed=-1"], 1.5, -1, 45),
+        (59.94, ["seconds=2"], 2.0, 0, 120),
+    ],
+)
+def test_the_runner_writes_one_motion_and_says_how_long_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    fps: float,
+    options: list[str],
+    seconds: float | None,
+    seed: int,
+    frames: int,
+) -> None:
+    steps = [[0, 0, 0, 1, 0, 0, 0]]  # the motion is its noise
+    sampler = sampler_without_graphs(fps=fps, features=3, steps=steps, vocabulary=["seed", "walks"])
+    sampler.content["function_words"] = []
+    monkeypatch.setattr(sampler, "decode", lambda x: x[:, None])
+    monkeypatch.setattr(runner, "Sampler", lambda folder: sampler)
+    text, out = "Seed= walks oddly", tmp_path / "walk.v2"
+    assert runner.main(["model", text, str(out), *options]) == 0
+    printed = capsys.readouterr()
+    assert printed.out == (
+        f"warning: never seen in training: oddly\n{out}.npz: {frames} frames at {fps:g} "
+        "frames per second, joints in meters, y up\n"
+    )
+    assert printed.err == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["walk.v2.npz"]
+    with np.load(tmp_path / "walk.v2.npz") as file:
+        assert sorted(file) == ["fps", "joints", "text"]
+        assert (float(file["fps"]), str(file["text"])) == (fps, text)
+        expected = sampler.generate(text, seconds, seed)[:, None]
+        np.testing.assert_array_equal(file["joints"], expected)
+        assert file["joints"].shape == (frames, 1, 3)
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["model"], ["model", "walks"], ["model", "walks", "out.npz", "3"]]
+)
+def test_the_runner_explains_its_words_if_their_number_is_wrong(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert runner.main([*words, "seconds=2"]) == 2
+    usage = 'usage: python runner.py FOLDER "TEXT OR ACTION" motion.npz [seconds=3] [seed=0]\n'
+    assert capsys.readouterr().err == usage
+
+
+def test_an_unknown_action_is_refused_with_the_known_ones_and_others_have_their_number() -> None:
+    sampler = sampler_without_graphs(reads="action", actions=["walk", "sit down", "jump"])
+    numbers = [
+        sampler._condition(name)["condition"].tolist() for name in sampler.content["actions"]
+    ]
+    assert numbers == [[0], [1], [2]]
+    with pytest.raises(
+        ValueError, match="unknown action 'Walk'; this model knows: walk, sit down, jump"
+    ):
+        sampler.generate("Walk")
+
+
+def test_blocks_of_the_runner_continue_the_last_frames_with_noise_of_their_own() -> None:
+    """The denoiser predicts 0, and the only step keeps the noise of a block."""
+    start = np.arange(20.0).reshape(2, 10)
+    steps = [[0, 0, 0, 1, 0, 0, 0]]
+    for seconds, count in ((0.3, 2), (0.4, 2), (0.45, 3), (0.15, 1)):
+        sampler = sampler_without_graphs(start=start.tolist(), max_frames=6, steps=steps)
+        read: list[dict[str, np.ndarray]] = []
+
+        def run(
+            name: str, inputs: dict[str, np.ndarray], shapes: Any, read: Any = read
+        ) -> list[np.ndarray]:
+            read.append(inputs)
+            return [np.zeros(shapes[0], np.float32)]
+
+        sampler._run = run  # type: ignore[method-assign]
+        x = sampler.generate("a", seconds, seed=4, sample=2)
+        names = [f"a#2\x1f{number}" for number in range(count)]
+        blocks = [runner.normal(runner.key("noise", 4, 0, name), 4, 10) for name in names]
+        whole = np.concatenate([start, *blocks])
+        np.testing.assert_allclose(x, whole[2 : 2 + round(20 * seconds)], rtol=1e-6)
+        assert [inputs["lengths"].tolist() for inputs in read] == [[4]] * count
+        for number, inputs in enumerate(read):
+            np.testing.assert_allclose(inputs["prefix"][0], whole[4 * number : 4 * number + 2])
+
+
 def test_noise_of_the_runner_depends_on_prompt_sample_and_seed() -> None:
     passes = {"steps": [[0, 0, 0, 1, 0, 0, 0]]}  # the last step keeps the noise
     first = sampler_without_graphs(**passes).generate("a")

@@ -494,12 +494,12 @@ def normal(number: int, frames: int, features: int) -> np.ndarray:
     return both.reshape(frames, 2 * pairs)[:, :features]
 
 
-def write(path: str | Path, **arrays: Any) -> None:
+def write(path: str | Path, **arrays: Any) -> Path:
     """Writes an .npz file under a temporary name, and renames it at the end.
 
-    A failure leaves no files behind. If `path` is a link, the link is replaced, and its target does
-    not change. Raises `ValueError` if `path` is a folder, a pipe or a device, and `OSError` if the
-    file cannot be written.
+    Returns the path of the file, whose name ends with .npz. A failure leaves no files behind. If
+    `path` is a link, the link is replaced, and its target does not change. Raises `ValueError` if
+    `path` is a folder, a pipe or a device, and `OSError` if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -516,6 +516,7 @@ def write(path: str | Path, **arrays: Any) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+    return path
 
 
 def _number_of(options: Mapping[str, str], key: str, kind: type[Any]) -> Any:
@@ -547,12 +548,12 @@ def main(arguments: Sequence[str]) -> int:
         if unknown := sampler.unknown(prompt):
             print(f"warning: never seen in training: {', '.join(unknown)}")
         joints = sampler.decode(sampler.generate(prompt, seconds, seed or 0))
-        write(out, joints=joints, fps=sampler.content["fps"], text=prompt)
+        path = write(out, joints=joints, fps=sampler.content["fps"], text=prompt)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(
-        f"{out}: {len(joints)} frames at {sampler.content['fps']:g} frames per second, joints in meters, y up"
+        f"{path}: {len(joints)} frames at {sampler.content['fps']:g} frames per second, joints in meters, y up"
     )
     return 0
 

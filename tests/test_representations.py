@@ -1,6 +1,7 @@
 import itertools
 import math
 import re
+from collections.abc import Callable
 from inspect import signature
 
 import numpy as np
@@ -756,3 +757,91 @@ def test_frames_are_added_between_the_first_and_the_last(frames: int, factor: in
 def test_defaults_of_representations_do_not_change(kind, defaults):
     parameters = signature(kind).parameters.values()
     assert {p.name: p.default for p in parameters} == defaults
+
+
+REPRESENTATIONS = [
+    HumanML(),
+    HumanML("kit21", "legacy", 12.5, units_per_metre=640.0),
+    Essential(),
+    Rifke(),
+    Rot6D(),
+    SMPL(),
+    Motion272(),
+]
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS, ids=lambda r: r.name)
+def test_motions_of_a_batch_are_decoded_and_cut_as_each_one_alone(representation: Representation):
+    """Features are random, so that every frame turns and moves."""
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(2, 3, 7, representation.features, generator=generator).double()
+    kept = features.clone()
+
+    def check(convert: Callable[[Tensor], Tensor | None]) -> None:
+        together = convert(features)
+        assert together is not None
+        for first, second in itertools.product(range(2), range(3)):
+            alone = convert(features[first, second])
+            assert alone is not None
+            close(together[first, second], alone, 1e-9)
+
+    check(representation.decode)
+    check(representation.rotations6d)
+    check(representation.rebase)
+    if "contacts" in representation.slices:
+        check(representation.contacts)
+    if isinstance(representation, HumanML):
+        check(lambda x: representation.root_steps(x)[0])
+        check(lambda x: representation.root_steps(x)[1])
+    if isinstance(representation, Motion272):
+        check(lambda x: representation.poses(x)[0])
+        check(lambda x: representation.poses(x)[1])
+    assert torch.equal(features, kept), "features are not changed in place"
+
+
+@pytest.mark.parametrize("representation", REPRESENTATIONS, ids=lambda r: r.name)
+def test_the_first_of_several_bad_frames_is_named(representation: Representation):
+    shape = (len(representation.skeleton), 3)
+    if isinstance(representation, SMPL | Rot6D | Motion272):
+        shape = (75,)
+    motion = torch.zeros(9, *shape)
+    motion[7], motion[4].flatten()[-1], motion[5] = math.nan, -math.inf, math.inf
+    with pytest.raises(UserError, match="^motion: frame 4 contains NaN or infinite values"):
+        representation.encode(motion)
+
+
+def test_published_headings_are_smoothed_over_20_frames_at_any_rate():
+    joints = torch.from_numpy(posed(80, heading=0.5 * np.sin(np.arange(80) / 12)).joints)
+    expected = HumanML(variant="legacy").encode(joints)
+    for fps in (12.5, 30.0, 60.0):
+        assert torch.equal(HumanML(variant="legacy", fps=fps).encode(joints), expected)
+        assert not torch.allclose(HumanML(fps=fps).encode(joints), HumanML().encode(joints))
+
+
+def test_temos_keeps_every_deviation_but_zero_and_divides_by_one_frame_less():
+    signs = torch.tensor([1.0, -1.0]).repeat(8)[:, None]
+    features = signs * torch.tensor([0.0, 1e-6, 2.0])
+    mean, std = Rifke().statistics(features)
+    assert mean.tolist() == [0, 0, 0]
+    unbiased = math.sqrt(16 / 15)
+    torch.testing.assert_close(std, torch.tensor([1.0, 1e-6 * unbiased, 2 * unbiased]))
+
+
+SMPL22_BONES = np.linalg.norm(ADULT[1:22], axis=-1).tolist()
+
+
+def test_a_body_is_scaled_by_the_legs_of_its_own_first_frame():
+    """Legs of two motions have different lengths; later frames do not change the scale."""
+    usual = wander(frames=8)
+    lengths = [0.0, *SMPL22_BONES]
+    representation = HumanML(bone_lengths=lengths)
+    tall, growing = 1.5 * usual, usual * torch.linspace(1, 2, 8)[:, None, None]
+    together = representation.encode_many([usual, tall, growing])
+    close(together[1], together[0], 1e-5)
+    close(together[2][:, 3], representation.encode(growing)[:, 3], 1e-6)
+    decoded = representation.decode(together[2])
+    close(SMPL22.bones(decoded).norm(dim=-1), torch.tensor(lengths).expand(7, -1), 1e-5)
+    root = growing[:-1, 0] - growing[:1, 0]
+    scale = (lengths[5] + lengths[8]) / SMPL22.bones(growing[:1])[0, [5, 8]].norm(dim=-1).sum()
+    moved = decoded[:, 0] - decoded[:1, 0]
+    close(moved.norm(dim=-1), scale * root.norm(dim=-1), 1e-4)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +26,7 @@ from torch import Tensor
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.batch import Condition, length_mask
+from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.checkpoints import onnx_export as onnx
 from flame_mdm.checkpoints import runner
 from flame_mdm.conditions import vocabulary
@@ -592,6 +593,77 @@ def test_the_runner_continues_frames_as_the_package_does(
             assert np.abs(joints - motion.joints).max() < 1e-3
     with pytest.raises(ValueError, match=r"give 0\.1 to 600 seconds"):
         sampler.generate(TEXT, 601)
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(20.0, 10), (25.0, 12), (30.0, 15), (59.94, 30)])
+def test_a_description_has_the_start_the_fade_and_the_root_of_a_model_that_continues_frames(
+    monkeypatch: pytest.MonkeyPatch, continuing: MotionGenerator, fps: float, frames: int
+) -> None:
+    representation = continuing.representation
+    mean = torch.arange(263.0) / 100
+    monkeypatch.setattr(representation, "fps", fps)
+    monkeypatch.setitem(representation._buffers, "mean", mean)
+    content = onnx.description(continuing)
+    still = torch.from_numpy(standing(representation, 10).features)
+    assert len(content["start"]) == 10
+    np.testing.assert_allclose(content["start"], (still - mean) / 0.05, rtol=1e-5, atol=1e-5)
+    # The pose consists of the height of the root, the positions and the rotations
+    assert content["fade"] == {"frames": frames, "begin": 3, "end": 4 + 9 * 21}
+    np.testing.assert_allclose(content["root"], [[0, 0.05], [0.01, 0.05], [0.02, 0.05]], atol=1e-7)
+    assert (content["fps"], content["max_frames"], content["padded_frames"]) == (fps, 40, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "padded"),
+    [
+        ("mdm_encoder_small", {}, 0),
+        ("mdm_encoder_small", {"mask_padding": False}, 20),
+        ("mdm_gru", {}, 20),
+        ("mdm_unet_small", {}, 20),
+    ],
+)
+def test_models_that_need_all_frames_are_padded_and_actions_keep_their_order(
+    name: str, options: dict[str, Any], padded: int
+) -> None:
+    model = tiny(name, "action")
+    for option, value in options.items():
+        setattr(model.denoiser, option, value)
+    model.process = GaussianDiffusion(50, clip_x0=padded == 0)
+    content = onnx.description(model)
+    assert content["padded_frames"] == padded
+    assert content["actions"] == ["walk", "run", "sit"]
+    assert content["clip_x0"] == (padded == 0)
+    assert not {"start", "fade", "root", "buckets", "max_words"} & set(content)
+    words = onnx.description(tiny("mdm_encoder_small", "learned"))
+    assert (words["buckets"], words["max_words"], words["reads"]) == (50, 8, "text")
+
+
+@pytest.mark.parametrize("condition", ["learned", "action", "none"])
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_a_call_is_the_denoiser_with_the_default_guidance_and_without_a_learned_variance(
+    condition: str, scale: float
+) -> None:
+    model = tiny("mdm_encoder_small", condition)
+    width = model.representation.features
+    model.sampler_options = replace(model.sampler_options, guidance_scale=scale)
+    inputs = inputs_of(model, condition, 3, 9, 4)
+    mask = length_mask(inputs["lengths"], 9)
+    x_t, t = inputs["x_t"], inputs["t"]
+    with torch.no_grad():
+        actual = onnx.Call(model)(*inputs.values())
+        if condition == "learned":
+            encoder = cast(LearnedTokens, model.condition)
+            cond = encoder.encode(inputs["condition"], inputs["counts"])
+        else:
+            batch = MotionBatch(x_t, mask, ["a", "b", "c"], action=inputs.get("condition"))
+            cond = model.condition(batch)
+        expected = model.denoiser(x_t, t, mask, cond)
+        if condition != "none":
+            null = model.denoiser(x_t, t, mask, cond.drop(torch.ones(3) > 0))
+            assert (expected - null).abs().max() > 1e-4
+            expected = null + scale * (expected - null)
+        torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-5)
+        assert actual.shape == (3, 9, width)
 
 
 def test_a_model_beyond_the_limits_of_the_runner_is_not_exported() -> None:

@@ -806,7 +806,7 @@ def test_the_first_of_several_bad_frames_is_named(representation: Representation
         shape = (75,)
     motion = torch.zeros(9, *shape)
     motion[7], motion[4].flatten()[-1], motion[5] = math.nan, -math.inf, math.inf
-    with pytest.raises(UserError, match="^motion: frame 4 contains NaN or infinite values"):
+    with pytest.raises(UserError, match=r"^motion: frame 4 contains NaN or infinite values"):
         representation.encode(motion)
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -465,3 +466,37 @@ def test_dropout_inside_of_layers_has_its_rate_and_its_place() -> None:
     motion = torch.randn(2, 8, 5)
     expected = block.skip(motion) + block.conv2.get_parameter("bias")[:, None]
     torch.testing.assert_close(block(motion, torch.randn(2, 4), torch.ones(2, 1, 5)), expected)
+
+
+@pytest.mark.parametrize(
+    ("kind", "defaults"),
+    [
+        (
+            FLAME,
+            {
+                **{"length_token": True, "cross_attention": True, "condition_frames": False},
+                "length_unit": 1,
+            },
+        ),
+        (MDMGRU, {"project_condition": True, "recur_over_batch": False}),
+        (
+            MDMEncoder,
+            {
+                **{"project_condition": True, "max_tokens": 0, "mask_padding": True},
+                "condition_frames": False,
+            },
+        ),
+        (
+            MDMDecoder,
+            {
+                **{"project_condition": True, "input_token": "none", "token_memory": False},
+                **{"memory": "add", "mask_padding": True, "context_frames": 0},
+                **{"target_encoder": "none", "target_layers": 1, "condition_frames": False},
+            },
+        ),
+        (MDMUNet, {"project_condition": True}),
+    ],
+)
+def test_defaults_of_denoisers_do_not_change(kind: Any, defaults: dict[str, Any]) -> None:
+    parameters = signature(kind).parameters.values()
+    assert {p.name: p.default for p in parameters if p.default is not p.empty} == defaults

@@ -2,7 +2,9 @@
 
 import math
 from functools import partial
+from inspect import signature
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,10 +24,10 @@ from support.analytic import (
 from support.fixtures import ROOT, golden, golden_case, golden_cases, meta
 from torch import Tensor
 
-from flame_mdm.batch import Condition, length_mask
+from flame_mdm.batch import Condition, Edit, length_mask
 from flame_mdm.config import check
 from flame_mdm.errors import UserError
-from flame_mdm.losses import masked_mean, masked_mse
+from flame_mdm.losses import MotionLosses, masked_mean, masked_mse
 from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
@@ -462,3 +464,72 @@ def test_each_step_toward_a_near_position_halves_the_distance_of_each_motion():
     expected = torch.zeros(2, 7, 6)
     expected[:, 3, 5] = torch.tensor([0.1 - 0.1 / 4, 0.1 - 0.04 / 4])
     torch.testing.assert_close(steered, expected)
+
+
+@pytest.mark.parametrize("null_count", [1, 3])
+def test_a_null_condition_without_a_mask_replaces_tokens_but_not_the_mask_of_a_sample(null_count):
+    tokens, nothing = torch.rand(2, 3, 2) + 1, torch.zeros(1, null_count, 2)
+    mask = torch.tensor([[True, True, False], [True, False, False]])
+    cond = Condition(tokens[:, 0], tokens, mask, Condition(nothing[:, 0], nothing, None))
+    dropped = cond.drop(torch.tensor([True, False]))
+    assert torch.equal(dropped.tokens, torch.stack([torch.zeros(3, 2), tokens[1]]))
+    assert dropped.token_mask is not None
+    assert torch.equal(dropped.token_mask, mask)
+    assert torch.equal(dropped.pooled, torch.stack([torch.zeros(2), tokens[1, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("strength", "total", "steps"),
+    [(None, 7, 7), (1.0, 7, 7), (0.01, 10, 1), (1e-9, 1000, 1), (0.58, 50, 29), (0.35, 20, 7)],
+)
+def test_a_variation_takes_its_share_of_the_steps_but_at_least_one(strength, total, steps):
+    known = torch.zeros(1, 4, 2)
+    assert Edit(known, known > 0, strength=strength).steps(total) == steps
+
+
+def test_kept_features_are_imposed_after_the_guide_has_changed_the_estimate():
+    known, keep = torch.full((1, 4, 2), 5.0), torch.zeros(1, 4, 2, dtype=torch.bool)
+    keep[:, 1, 0] = True
+    guide: Any = SimpleNamespace(reach=lambda x0_hat: x0_hat + 1)
+    imposed = Edit(known, keep, guide=guide).impose(torch.zeros(1, 4, 2))
+    assert torch.equal(imposed, torch.where(keep, 5.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "defaults"),
+    [
+        (
+            GaussianDiffusion,
+            {
+                **{"num_train_timesteps": 1000, "schedule": "cosine", "prediction": "x0"},
+                **{"variance": "fixed_small", "vlb_weight": 0.001, "average_padding": False},
+                **{"clip_x0": False, "timestep_sampling": "uniform", "skip": False},
+                **{"min_snr": None, "noise_scale": 1.0},
+            },
+        ),
+        (
+            FlowMatching,
+            {
+                **{"sigma_min": 1e-4, "prediction": "velocity", "time_distribution": "uniform"},
+                **{"quantize_time": False, "odeint_grid": False},
+            },
+        ),
+        (
+            Edit,
+            {
+                **{"mode": "x0", "until": 0.2, "blend": "after", "resample": 1, "strength": None},
+                "guide": None,
+            },
+        ),
+        (
+            MotionLosses,
+            {
+                **{"edges": (), "joints": 0.0, "velocity": 0.0, "foot_contact": 0.0},
+                **{"bone_length": 0.0, "root_relative": False, "velocity_features": None},
+            },
+        ),
+    ],
+)
+def test_defaults_of_processes_edits_and_losses_do_not_change(kind, defaults):
+    parameters = signature(kind).parameters.values()
+    assert {p.name: p.default for p in parameters if p.default is not p.empty} == defaults

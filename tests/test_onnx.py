@@ -639,7 +639,7 @@ def test_models_that_need_all_frames_are_padded_and_actions_keep_their_order(
 
 
 @pytest.mark.parametrize("condition", ["learned", "action", "none"])
-@pytest.mark.parametrize("scale", [1.0, 2.5])
+@pytest.mark.parametrize("scale", [0.0, 1.0, 2.5])
 def test_a_call_is_the_denoiser_with_the_default_guidance_and_without_a_learned_variance(
     condition: str, scale: float
 ) -> None:

@@ -25,7 +25,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
-from flame_mdm.checkpoints.locating import find
+from flame_mdm.checkpoints.locating import SHIPPED, find
 from flame_mdm.checkpoints.released import (
     Released,
     _flame_recipe,
@@ -36,6 +36,7 @@ from flame_mdm.checkpoints.released import (
 from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
 from flame_mdm.commands.edit import EditSettings
 from flame_mdm.commands.sample import SampleSettings
+from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.mdm import MDMEncoder
 from flame_mdm.errors import UserError
@@ -873,6 +874,17 @@ def test_options_at_the_top_of_a_file_override_those_of_training_and_of_the_netw
     assert read_options(path, {"num_heads": 8}).num_heads == 8
 
 
+@pytest.mark.parametrize("count", [12, 13])
+@pytest.mark.parametrize("dataset", ["humanact12", "uestc"])
+def test_actions_of_released_models_have_names_if_they_are_those_of_their_data_set(count, dataset):
+    network = Released(MDMEncoder, (150, 150, 8), {}, {}, torch.zeros(count, 8))
+    config, facts = _mdm_recipe("mdm", network, Options(dataset=dataset))
+    numbered = [f"action {number}" for number in range(count)]
+    is_named = (count, dataset) == (12, "humanact12")
+    assert facts["actions"] == (list(HumanAct12.actions) if is_named else numbered)
+    assert config["condition"]["features"] == 8
+
+
 def test_a_loaded_model_has_the_hash_of_its_file_and_a_built_one_the_facts_about_its_data():
     model = load("quickstart")
     assert model.sha256 == sha256(find("quickstart"))
@@ -976,6 +988,31 @@ def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
     subprocess.run(
         [sys.executable, "-c", f"{program}; assert not {slow} & {{*sys.modules}}"], check=True
     )
+
+
+def test_an_existing_path_takes_precedence_over_the_models_of_the_package_and_of_the_hub(
+    tmp_path, monkeypatch
+):
+    downloads: list[tuple[Any, ...]] = []
+
+    def hf_hub_download(name: str, file: str, revision: str | None) -> str:
+        downloads.append((name, file, revision))
+        return "downloaded"
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", hf_hub_download)
+    monkeypatch.chdir(tmp_path)
+    assert find("quickstart") == SHIPPED["quickstart"]
+    assert find("me/walker@v1.2/b") == find("me/walker") == Path("downloaded")
+    file = "model.safetensors"
+    assert downloads == [("me/walker", file, "v1.2/b"), ("me/walker", file, None)]
+    for name in ("quickstart", "me/walker"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "mine.safetensors").touch()
+        assert find(name) == Path(name, "mine.safetensors")
+    with pytest.raises(
+        FileNotFoundError, match=r"me/walkr: no such checkpoint\. Did you mean walker"
+    ):
+        find("me/walkr")
 
 
 def test_a_folder_of_runs_names_the_runs_below_it(tmp_path):

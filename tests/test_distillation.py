@@ -682,6 +682,26 @@ def test_files_contain_the_changes_of_later_layers_and_for_actions_of_all(tmp_pa
     } == kept
 
 
+@pytest.mark.parametrize("rank", [2, 32])
+def test_a_new_adapter_changes_nothing_and_its_first_gradients_do_not_depend_on_the_width(rank):
+    """`up` is zero, and the variance of `down` is that of a usual linear layer, whatever the rank."""
+    model, about = build("denoiser.ff_size=400"), ABOUT | {"rank": rank, "rows": [3, 5]}
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    torch.manual_seed(0)
+    attach(model, about)
+    for name, module in model.named_modules():
+        if f"{name}.weight" in before and hasattr(module, "parametrizations"):
+            assert torch.equal(module.weight, before[f"{name}.weight"])  # type: ignore[arg-type]
+    parts = dict(model.named_parameters())
+    downs = {name: value for name, value in parts.items() if name.endswith(".down")}
+    assert {value.shape[0] for value in downs.values()} == {rank}
+    assert {value.shape[1] for value in downs.values()} >= {400}
+    scaled = [(down.detach() * down.shape[1] ** 0.5).flatten() for down in downs.values()]
+    assert float(torch.cat(scaled).std()) == pytest.approx(1, rel=0.1)
+    (vectors,) = (value for name, value in parts.items() if name.endswith(".vectors"))
+    assert (len(vectors), vectors.count_nonzero()) == (2, 0)
+
+
 def test_new_words_get_rows_that_no_known_word_has():
     encoder = LearnedTokens(16, buckets=50, heads=2)
     (row,) = word_rows(encoder, ["limp"], [])

@@ -152,10 +152,11 @@ def test_the_moving_average_of_mdm_starts_from_the_initial_weights_as_in_its_cod
         torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], expected)
 
 
-def test_a_resumed_average_keeps_the_initial_weights_before_its_first_update():
+@pytest.mark.parametrize("start", [0, 8])
+def test_a_resumed_average_keeps_the_initial_weights_before_its_first_update(start):
     model = Tiny()
     initial = model.layer.weight.detach().clone()
-    average = MovingAverage(0.5, update_every_n_steps=4, from_initial_weights=True)
+    average = MovingAverage(0.5, 4, update_starting_at_step=start, from_initial_weights=True)
     list(train_with([average], model, 2))
     trainer: Any = SimpleNamespace(global_step=2)
     average.on_train_start(trainer, model)

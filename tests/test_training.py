@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,8 +16,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from PIL import Image
+from support.fixtures import recipe
 from support.runs import TINY, ended, forked
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchmetrics import MeanMetric, Metric
@@ -27,7 +29,8 @@ from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.locating import SHIPPED
 from flame_mdm.checkpoints.model_files import read_checkpoint, read_model_file
-from flame_mdm.config import compose, instantiate
+from flame_mdm.conditions.action import ActionLabels
+from flame_mdm.config import compose, flatten, instantiate
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import _length_unit
@@ -43,7 +46,14 @@ from flame_mdm.training import callbacks, provenance, start
 from flame_mdm.training import fit as fit_module
 from flame_mdm.training.callbacks import Checkpoints, Interrupted, Measurements, SampleMotions
 from flame_mdm.training.guards import BadLoss
-from flame_mdm.training.loggers import History, log_table
+from flame_mdm.training.loggers import (
+    History,
+    TensorBoardRun,
+    WandbRun,
+    log_config,
+    log_table,
+    log_video,
+)
 
 STEPS = [
     "trainer.val_check_interval=4",
@@ -471,6 +481,13 @@ def test_samples_are_written_at_the_first_chance_after_their_number_of_steps(tmp
     for step in (149, 169, 170, 171, 219, 230, 231, 269, 270):
         samples.on_train_batch_end(running(step), task)
     assert written == [170, 230, 270]
+    # With validation clips, samples are written when the model is validated.
+    validated = running(350)
+    validated.datamodule.val = range(3)
+    samples.on_train_batch_end(validated, task)
+    assert written == [170, 230, 270]
+    samples.on_validation_epoch_start(validated, task)
+    assert written == [170, 230, 270, 350]
 
 
 @pytest.mark.parametrize(("count", "stride"), [(130, 3), (64, 1), (65, 2)])
@@ -897,6 +914,167 @@ def test_an_extractor_is_suggested_only_for_the_representation_of_its_training()
     assert callbacks._extractor_in_package(other, facts) == ""
 
 
+RESUMABLE = {
+    "data_root",
+    "data.root",
+    "data.num_workers",
+    "data.source.path",
+    "trainer.max_steps",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.accelerator",
+    "trainer.strategy",
+    "trainer.log_every_n_steps",
+    "trainer.val_check_interval",
+}
+"""Keys of the recipes, except for callbacks and loggers, that may differ when a run is resumed."""
+
+
+@pytest.mark.parametrize("name", ["bandai/mfm_medium_distilled", "humanml3d/flame", "package"])
+def test_every_key_that_decides_the_training_must_be_the_same_when_a_run_resumes(
+    tmp_path, monkeypatch, name
+):
+    saved = recipe(name)
+    monkeypatch.setattr(start, "read_saved", lambda _: saved)
+    accepted = set()
+    for key in flatten(saved):
+        with suppress(UserError):
+            start._check_same(tmp_path, with_value(saved, key, "other"))
+            accepted.add(key)
+    expected = RESUMABLE & flatten(saved).keys()
+    assert {key for key in accepted if not key.startswith(("callbacks.", "logger."))} == expected
+    assert {key for key in flatten(saved) if key.startswith("callbacks.")} <= accepted
+
+
+def test_a_run_resumes_with_another_data_root_which_is_no_change_of_the_recipe(
+    tmp_path, monkeypatch
+):
+    """AMASS lies in the data root too, but in the folder of another user it is another one."""
+    saved, other = recipe("humanml3d/flame"), compose("humanml3d/flame", ["data_root=/data/sets"])
+    assert other["data"]["source"]["amass"] == "/data/sets/raw/amass"
+    monkeypatch.setattr(start, "read_saved", lambda _: saved)
+    start._check_same(tmp_path, other)
+    assert start.recipe_changes(other) == []
+    foreign = with_value(other, "data.source.amass", "/data/others/raw/amass")
+    with pytest.raises(UserError, match=r"data\.source\.amass \(.*/raw/amass there, /data/others"):
+        start._check_same(tmp_path, foreign)
+    assert start.recipe_changes(foreign) == ["data.source.amass=/data/others/raw/amass"]
+
+
+def gathered(monkeypatch: Any, *others: Any) -> None:
+    """Makes this process the second of two or more; the first one and the last ones hold `others`."""
+
+    def all_gather(parts: list[Any], own: Any) -> None:
+        parts[:] = [others[0], own, *others[1:]]
+
+    monkeypatch.setattr(torch.distributed, "all_gather", all_gather)
+    monkeypatch.setattr(torch.distributed, "all_gather_object", all_gather)
+
+
+def test_a_bad_loss_of_any_process_stops_all_of_them_at_its_step(tmp_path, monkeypatch):
+    guard, task = BadLoss(str(tmp_path), factor=10.0), Stub()
+    trainer = running(0, global_rank=1, is_global_zero=False)
+    trainer.log_every_n_steps = 4
+    batch = MotionBatch(torch.zeros(1, 2, 1), torch.ones(1, 2) > 0, ["clip"])
+
+    def end(*losses: float) -> None:
+        for loss in losses:
+            trainer.global_step += 1
+            output = {"loss": torch.tensor(loss)}
+            guard.on_train_batch_end(trainer, task, output, batch, trainer.global_step - 1)
+
+    gathered(monkeypatch, torch.full((4,), 7.0), torch.full((4,), 8.0))
+    end(1.0, 1.0, 1.0, 1.0)
+    assert guard.usual == 7.0, "the median over all processes"
+    first, last = torch.tensor([7.0, 7.0, 7.0, 99.0]), torch.tensor([7.0, 71.0, 7.0, 7.0])
+    gathered(monkeypatch, first, last)
+    with pytest.raises(UserError, match=r"the loss at step 6 is 71 \(typical: 7\)"):
+        end(1.0, 2.0, 3.0, 4.0)
+
+
+def test_a_checkpoint_is_not_written_after_a_bad_loss_between_two_log_steps(tmp_path):
+    guard, task = BadLoss(str(tmp_path)), Stub()
+    trainer = running(1, global_rank=0, is_global_zero=True)
+    trainer.world_size = 1
+    batch = MotionBatch(torch.zeros(1, 2, 1), torch.ones(1, 2) > 0, ["clip"])
+    guard.on_train_batch_end(trainer, task, {"loss": torch.tensor(1.0)}, batch, 0)
+    guard.on_save_checkpoint(trainer, task, {})
+    guard.on_save_checkpoint(trainer, task, {})
+    guard.on_train_batch_end(trainer, task, torch.tensor(float("inf")), batch, 1)
+    with pytest.raises(UserError, match=r"is inf \(typical: 1\)"):
+        guard.on_save_checkpoint(trainer, task, {})
+
+
+@pytest.mark.parametrize(("own", "other"), [(signal.SIGTERM, 0), (0, signal.SIGTERM)])
+def test_processes_stop_together_one_step_after_one_of_them_received_a_signal(
+    tmp_path, monkeypatch, own, other
+):
+    received = {3: other}
+
+    def all_reduce(values: torch.Tensor, operation: Any) -> None:
+        assert operation == torch.distributed.ReduceOp.MAX
+        values.clamp_(min=received.get(trainer.global_step, 0))
+
+    monkeypatch.setattr(torch.distributed, "all_reduce", all_reduce)
+    written: list[int] = []
+    checkpoints, task = Checkpoints(str(tmp_path), 100), Stub()
+    monkeypatch.setattr(checkpoints.stop, "install", lambda: None)
+    trainer = running(0, should_stop=False, max_steps=50)
+    trainer.save_checkpoint = lambda _: written.append(trainer.global_step)
+    checkpoints.on_train_start(trainer, task)
+    for trainer.global_step in (1, 2, 3):
+        checkpoints.stop.signum = own if trainer.global_step == 3 else 0
+        checkpoints.on_train_batch_end(trainer, task)
+    trainer.global_step = 4
+    with pytest.raises(Interrupted) as stop:
+        checkpoints.on_train_batch_end(trainer, task)
+    assert (stop.value.signum, stop.value.step, written) == (signal.SIGTERM, 4, [4])
+
+
+def test_samples_of_all_processes_are_measured_in_the_order_of_the_prompts(tmp_path, monkeypatch):
+    """Three processes sample five prompts: 0 and 3, 1 and 4, and 2."""
+    motions = [Motion(np.full((4, 22, 3), float(number)), 20.0) for number in range(5)]
+    gathered(monkeypatch, motions[0::3], motions[2::3])
+    prompts = [(f"text {number}", {"speed": number}) for number in range(5)]
+    samples = SampleMotions(str(tmp_path), 1, prompts, 1.0)
+    measured: list[Any] = []
+    written: list[Any] = []
+    logged: list[Any] = []
+    monkeypatch.setattr(samples, "_sample", lambda _, rank, world: motions[rank::world])
+    monkeypatch.setattr(samples, "measure", lambda *pair: measured.append(pair) or {"skating": 0.5})
+    monkeypatch.setattr(callbacks, "write_motions", lambda *values: written.append(values))
+    monkeypatch.setattr(callbacks, "log_video", lambda *values: logged.append(values))
+    logger = SimpleNamespace(log_metrics=lambda *values: logged.append(values))
+    trainer = running(40, global_rank=1, is_global_zero=True)
+    trainer.loggers = [logger]
+    samples.write(trainer, Stub(generator=None))
+    ((joints, requested),) = measured
+    assert [float(motion[0, 0, 0]) for motion in joints] == [0, 1, 2, 3, 4]
+    assert requested == [{"speed": number} for number in range(5)]
+    ((folder, shown, facts),) = written
+    assert (folder, shown) == (tmp_path / "step_0000040", motions)
+    assert (facts["seed"], facts["step"]) == (0, 40)
+    # Lightning counts steps from 0.
+    video = (logger, "samples", folder / "motions.gif", 39)
+    assert logged == [video, ({"samples/skating": 0.5}, 39)]
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [(["x", "y"], ["walk", "sit"]), (["x"] * 4, ["walk", "sit", "jump"]), (["x", "sit"], None)],
+)
+def test_a_model_of_actions_is_sampled_with_its_first_actions_instead_of_texts(
+    tmp_path, texts, expected
+):
+    samples = SampleMotions(str(tmp_path), 1, texts, 1.0)
+    task = Stub(generator=SimpleNamespace(condition=ActionLabels(3, 8)))
+    task.facts = {"actions": ["walk", "sit", "jump"]}
+    samples.on_train_start(running(0), task)
+    assert samples.texts == (expected or texts)
+    if expected:
+        assert [requested["action"] for _, requested in samples.prompts] == expected
+
+
 def test_a_table_is_logged_as_lines_of_markdown_with_its_step():
     texts: list[tuple[Any, ...]] = []
 
@@ -910,6 +1088,174 @@ def test_a_table_is_logged_as_lines_of_markdown_with_its_step():
     log_table(Board(), "evaluation/own", ["metric", "mean"], [["fid", 0.5], ["kid", None]], 7)
     table = "| metric | mean |\n| --- | --- |\n| fid | 0.5 |\n| kid | None |"
     assert texts == [("evaluation/own", table, 7)]
+
+
+@pytest.mark.parametrize(
+    ("higher_is_better", "text"),
+    [(True, " Higher is better."), (False, " Lower is better."), (None, "")],
+)
+def test_metrics_say_which_values_are_better_unless_neither_is(higher_is_better, text):
+    class Share(MeanMetric):
+        """Share of frames."""
+
+    Share.higher_is_better = higher_is_better
+    lines = callbacks.explain_metrics({"share": 0.0}, {"share": 0.0}, {"share": Share()})
+    assert lines == [f"share: Share of frames.{text}", "  share: 0 (real motions: 0)"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "facts", "words"),
+    [
+        ("text", {"captions": ["a person limps"]}, "'text=a person limps'"),
+        ("text", {}, "'text=a person walks'"),
+        ("action", {"actions": ["sit down", "walk"]}, "'action=sit down'"),
+        ("none", {}, "unconditioned=true"),
+    ],
+)
+def test_the_next_command_suits_the_condition_of_the_model(
+    tmp_path, monkeypatch, capsys, kind, facts, words
+):
+    monkeypatch.setattr(callbacks, "write_report", lambda folder: folder / "report.html")
+    task = Stub(generator=SimpleNamespace(conditioned_on=kind), config={})
+    task.facts = {"actions": [], "dataset": "mine"} | facts
+    trainer = running(12, is_global_zero=True)
+    trainer.callback_metrics = {"val/loss": torch.tensor(0.0), "train/loss": torch.tensor(2 / 3)}
+    callbacks.Report(tmp_path).on_fit_end(trainer, task)
+    loss, report, sampling, evaluation = capsys.readouterr().out.splitlines()
+    texts = "0.6667 on the last batch, 0 on the validation clips"
+    assert loss.startswith(f"loss after 12 steps: {texts} (lower is better")
+    assert report == f"report: {tmp_path / 'report.html'}"
+    assert sampling == f"next: flame-mdm sample {tmp_path} {words}"
+    assert evaluation.split() == [
+        "flame-mdm",
+        "evaluate",
+        str(tmp_path),
+        "extractor=none",
+        "quick=true",
+    ]
+
+
+@pytest.mark.parametrize(("threads", "text"), [(1, "1 thread"), (8, "8 threads")])
+def test_the_device_counts_processes_and_threads(monkeypatch, threads, text):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"cpu_name": "EPYC"})
+    assert provenance.device_name(running(0)) == f"3 x EPYC, {text}"
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"H200 {device.index}")
+    gpus = running(0)
+    gpus.strategy.root_device = torch.device("cuda", 1)
+    assert provenance.device_name(gpus) == "3 x H200 1"
+
+
+def test_the_bar_of_a_resumed_run_begins_at_its_step_and_advances_by_optimizer_steps():
+    progress, task = callbacks.Progress(), Stub()
+    trainer = running(20, is_global_zero=True, max_steps=30)
+    progress.on_train_start(trainer, task)
+    bar = progress.bar
+    assert bar is not None
+    assert (bar.n, bar.total) == (20, 30)
+    trainer.callback_metrics = {"train/loss": torch.tensor(0.0), "val/loss": torch.tensor(1 / 3)}
+    for trainer.global_step, postfix in ((20, ""), (24, ""), (25, "train/loss=0, val/loss=0.3333")):
+        progress.on_train_batch_end(trainer, task)
+        assert (bar.n, bar.postfix or "") == (trainer.global_step, postfix)
+    progress.on_train_end()
+    endless = callbacks.Progress()
+    endless.on_train_start(running(0, is_global_zero=False, max_steps=-1), task)
+    assert endless.bar is not None
+    assert (endless.bar.total, endless.bar.disable) == (None, True)
+
+
+def test_a_gif_is_logged_with_its_size_and_step(tmp_path):
+    Image.new("P", (30, 20)).save(tmp_path / "motions.gif")
+    logged: list[tuple[Any, int]] = []
+
+    class Board(TensorBoardLogger):
+        def __init__(self) -> None: ...
+
+        @property
+        def experiment(self) -> Any:
+            writer = SimpleNamespace(add_summary=lambda *values: logged.append(values))
+            return SimpleNamespace(_get_file_writer=lambda: writer)
+
+    log_video(Board(), "samples", tmp_path / "motions.gif", 7)
+    ((summary, step),) = logged
+    (value,) = summary.value
+    assert (value.tag, value.image.width, value.image.height, step) == ("samples", 30, 20, 7)
+    assert value.image.encoded_image_string == (tmp_path / "motions.gif").read_bytes()
+
+
+class WandbStub(WandbRun):
+    """A logger whose Weights & Biases run counts and stores its rows."""
+
+    def __init__(self, folder: Path):
+        self.stored: list[tuple[dict[str, Any], int | None]] = []
+        self.finished: list[int] = []
+        super().__init__(str(folder))
+        self._experiment = SimpleNamespace(  # type: ignore[assignment]
+            id="f00",
+            step=0,
+            log=self._log,
+            finish=lambda exit_code: self.finished.append(exit_code),
+        )
+
+    @property
+    def experiment(self) -> Any:
+        return self._experiment
+
+    def _log(self, row: dict[str, Any], step: int | None = None) -> None:
+        self.stored.append((row, step))
+        self.experiment.step = (self.experiment.step if step is None else step) + bool(row)
+
+
+def test_a_resumed_wandb_run_continues_its_rows_and_repeats_no_step(tmp_path):
+    def steps(logger: WandbStub) -> list[int]:
+        return [row["trainer/global_step"] for row, _ in logger.stored if row]
+
+    first = WandbStub(tmp_path)
+    for step in (0, 1, 2):
+        first.log_metrics({"loss": 0.5}, step)
+    assert steps(first) == [0, 1, 2]
+    assert json.loads((tmp_path / "wandb.json").read_text()) == {"id": "f00", "step": 2, "rows": 3}
+    second = WandbStub(tmp_path)
+    assert second._wandb_init["id"] == "f00"
+    for step in (0, 1, 2, 3):
+        second.log_metrics({"loss": 0.5}, step)
+    # The values of a step may be logged in several rows, so the last step may continue.
+    assert steps(second) == [2, 3]
+    assert second.stored[0] == ({}, 3), "the first row after the three of the first part"
+    assert json.loads((tmp_path / "wandb.json").read_text())["rows"] == 5
+
+
+@pytest.mark.parametrize(("status", "code"), [("success", 0), ("failed", 1)])
+def test_a_wandb_run_ends_with_the_exit_code_of_the_training(tmp_path, monkeypatch, status, code):
+    monkeypatch.setattr(WandbLogger, "finalize", lambda *_: None)
+    logger = WandbStub(tmp_path)
+    logger.finalize(status)
+    assert (logger.finished, logger._experiment) == ([code], None)
+
+
+def test_wandb_gets_tables_with_their_step_and_the_recipe_with_the_provenance(
+    tmp_path, monkeypatch
+):
+    tables: list[dict[str, Any]] = []
+    parameters: list[dict[str, Any]] = []
+    monkeypatch.setattr(
+        WandbLogger, "log_table", lambda _, name, **table: tables.append({"name": name, **table})
+    )
+    monkeypatch.setattr(WandbLogger, "log_hyperparams", lambda _, values: parameters.append(values))
+    logger = WandbStub(tmp_path)
+    log_table(logger, "evaluation/own", ["metric", "mean"], [("fid", 0.5)], 7)
+    log_config(logger, {"seed": 3}, {"commit": "f00"})
+    columns, data = ["metric", "mean"], [["fid", 0.5]]
+    assert tables == [{"name": "evaluation/own", "columns": columns, "data": data, "step": 7}]
+    assert parameters == [{"seed": 3, "provenance": {"commit": "f00"}}]
+
+
+def test_tensorboard_gets_all_values_but_the_epoch(monkeypatch):
+    logged: list[Any] = []
+    monkeypatch.setattr(TensorBoardLogger, "log_metrics", lambda _, *values: logged.append(values))
+    board = object.__new__(TensorBoardRun)
+    board.log_metrics({"epoch": 0, "train/loss": 0.0, "train/epochs": 1.5}, 4)
+    assert logged == [({"train/loss": 0.0, "train/epochs": 1.5}, 4)]
 
 
 @pytest.mark.parametrize(

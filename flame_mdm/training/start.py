@@ -2,8 +2,9 @@
 
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
-from flame_mdm.config import Config, compose, flatten, movable, read_saved, recipes
+from flame_mdm.config import Config, compose, flatten, movable, moved, read_saved, recipes
 from flame_mdm.errors import UserError, shortened
 
 FREE = (
@@ -59,10 +60,10 @@ def recipe_changes(config: Config) -> list[str]:
     name = config.get("experiment")
     if name not in recipes():
         return []
-    recipe = flatten(movable(compose(name)))
+    recipe = _flat(movable(compose(name)))
     model = {
         key: value
-        for key, value in flatten(config).items()
+        for key, value in _flat(config).items()
         if not key.startswith((*FREE, "run", "seed"))
     }
     changed = {key: value for key, value in model.items() if value != recipe.get(key)}
@@ -75,15 +76,24 @@ def recipe_changes(config: Config) -> list[str]:
 
 
 def _check_same(folder: Path, config: Config) -> None:
-    saved = flatten(movable(read_saved(folder / "config.yaml")))
-    requested = flatten(movable(config))
+    there, here = movable(read_saved(folder / "config.yaml")), movable(config)
+    saved, requested = flatten(there), flatten(here)
+    saved_below, requested_below = _flat(there), _flat(here)
     differing = [
         f"{key} ({saved.get(key, 'absent')} there, {requested.get(key, 'absent')} here)"
         for key in sorted(saved.keys() | requested.keys())
-        if saved.get(key) != requested.get(key) and not key.startswith(FREE)
+        if saved.get(key) != requested.get(key)
+        and saved_below.get(key) != requested_below.get(key)
+        and not key.startswith(FREE)
     ]
     if differing:
         raise UserError(
             f"{folder} contains a run with a different configuration: {'; '.join(differing)}. Choose another name with "
             "run.name=..., or delete that folder"
         )
+
+
+def _flat(config: Config) -> dict[str, Any]:
+    """Flattens a configuration in which a placeholder stands for the data root in all paths."""
+    root = config.get("data_root")
+    return flatten(moved(config, {str(root): "${data_root}"}) if root else config)

@@ -7,6 +7,7 @@ import multiprocessing
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -334,3 +335,17 @@ def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tmp_pat
         )
     assert f"process {other.pid} on " in capsys.readouterr().out
     assert not (tmp_path / "run.lock").exists()
+
+
+@pytest.mark.parametrize("content", [None, "notes.txt", "config.yaml"])
+def test_a_folder_that_was_there_before_a_failed_start_is_kept(tmp_path, content):
+    """A new folder without a configuration contains only the files of loggers."""
+    folder = tmp_path / "run"
+    if content == "notes.txt":
+        folder.mkdir()
+        (folder / content).touch()
+    with suppress(ZeroDivisionError), only_run(folder):
+        (folder / (content or "metrics.jsonl")).touch()
+        raise ZeroDivisionError
+    assert folder.exists() == bool(content)
+    assert not content or [path.name for path in folder.iterdir()] == [content]

@@ -266,6 +266,7 @@ def parts(config: Config) -> tuple[GeneratorTask, MotionDataModule]:
         ("trainer.max_steps=5000", 32),
         ("trainer.max_steps=4999", 0),
         ("+denoiser.mask_padding=false", 1),
+        ("+data.pad_multiple=48", 48),
     ],
 )
 def test_long_runs_on_cuda_are_compiled_for_few_lengths(words, multiple, monkeypatch, capsys):

@@ -1258,6 +1258,121 @@ def test_tensorboard_gets_all_values_but_the_epoch(monkeypatch):
     assert logged == [({"train/loss": 0.0, "train/epochs": 1.5}, 4)]
 
 
+def fitted(tmp_path: Path, monkeypatch: Any, stop: BaseException | None, **changes: Any) -> Any:
+    """Runs `fit` without data and network; `stop` ends the training. Returns the options of the trainer."""
+    passed: dict[str, Any] = {}
+
+    def fit(*_: Any, **__: Any) -> None:
+        if stop:
+            raise stop
+
+    def build(node: Any, *_: Any, **options: Any) -> Any:
+        if "precision" not in node:
+            return SimpleNamespace(actions=[], node=node, num_workers=0)
+        passed.update(node | options)
+        return SimpleNamespace(
+            fit=fit,
+            is_global_zero=changes.get("is_first", True),
+            strategy=SimpleNamespace(launcher=None),
+        )
+
+    for name in (
+        "skip_empty_hooks",
+        "skip_exchange_of_signals",
+        "check_devices",
+        "seed_everything",
+    ):
+        monkeypatch.setattr(fit_module, name, lambda *_, **__: None)
+    monkeypatch.setattr(fit_module, "instantiate", build)
+    task_class = SimpleNamespace(build=lambda *_, **__: Stub())
+    monkeypatch.setattr(fit_module, "get_class", lambda _: task_class)
+    monkeypatch.setattr(fit_module, "newest", lambda _: changes.get("resumed"))
+    monkeypatch.setattr(fit_module, "_check_same_data", lambda *_: None)
+    monkeypatch.setattr(fit_module, "check_optimizers", lambda *_: None)
+    monkeypatch.setattr(Stub, "make_optimizer", lambda _: None)
+    config = {name: {"_target_": name} for name in ("representation", "data", "task", "logger")}
+    config |= {"seed": 0, "run": {"dir": str(tmp_path)}, "ema": {"decay": 0.5}}
+    config |= {"callbacks": {"first": {"_target_": "x"}, "absent": None, "last": {"_target_": "y"}}}
+    trainer = {"max_steps": 9, "precision": "32-true"} | changes.get("trainer", {})
+    fit_module.fit(tmp_path, config | {"trainer": trainer})
+    return passed
+
+
+def test_averages_come_before_the_callbacks_that_validate_and_the_history_at_the_resumed_step(
+    tmp_path, monkeypatch
+):
+    monkeypatch.delenv("SLURM_NTASKS", raising=False)
+    resumed = SimpleNamespace(step=8, path=tmp_path / "last.ckpt", content={})
+    options = fitted(tmp_path, monkeypatch, None, resumed=resumed)
+    kinds = [type(callback).__name__ for callback in options["callbacks"]]
+    own, after = ["WriteProvenance", "MovingAverage"], ["Measurements", "Progress", "Report"]
+    assert kinds == [*own, "SimpleNamespace", "SimpleNamespace", *after]
+    assert [callback.node["_target_"] for callback in options["callbacks"][2:4]] == ["x", "y"]
+    *_, history = options["logger"]
+    assert (history.step, history.path) == (8, tmp_path / HISTORY)
+    (plugin,) = options["plugins"]
+    assert (plugin.folder, plugin.resumed) == (tmp_path / "checkpoints", resumed)
+    assert (options["precision"], options["enable_progress_bar"]) == ("32-true", False)
+    quiet = fitted(
+        tmp_path, monkeypatch, None, trainer={"enable_progress_bar": False, "profiler": "x"}
+    )
+    assert "Progress" not in [type(callback).__name__ for callback in quiet["callbacks"]]
+    assert quiet["profiler"] == "x"
+    assert fitted(tmp_path, monkeypatch, None, resumed=resumed, trainer={"max_steps": 8}) == {}
+    endless = {"max_steps": -1}
+    assert fitted(tmp_path, monkeypatch, None, resumed=resumed, trainer=endless)["max_steps"] == -1
+
+
+@pytest.mark.parametrize(
+    ("signum", "job", "requeued"),
+    [
+        (signal.SIGUSR1, "12", True),
+        (signal.SIGUSR2, "12", True),
+        (signal.SIGUSR1, None, False),
+        (signal.SIGTERM, "12", False),
+    ],
+)
+def test_a_job_that_slurm_is_about_to_end_is_requeued_by_its_first_process(
+    tmp_path, monkeypatch, capsys, signum, job, requeued
+):
+    commands: list[list[str]] = []
+    run_command = SimpleNamespace(
+        run=lambda words, **_: commands.append(words),
+        CalledProcessError=subprocess.CalledProcessError,
+    )
+    monkeypatch.setattr(fit_module, "subprocess", run_command)
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    if job:
+        monkeypatch.setenv("SLURM_JOB_ID", job)
+    with pytest.raises(SystemExit) as stop:
+        fitted(tmp_path, monkeypatch, Interrupted(signum, 7))
+    assert stop.value.code == 128 + signum
+    assert commands == [["scontrol", "requeue", "12"]] * requeued
+    lines = capsys.readouterr().out.splitlines()
+    requeue = ["job 12 was requeued"] * requeued
+    assert lines == ["stopped at step 7. Run the same command to resume", *requeue]
+    fitted(tmp_path, monkeypatch, Interrupted(signum, 7), is_first=False)
+    assert len(commands) == requeued
+
+
+@pytest.mark.parametrize(("platform", "unit"), [("linux", 2**10), ("darwin", 1)])
+def test_memory_is_in_gibibytes_on_every_system_and_device(monkeypatch, platform, unit):
+    monkeypatch.setattr(callbacks, "sys", SimpleNamespace(platform=platform))
+    usage = SimpleNamespace(ru_maxrss=3 * 2**30 // unit)
+    monkeypatch.setattr(callbacks, "getrusage", lambda _: usage)
+    measurements, task, trainer = Measurements(), Stub(), running(5)
+    measurements.on_save_checkpoint(trainer, task, {})
+    assert task.facts["training"]["memory_gib"] == 3
+    monkeypatch.setattr(Stub, "device", torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda _: 5 * 2**29)
+    monkeypatch.setattr(callbacks, "device_name", lambda _: "1 x H200")
+    measurements.on_save_checkpoint(trainer, task, {})
+    training = task.facts["training"]
+    assert (training["memory_gib"], training["device"]) == (2.5, "1 x H200")
+    measurements.on_train_batch_end(trainer, task)
+    assert float(trainer.logged_metrics["train/gpu_memory_gib"]) == 2.5
+
+
 @pytest.mark.parametrize(
     ("warmup", "decay", "factors"),
     [

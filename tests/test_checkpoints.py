@@ -7,7 +7,9 @@ import re
 import subprocess
 import sys
 import tempfile
+from dataclasses import MISSING, fields
 from functools import cache
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -26,15 +28,20 @@ from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.locating import SHIPPED, find
+from flame_mdm.checkpoints.onnx_export import export_onnx
 from flame_mdm.checkpoints.released import (
     Released,
     _flame_recipe,
     _mdm_recipe,
     import_flame,
     import_mdm,
+    import_released,
 )
 from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
+from flame_mdm.commands.adapt import AdaptSettings
 from flame_mdm.commands.edit import EditSettings
+from flame_mdm.commands.export import ExportSettings
+from flame_mdm.commands.import_released import ImportSettings
 from flame_mdm.commands.sample import SampleSettings
 from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.denoisers.flame import FLAME
@@ -43,6 +50,8 @@ from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import sha256
 from flame_mdm.sampling.generation import generate
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
+from flame_mdm.training.adaptation import adapt
 
 MDM = ["mdm_trans_enc", "mdm_trans_dec", "mdm_trans_dec_emb", "mdm_trans_dec_bert", "mdm_gru"]
 MDM += ["mdm_action_rot6d", "mdm_uncond_rot6d", "mfm"]
@@ -988,6 +997,40 @@ def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
     subprocess.run(
         [sys.executable, "-c", f"{program}; assert not {slow} & {{*sys.modules}}"], check=True
     )
+
+
+@pytest.mark.parametrize(
+    ("settings", "function"),
+    [
+        (AdaptSettings, adapt),
+        (ImportSettings, import_released),
+        (ExportSettings, hub.export),
+        (ExportSettings, export_onnx),
+        (SampleSettings, SamplingRequest),
+        (EditSettings, EditRequest),
+    ],
+)
+def test_options_have_the_same_defaults_on_the_command_line_and_in_python(
+    monkeypatch, settings, function
+):
+    monkeypatch.delenv("FLAME_MDM_DATA", raising=False)
+    parameters = signature(function).parameters
+    defaults = {
+        entry.name: (
+            (entry.default, parameters[entry.name].default)
+            if entry.default_factory is MISSING
+            else (entry.default_factory(), parameters[entry.name].default)
+        )
+        for entry in fields(settings)
+        if entry.name in parameters
+    }
+    chosen = {name: pair for name, pair in defaults.items() if MISSING not in pair}
+    differing = {
+        name for name, (typed, ours) in chosen.items() if ours not in (typed, Parameter.empty)
+    }
+    # On the command line, the number of samples depends on the command.
+    assert differing - {"samples"} == set()
+    assert chosen
 
 
 def test_an_existing_path_takes_precedence_over_the_models_of_the_package_and_of_the_hub(

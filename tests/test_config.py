@@ -31,6 +31,7 @@ from flame_mdm.config import (
     compose_data,
     guarded,
     instantiate,
+    jobs,
     parameters,
     recipes,
     sweeps,
@@ -781,6 +782,56 @@ def test_a_signal_ends_a_sweep_and_a_failed_job_does_not(code, count):
 
     assert run_jobs(end, Example, ["rate=1,2", "-m"]) == code
     assert started == [1, 2][:count]
+
+
+@pytest.mark.parametrize("code", [1, 70, 130])
+def test_a_failed_job_of_a_launcher_ends_with_its_code(tmp_path, monkeypatch, code):
+    """Otherwise, the cluster would list the job as completed."""
+    monkeypatch.chdir(tmp_path)
+    launched: list[Callable[[Any], None]] = []
+    monkeypatch.setattr(jobs, "hydra_sweep", lambda job, *_: launched.append(job))
+
+    def end(job: Example) -> None:
+        raise SystemExit(code if job.rate == 2 else 0)
+
+    assert run_jobs(end, Example, ["rate=1,2", "launch=local"]) == 0
+    (job,) = launched
+    job({"job": 0})
+    with pytest.raises(SystemExit) as stop:
+        job({"job": 1})
+    assert stop.value.code == code
+
+
+@pytest.mark.parametrize(("launcher", "ends"), [(["launch=local"], True), (["--multirun"], False)])
+def test_a_failed_training_ends_its_job_only_if_a_launcher_started_it(
+    tmp_path, monkeypatch, launcher, ends
+):
+    stops: list[Any] = []
+    monkeypatch.setattr(sys, "argv", ["flame-mdm", "train"])
+    monkeypatch.chdir(tmp_path)
+
+    def sweep(job: Callable[[Any], None], *_: Any) -> None:
+        overrides = SimpleNamespace(task=["seed=1", "+launch=local"])
+        runtime = SimpleNamespace(output_dir=str(tmp_path))
+        hydra = SimpleNamespace(overrides=overrides, runtime=runtime)
+        state = SimpleNamespace(get=lambda: hydra, instance=SimpleNamespace)
+        monkeypatch.setattr(sweeps, "HydraConfig", state)
+        try:
+            job(None)
+        except SystemExit as stop:
+            stops.append(stop.code)
+
+    def composed(_: str, words: list[str]) -> Any:
+        assert words == ["seed=1", f"run.dir='{tmp_path}'"]
+        return {"run": {"dir": str(tmp_path)}}
+
+    def train(_: Any) -> None:
+        raise UserError("failed")
+
+    monkeypatch.setattr(sweeps, "hydra_sweep", sweep)
+    monkeypatch.setattr(sweeps.composition, "compose", composed)
+    assert sweeps.run_recipe(train, "usage", ["quickstart", "seed=0,1", *launcher]) == 1
+    assert stops == [1] * ends
 
 
 def test_limits_of_a_configuration_are_allowed(subtests):

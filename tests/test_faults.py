@@ -1,5 +1,6 @@
 """Full disks, signals, kills at random moments, loading processes that die, and two that prepare the same data."""
 
+import io
 import multiprocessing
 import os
 import random
@@ -320,6 +321,22 @@ def test_a_signal_that_a_library_swallows_stops_the_next_step_of_a_progress_bar(
     assert "Traceback" not in capsys.readouterr().err
     assert sys.unraisablehook is before
     assert list(ProgressBar(range(3))) == [0, 1, 2], "the next command is not stopped"
+
+
+def test_progress_in_a_log_file_is_lines_half_a_minute_apart(monkeypatch):
+    file = io.StringIO()
+    clock = [0.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    bar = ProgressBar(total=100, desc="training", file=file)
+    for clock[0] in range(1, 101):
+        bar.update()
+    bar.close()
+    lines = file.getvalue().split("\n")
+    assert [line.split("|")[0].strip() for line in lines[:-1]] == [
+        f"training: {share:3}%" for share in (0, 30, 60, 90, 100)
+    ]
+    assert lines[-1] == ""
+    assert "100/100" in lines[-2]
 
 
 def test_an_ignored_signal_stays_ignored():

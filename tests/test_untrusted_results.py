@@ -28,7 +28,14 @@ from flame_mdm.data import verify
 from flame_mdm.data.crops import Whole
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import (
+    UserError,
+    did_you_mean,
+    first_line,
+    markdown_text,
+    say,
+    shortened,
+)
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.records import Cost
@@ -49,6 +56,7 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
 from flame_mdm.sampling.output import write_motions
+from flame_mdm.schemas import ClosedSchema, Int, check_shape, read_json
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
 pytestmark = pytest.mark.slow
@@ -383,6 +391,87 @@ def test_commands_print_no_control_characters(tmp_path, capsys):
     assert len(out.splitlines()) == 1
     say("one", "two\x1b")
     assert capsys.readouterr().out == "one\ntwo\\x1b\n"
+
+
+class Named(ClosedSchema):
+    format: Int
+    name: str
+
+
+def test_long_texts_are_cut_to_the_most_characters_that_are_allowed():
+    assert [shortened("x" * count, 10) for count in (0, 9, 10)] == ["", "x" * 9, "x" * 10]
+    assert [shortened("x" * count, 10) for count in (11, 99)] == ["x" * 9 + "…"] * 2
+    assert shortened("a\u202eb", 10) == "a\\u202eb"
+
+
+def test_of_a_long_error_the_beginning_and_the_end_are_printed(capsys):
+    text = f"{'a' * 1000}{'b' * 5000}{'c' * 1000}"
+    say(text, error=True)
+    assert capsys.readouterr().err == f"{'a' * 1000} … {'c' * 1000}\n"
+    for whole, is_error in ((text[:2000], True), (text, False)):
+        say(whole, error=is_error)
+        assert "".join(capsys.readouterr()) == f"{whole}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("one\ntwo", "one"),
+        ("\n  one:  \n\n two \nthree", "one: two"),
+        ("one:", "one:"),
+        ("", "ValueError"),
+    ],
+)
+def test_the_first_line_of_an_error_includes_what_follows_a_colon(text, line):
+    assert first_line(ValueError(text)) == line
+
+
+def test_up_to_three_similar_names_are_suggested_the_nearest_first():
+    names = ["walks", "walked", "walk", "walking", "jump"]
+    assert did_you_mean("walk", names) == " Did you mean walk, walks, walked?"
+    assert did_you_mean("jumps", iter(names)) == " Did you mean jump?"
+    assert did_you_mean("zzz", names) == ""
+
+
+def test_markdown_shows_a_text_as_it_is():
+    assert markdown_text("a|b*_`~#[c]\\ <d>&\ne") == (r"a\|b\*\_\`\~\#\[c\]\\ &lt;d&gt;&amp; e")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_whole_numbers_up_to_63_bits_are_read_at_any_depth(tmp_path, sign):
+    path, most = tmp_path / "a.json", sign * (2**63 - 1)
+    path.write_text(json.dumps({"a": [1, {"b": most}]}))
+    assert read_json(path, dict[str, Any]) == {"a": [1, {"b": most}]}
+    path.write_text(json.dumps({"a": [1, {"b": most + sign}]}))
+    refused = rf"a\.json is damaged: {hex(most + sign)} \.\.\. is too large.*the maximum is {2**63 - 1:,}; rm"
+    with pytest.raises(UserError, match=refused):
+        read_json(path, dict[str, Any], "rm")
+
+
+def test_a_file_of_results_may_be_as_large_as_the_limit(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    path.write_text("[1]" + " " * 97)
+    for limit in (100, 99):
+        monkeypatch.setattr("flame_mdm.schemas.LIMIT", limit)
+        if limit == 100:
+            assert read_json(path, list[int]) == [1]
+        else:
+            with pytest.raises(UserError, match="the file is 100 bytes, but at most 99 bytes is"):
+                read_json(path, list[int])
+
+
+def test_a_wrong_value_is_named_with_its_key_and_what_is_expected():
+    for content, message in (
+        ({"format": 1, "name": 3}, "name is 3, not a string"),
+        ({"name": "a"}, "the file has no format"),
+        ({"format": 1.5, "name": "a"}, "format is 1.5, not a whole number"),
+        ({"format": 1, "name": "a", "nmae": 3}, "unknown key: nmae. Did you mean name?"),
+        ({"format": 1, "name": ["x" * 50]}, f'name is ["{"x" * 34} ..., not a string'),
+    ):
+        with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+            check_shape(content, Named)
+    overridden = {"format": 1, "name": "a", "data.crop.max_frames": 60}
+    assert check_shape(overridden, Named).name == "a"
 
 
 def test_all_that_is_printed_is_printable():

@@ -38,6 +38,7 @@ from flame_mdm.checkpoints.released import (
     import_released,
 )
 from flame_mdm.checkpoints.released_options import Options, check_hyperparameters, read_options
+from flame_mdm.checkpoints.released_weights import released_state
 from flame_mdm.commands.adapt import AdaptSettings
 from flame_mdm.commands.edit import EditSettings
 from flame_mdm.commands.export import ExportSettings
@@ -1031,6 +1032,27 @@ def test_options_have_the_same_defaults_on_the_command_line_and_in_python(
     # On the command line, the number of samples depends on the command.
     assert differing - {"samples"} == set()
     assert chosen
+
+
+def test_weights_are_taken_from_every_form_of_a_released_file():
+    def value(number: float) -> torch.Tensor:
+        return torch.full((1,), number)
+
+    flame = {"net.a": value(1), "ema_model.model.a": value(2), "lm.b": value(3)}
+    both = {"model": {"a": value(4)}, "model_avg": {"a": value(5)}}
+    for checkpoint, averaged, last in (
+        ({"state_dict": flame}, 2, 1),
+        (flame, 2, 1),
+        ({"state_dict": {"net.a": value(1)}}, 1, 1),
+        (both, 5, 4),
+        ({"a": value(6)}, 6, 6),
+    ):
+        for is_averaged, expected in ((True, averaged), (False, last)):
+            state = released_state(checkpoint, ema=is_averaged)
+            assert {name: float(x) for name, x in state.items()} == {"a": expected}
+    content = {f"key{number}": number for number in range(8)}
+    with pytest.raises(ValueError, match=r"it has key0, key1, key2, key3, key4 and 3 more$"):
+        released_state(content)
 
 
 def test_an_existing_path_takes_precedence_over_the_models_of_the_package_and_of_the_hub(

@@ -26,7 +26,7 @@ from flame_mdm.checkpoints.adapters import About, attach, copy_weights, word_row
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
-from flame_mdm.conditions.tokens import LearnedTokens
+from flame_mdm.conditions.tokens import START, LearnedTokens
 from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.config import compose, instantiate, sweeps
 from flame_mdm.data.store import Store
@@ -636,6 +636,8 @@ def test_words_and_captions_of_an_adapter_come_first_unless_its_strength_is_zero
     facts = flame_mdm.load(taught / "base.safetensors", adapter=files, strength=[0, 0.5]).facts
     assert facts["vocabulary"] == ["march", "in", "style", *base["vocabulary"]]
     assert facts["captions"] == ["a person limps", *base["captions"]]
+    opposite = flame_mdm.load(taught / "base.safetensors", adapter=files[1], strength=-1).facts
+    assert opposite["vocabulary"] == facts["vocabulary"]
     without = flame_mdm.load(taught / "base.safetensors", adapter=files, strength=0).facts
     assert without == base
 
@@ -710,6 +712,12 @@ def test_new_words_get_rows_that_no_known_word_has():
         w for n in range(10**4) if first in hashed(w := f"w{n}", 50) and second not in hashed(w, 50)
     )
     assert (row, word_rows(encoder, ["limp"], [other])) == (first, [second])
+    # The rows of the token that begins every caption are not free either.
+    begin = hashed(START, 50)
+    rows = (hashed(f"w{n}", 50) for n in range(10**4))
+    number = next(n for n, (one, two) in enumerate(rows) if one in begin and two not in begin)
+    word = f"w{number}"
+    assert word_rows(encoder, [word], []) == [hashed(word, 50)[1]]
 
 
 STYLED = "A person hobbles in limp style"

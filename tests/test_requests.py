@@ -472,6 +472,26 @@ def test_a_frame_with_two_faults_counts_once_when_candidates_are_compared(monkey
     assert best(cast(Any, ["long", "apart", "overlapping"])) == "overlapping"
 
 
+@pytest.mark.parametrize(
+    ("name", "valid", "invalid"),
+    [
+        ("eta", (0, 0.5, 1), (-0.01, 1.01, float("nan"))),
+        ("guidance_scale", (-1, 0, 7.5), (float("inf"), "2")),
+        ("num_inference_steps", (1, 100_000, [0], [0, 99_999], [100_000]), (0, True, 2.0, 100_001)),
+        ("num_inference_steps", ((0, 5), []), ([-1, 3], [100_001], [0.5], "10")),
+        ("spacing", ("linspace", "stride"), ("even",)),
+        ("sampler", ("ddim", None), (3,)),
+    ],
+)
+def test_options_of_samplers_are_accepted_up_to_their_limits(name, valid, invalid):
+    for value in valid:
+        chosen = SamplerOptions(**{name: value}).chosen()
+        assert chosen.get(name) == (list(value) if isinstance(value, tuple) else value)
+    for value in invalid:
+        with pytest.raises(UserError, match=f"^{name}="):
+            SamplerOptions(**{name: value})
+
+
 def test_an_option_that_is_zero_replaces_the_value_of_the_recipe():
     recipe = SamplerOptions(guidance_scale=2.5, sampler="ddim", eta=0.7)
     chosen = SamplerOptions(guidance_scale=0, eta=0).over(recipe).chosen()

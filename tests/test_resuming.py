@@ -111,6 +111,15 @@ def test_only_files_in_the_folder_of_the_checkpoints_are_removed(tmp_path):
     assert [file.exists() for file in files] == [False, True, True]
 
 
+def test_only_the_last_checkpoint_has_a_previous_one(tmp_path):
+    folder = tmp_path / "checkpoints"
+    writer = AtomicCheckpoints(folder)
+    for step, name in enumerate((LAST, "best.ckpt", "best.ckpt", LAST, LAST)):
+        writer.save_checkpoint({"global_step": step}, folder / name)
+    steps = {path.name: torch.load(path)["global_step"] for path in folder.iterdir()}
+    assert steps == {LAST: 4, PREVIOUS: 3, "best.ckpt": 2}
+
+
 HUGE = torch.zeros(1, dtype=torch.float64).expand(2**31, 16)
 JUNK: list[tuple[tuple[Any, ...], Any]] = [
     *((("pytorch-lightning_version",), version) for version in (None, "1.0.0")),

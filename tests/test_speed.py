@@ -18,6 +18,7 @@ from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Transformer
+from flame_mdm.errors import UserError
 from flame_mdm.seeds import seed_generator
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training import speed
@@ -176,6 +177,17 @@ def test_a_new_average_starts_from_weights_that_changed_after_it_was_made():
     average.on_train_batch_start(trainer, model, None, 0)
     (averaged,) = (p for p in average.averages if p.shape == model.layer.weight.shape)
     torch.testing.assert_close(averaged, model.layer.weight.detach())
+
+
+@pytest.mark.parametrize(("decay", "expected"), [(0.0, "last"), (1.0, "first")])
+def test_the_factor_of_an_average_is_from_zero_to_one(decay, expected):
+    """With 0, the average is the last weights; with 1, it stays at the first ones."""
+    model, average = Tiny(), MovingAverage(decay)
+    weights = [model.layer.weight.detach().clone() for _ in train_with([average], model, 3)]
+    averaged = saved(average, model)["state_dict"]["layer.weight"]
+    torch.testing.assert_close(averaged, weights[-1 if expected == "last" else 0])
+    with pytest.raises(UserError, match=r"ema\.decay=.*: expected a number from 0 to 1"):
+        MovingAverage(decay * 3 - 1)
 
 
 def test_a_resumed_average_goes_on():

@@ -458,6 +458,22 @@ def test_temporary_files_of_living_processes_stay_and_abandoned_ones_go(tmp_path
     assert {path.name for path in tmp_path.iterdir()} == {names["not ours"]}
 
 
+def test_abandoned_files_with_long_names_go_and_those_of_other_files_stay(tmp_path):
+    """The names of temporary files contain the first 80 characters of the name of the file."""
+    machine, token = paths._machine(), "0123456789abcdef"
+    dead = next(number for number in range(99_999, 1, -1) if not Path(f"/proc/{number}").exists())
+    path = tmp_path / f"{'x' * 100}.npz"
+    names = [f".{stem}.{machine}-{dead}-{token}" for stem in ("x" * 80, "x" * 79)]
+    for name in (f"{names[0]}.npz", f"{names[0]}.npy", f"{names[1]}.npz"):
+        (tmp_path / name).touch()
+    with paths.temporary_beside(path) as own:
+        own.touch()
+        assert own.name.startswith(f".{'x' * 80}.{machine}-{os.getpid()}-")
+        assert own.suffix == ".npz"
+    paths.remove_abandoned(tmp_path, path)
+    assert {file.name for file in tmp_path.iterdir()} == {f"{names[0]}.npy", f"{names[1]}.npz"}
+
+
 def test_a_folder_that_a_killed_command_left_is_removed_by_the_next_one(tmp_path):
     if not (child := os.fork()):
         with atomic_folder(tmp_path / "out") as made:

@@ -1,6 +1,7 @@
 """Results, table specs, texts, samples and pages from others: refused in one line, or shown as plain text."""
 
 import csv
+import errno
 import io
 import json
 import multiprocessing
@@ -54,7 +55,7 @@ from flame_mdm.reporting.tables.format import (
 from flame_mdm.reporting.tables.specs import Figure
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
+from flame_mdm.safe_io import atomic_folder, atomic_write, write_failure, write_json
 from flame_mdm.sampling.output import write_motions
 from flame_mdm.schemas import ClosedSchema, Int, check_shape, read_json
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
@@ -305,6 +306,33 @@ def test_a_failed_write_keeps_what_was_there(tmp_path):
     with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "b" / "c" / "file.txt"):
         raise ZeroDivisionError
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("free", "text"),
+    [
+        (0, "0 bytes"),
+        (999, "999 bytes"),
+        (1000, "0.977 KiB"),
+        (1536, "1.5 KiB"),
+        (2**20, "1 MiB"),
+        (1000 * 2**20, "0.977 GiB"),
+        (3 * 2**29, "1.5 GiB"),
+        (5 * 2**40, "5 TiB"),
+    ],
+)
+def test_of_a_full_disk_the_free_space_is_named_in_binary_units(tmp_path, monkeypatch, free, text):
+    disk = SimpleNamespace(total=2**60, used=2**50, free=free)
+    folders: list[Path] = []
+    usage = SimpleNamespace(disk_usage=lambda folder: folders.append(folder) or disk)
+    monkeypatch.setattr("flame_mdm.safe_io.shutil", usage)
+    path = tmp_path / "new" / "folder" / "a.npz"
+    for number in (errno.ENOSPC, errno.EDQUOT):
+        reason = write_failure(OSError(number, "full"), path)
+        assert reason == f"full. {text} is free on the disk that contains {tmp_path}"
+    assert folders == [tmp_path] * 2
+    assert write_failure(OSError(errno.EACCES, "not allowed"), path) == "not allowed"
+    assert write_failure(RuntimeError("one\ntwo"), path) == "one"
 
 
 def _table(folder: Path) -> Path:

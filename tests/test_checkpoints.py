@@ -854,6 +854,39 @@ def test_a_card_states_the_facts_of_the_model_and_how_it_is_sampled():
     assert "flame_mdm.generate(model, actions=['walk'], seconds=3, seed=0)" in card
 
 
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        ("tokens.LearnedTokens", '"a person walks forward", '),
+        ("text.PretrainedText", '"a person walks forward", '),
+        ("Unconditional", ""),
+    ],
+)
+def test_a_card_requests_what_the_model_is_conditioned_on_and_lists_the_parts_of_a_mixture(
+    condition, words
+):
+    parts = [
+        {"license": "CC0", "clips": 3, "minutes": 1.5, "actions": ["run"]},
+        {"license": "of my own", "clips": 20, "minutes": 0.0, "actions": []},
+    ]
+    model: dict[str, Any] = {
+        "config": {
+            "experiment": "mine",
+            "condition": {"_target_": f"flame_mdm.conditions.{condition}"},
+        },
+        "facts": {"actions": [], "max_frames": 60, "dataset": "bandai", "licenses": parts},
+        "state_dict": {},
+        "origin": {"averaged": False},
+    }
+    card = hub.card(model, "me/walker", "f00d")
+    assert f"flame_mdm.generate(model, {words}seconds=3, seed=0)" in card
+    assert "| actions | none |" in card
+    assert "| weights: averaged | False |" in card
+    assert "| CC0 | 3 | 1.5 | run | CC0: no conditions. |" in card
+    assert "| of my own | 20 | 0.0 |" in card
+    assert "license: cc-by-nc-4.0" not in card, "the terms are those of the parts"
+
+
 @pytest.mark.parametrize("is_moved", [True, False])
 def test_a_shared_recipe_names_the_default_folders_instead_of_absolute_ones(is_moved: bool):
     here = "/home/me" if is_moved else "mine"

@@ -16,8 +16,9 @@ from support.runs import TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wandb import Run
 
+from flame_mdm import runs
 from flame_mdm.__main__ import main
-from flame_mdm.records import Result, Value
+from flame_mdm.records import AuditedMetric, Measured, Result, Value
 from flame_mdm.reporting.page import filled, interval, number, page, short
 from flame_mdm.reporting.plots import (
     Histogram,
@@ -31,7 +32,7 @@ from flame_mdm.reporting.plots import (
     svg,
 )
 from flame_mdm.reporting.report import _evaluation, _facts, charted, marks, sampling, write_report
-from flame_mdm.runs import read_history, read_run
+from flame_mdm.runs import Provenance, RunConfig, made_by, read_history, read_run
 from flame_mdm.schemas import check_shape
 from flame_mdm.training import callbacks
 
@@ -450,6 +451,76 @@ def test_results_of_other_inputs_have_other_origins(name: str):
     assert (
         check_shape(result(**ORIGINS[name]), Result).origin != check_shape(result(), Result).origin
     )
+
+
+EARLIER: list[tuple[Any, dict[str, Any], dict[str, Any]]] = [
+    (
+        AuditedMetric,
+        {},
+        {
+            "unit": "",
+            "sees_meaning": True,
+            "sums_up": True,
+            "exact": False,
+            "depends_on_count": False,
+        },
+    ),
+    (
+        Measured,
+        {"ground_truth": None, "values": None, "not_computed": {}, "invalid_because": []},
+        {"forced": False, "warnings": [], "cost": None, "seeds": []},
+    ),
+    (
+        Value,
+        {"mean": 0.0, "ci": None, "replications": 1, "n": 4},
+        {"per_replication": [], "n_real": None, "unit": "", "resampled": []},
+    ),
+    (
+        Provenance,
+        {"command": [], "commit": None, "python": "", "machine": "", "packages": {}, "data": {}},
+        {"data": {"fingerprint": "–"}, "changed": None, "device": "–", "parameters": None},
+    ),
+    (
+        RunConfig,
+        {"experiment": "a/b", "trainer": {"max_steps": 0}, "run": {}},
+        {"experiment": "a/b", "max_steps": 0, "name": "default"},
+    ),
+    (
+        RunConfig,
+        {"experiment": None, "trainer": {"max_steps": -1}, "run": {"name": 0}},
+        {"experiment": None, "max_steps": -1, "name": 0},
+    ),
+]
+"""Schemas, contents without the keys that were added later, and the values of these keys."""
+
+
+@pytest.mark.parametrize(("schema", "content", "expected"), EARLIER)
+def test_keys_that_a_file_lacks_have_the_values_of_the_version_that_wrote_it(
+    schema, content, expected
+):
+    values = check_shape(content, schema).model_dump()
+    assert {name: values[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "label"), [("default", "a/b"), ("long", "a/b/long"), (0, "a/b/0"), (None, "a/b")]
+)
+def test_a_run_is_called_by_its_recipe_and_its_name(name, label):
+    config = {"experiment": "a/b", "run": {} if name is None else {"name": name}}
+    assert runs.Run(Path("x"), config, None, {}, {}).label == label
+
+
+@pytest.mark.parametrize(
+    ("path", "hint"),
+    [
+        ("runs/a/b/default/checkpoints/best.ckpt", "make train EXP=a/b"),
+        ("runs/a/long/checkpoints/last.ckpt", "runs/a/long/checkpoints/last.ckpt is missing"),
+        ("assets/t2m/kit", 'assets/t2m/kit is missing; see "Extractors" in docs/evaluation.md'),
+        ("a.safetensors", "a.safetensors is missing"),
+    ],
+)
+def test_a_missing_file_has_a_hint_how_to_obtain_it(path, hint):
+    assert made_by(path) == hint
 
 
 def test_a_page_names_the_number_of_motions_of_most_values():

@@ -687,7 +687,8 @@ def test_files_contain_the_changes_of_later_layers_and_for_actions_of_all(tmp_pa
 @pytest.mark.parametrize("rank", [2, 32])
 def test_a_new_adapter_changes_nothing_and_its_first_gradients_do_not_depend_on_the_width(rank):
     """`up` is zero, and the variance of `down` is that of a usual linear layer, whatever the rank."""
-    model, about = build("denoiser.ff_size=400"), ABOUT | {"rank": rank, "rows": [3, 5]}
+    about: About = {**ABOUT, "rank": rank, "rows": [3, 5]}
+    model = build("denoiser.ff_size=400")
     before = {name: value.clone() for name, value in model.state_dict().items()}
     torch.manual_seed(0)
     attach(model, about)

@@ -1,10 +1,12 @@
 """What sentences are understood to ask for, and what a model makes of them."""
 
+import hashlib
 import json
 import re
 from collections import defaultdict
 from html import unescape
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,8 @@ from flame_mdm.data.synthetic import draw_captions, prompts
 from flame_mdm.data.synthetic_actions import ACTIONS
 from flame_mdm.demo.chips import _with_action, chips
 from flame_mdm.errors import UserError
+from flame_mdm.safe_io import read_package_yaml
+from flame_mdm.sampling.referee.sentences import read_claims
 
 ATTRIBUTES = ("side", "count", "direction", "speed")
 
@@ -599,3 +603,145 @@ def test_a_word_is_a_thing_if_three_of_the_five_closest_words_are(monkeypatch, t
     monkeypatch.setattr(meaning, "_thing_vectors", lambda: vectors(things))
     assert meaning.is_thing("word") == expected
     assert not meaning.is_thing("unlisted")
+
+
+GOLDEN = ROOT / "tests" / "golden" / "language.json"
+MORE_TEXTS = [
+    "", "!!!", "kicks ４ times", "kicks x 3, then faster", "jumps 13 times", "walks, then slower",
+    "a person jumps followed by bowing", "он идёт вперёд", "ÉLÈVE WALKS", "a person walks in limp style",
+    "a person somersaults | he bows @2", "stretches both arms above the head and leans to the left",
+    "while walking, a man waves with the left hand", "a man waves while walking backwards",
+    "a person yodels loudly", "a person brawls", "turns 90 degrees to the left", "turns halfway around",
+    "takes a few steps back", "takes three steps to the left", "walks in a circle to the right",
+    "walks to the left in a circle", "walks counter-clockwise", "walks anticlockwise slowly",
+    "raises both hands", "raises her arms", "raises the right arm twice", "kicks with both legs",
+    "kicks a couple of times", "punches left, then right", "punches with his left fist quickly",
+    "leans to the left with the right hand", "steps to the left side", "climbs up", "climbs down a ladder",
+    "sits down, stands up and sits down again", "stands still, waving", "walks. Finally he sits",
+    "at the same time he waves and nods", "he waves at the same time", "jumps once they have turned",
+    "jumps once", "jumps next to the table", "next, he jumps", "sits in the chair later",
+    "before sitting, he bows twice", "after he bows, he sits", "bows after sitting", "bows before sitting",
+    "does not walk but runs", "without running he walks", "picks a box up", "picks up the box with both hands",
+    "five quick push-ups", "two slow squats", "does 10 jumping jacks", "walks 5 meters", "waves for 3 seconds",
+    "hops on the left foot 3 times", "hops on one leg", "looks back over the shoulder", "go running",
+    "the guard walks", "a drunk man walks", "walsk and jmups", "kikcs", "doge to the left", "tims jumps",
+    "crawls, crawls faster", "runs then runs backward", "walks forward and walks backward", "sprints",
+    "spins clockwise twice", "turns clockwise", "swings a sword with the right hand at a goblin",
+    "dances happily like a robot", "a person limps slowly", "crouches 7 times", "jumps 4 times",
+    "a person walks four steps nervously", "climbs a ladder", "a person is upset", "a blue grenade",
+]  # fmt: skip
+
+
+def all_texts() -> list[str]:
+    return [*(request["text"] for request in requests()), *MORE_TEXTS]
+
+
+def shown_mention(mention: Mention) -> str:
+    stated = "".join(f" {name}={value}" for name, value in sorted(mention.attributes.items()))
+    typed = f" as {mention.typed}" if mention.typed else ""
+    return f"{mention.action}{stated}{typed} '{mention.text}' {mention.start}-{mention.end}"
+
+
+def shown_understanding(text: str) -> str:
+    """Everything that is understood of a text, in one line."""
+    understood = understand(text)
+    steps = " > ".join(" + ".join(map(shown_mention, step)) for step in understood.steps)
+    rest = [
+        f"things: {', '.join(understood.objects)}" if understood.objects else "",
+        f"unknown: {', '.join(understood.unknown)}" if understood.unknown else "",
+        f"corrected: {dict(understood.corrected)}" if understood.corrected else "",
+        f"nearest: {', '.join(understood.nearest)}" if understood.nearest else "",
+        "foreign" if understood.is_foreign else "",
+    ]
+    return "; ".join(filter(None, [steps, *rest]))
+
+
+def shown_reading(reader: Reader, text: str) -> str:
+    """The captions that a model reads for a text, and what it says about them, in one line."""
+    try:
+        reading = reader.read(text)
+    except UserError as error:
+        return f"refused: {error}"
+    captions = [
+        f"{caption} ({words}, {seconds and round(seconds, 2)})"
+        for caption, words, seconds in zip(
+            reading.captions,
+            reading.texts,
+            reading.seconds() or (None,) * len(reading.texts),
+            strict=True,
+        )
+    ]
+    return "; ".join([" > ".join(captions), reading.summary(), *reading.warnings()])
+
+
+def models() -> list[Reader]:
+    """Readers for a model with the actions of the synthetic set, and for one that knows more words and captions."""
+    both = "a person walks forward while waving with the left hand"
+    added = "stretches sideways sneaks slowly limps yodels crawls somersaults"
+    more = {
+        "actions": [*FACTS["actions"], "stretch sideways", "sneak", "limp", "no_action"],
+        "captions": [*FACTS["captions"], both],
+        "vocabulary": sorted({*FACTS["vocabulary"], *both.split(), *added.split()}),
+    }
+    return [Reader(FACTS), Reader(FACTS | more)]
+
+
+def table_rows() -> dict[str, str]:
+    """The rows of the tables of words and of claims, each as the start of a hash."""
+    folder = ROOT / "flame_mdm" / "conditions" / "language"
+    referee = ROOT / "flame_mdm" / "sampling" / "referee"
+    rows = {}
+    for path in (folder / "actions.yaml", folder / "phrases.yaml", referee / "thresholds.yaml", referee / "sentences.yaml"):  # fmt: skip
+        content = read_package_yaml(path)
+        content = content.get("thresholds", content)
+        for name, row in content.items():
+            text = json.dumps(row, sort_keys=True, default=str)
+            rows[f"{path.stem}: {name}"] = hashlib.sha256(text.encode()).hexdigest()[:12]
+    return rows
+
+
+def golden() -> dict[str, dict[str, Any]]:
+    """What the committed file holds."""
+    readers = models()
+    return {
+        "understood": {text: shown_understanding(text) for text in all_texts()},
+        "read": {text: [shown_reading(reader, text) for reader in readers] for text in all_texts()},
+        "claims": {text: [f"{claim} '{claim.words}'" for claim in read_claims(text)] for text in all_texts()},
+        "tables": table_rows(),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def committed() -> dict[str, dict[str, Any]]:
+    return json.loads(GOLDEN.read_text(encoding="utf-8"))
+
+
+REPEAT = "if the change is intended: PYTHONPATH=tests python tests/test_language.py"
+
+
+def test_texts_are_understood_as_in_the_committed_list(committed):
+    """The shares in docs/language.md leave room for single texts; this list leaves none."""
+    understood = {text: shown_understanding(text) for text in all_texts()}
+    assert understood == committed["understood"], REPEAT
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_models_read_the_captions_of_the_committed_list(committed, number: int):
+    reader = models()[number]
+    read = {text: shown_reading(reader, text) for text in all_texts()}
+    assert read == {text: both[number] for text, both in committed["read"].items()}, REPEAT
+
+
+def test_claims_of_texts_are_those_of_the_committed_list(committed):
+    claims = {
+        text: [f"{claim} '{claim.words}'" for claim in read_claims(text)] for text in all_texts()
+    }
+    assert claims == committed["claims"], REPEAT
+
+
+def test_tables_are_those_for_which_the_documented_shares_were_measured(committed):
+    assert table_rows() == committed["tables"], REPEAT
+
+
+if __name__ == "__main__":
+    GOLDEN.write_text(json.dumps(golden(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -30,9 +30,20 @@ from support.refusals import error_of
 
 from flame_mdm.__main__ import main
 from flame_mdm.demo import studio as making
-from flame_mdm.demo.request import MAX_EDITS, DemoEdit, DemoRequest, parse_query
+from flame_mdm.demo.live import STAND, WALK
+from flame_mdm.demo.request import (
+    FAR,
+    MAX_EDITS,
+    MAX_TEXT,
+    MAX_WAYPOINTS,
+    DemoEdit,
+    DemoRequest,
+    checked,
+    parse_query,
+)
 from flame_mdm.errors import UserError
 from flame_mdm.formats.retarget import presets
+from flame_mdm.sampling.motion_request import USUAL_SECONDS
 
 FAST = {"seconds": 1.0, "num_inference_steps": 3}
 EDITED = DemoRequest(
@@ -750,3 +761,134 @@ def click(tab: Any, label: str) -> None:
 def joints_of(address: str) -> np.ndarray:
     with np.load(io.BytesIO(get(address)[1])) as content:
         return content["joints"]
+
+
+def test_a_variation_may_have_a_text_of_its_own_and_sentences_are_split_in_the_first_step_alone():
+    other = DemoEdit(strength=0.5, text="waves", samples=2)
+    new = DemoEdit(region_seconds=(0.0, 0.5), text="")
+    options = {"guidance_scale": 0.0, "num_inference_steps": 7, "sampler": "ddim"}
+    request = DemoRequest(text="walks", seconds=2.5, split=False, edits=(other, new), **options)
+    assert request.steps("text") == [
+        (None, {"texts": "walks", "seconds": 2.5, "split": False, "samples": 1, "seed": 0, **options}),
+        (0, {"texts": "waves", "strength": 0.5, "samples": 2, "seed": 0, **options}),
+        (0, {"region_seconds": [0.0, 0.5], "samples": 1, "seed": 0, **options, "cleanup": True}),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("seconds", "total"), [(None, 1.5 + 3 + 3), (2.0, 1.5 + 2 + 2), (0.25, 1.5 + 0.5)]
+)
+def test_parts_last_as_long_as_they_state_or_as_the_field_says_or_three_seconds(seconds, total):
+    parts = [("walks", 1.5), ("waves", None), ("sits", None)]
+    assert DemoRequest(seconds=seconds).total_seconds(parts) == total
+
+
+def test_the_program_loads_the_adapter_onto_the_device_and_edits_the_chosen_motion():
+    request = DemoRequest(
+        model="base + styles.safetensors",
+        text="walks",
+        cleanup=False,
+        edits=(DemoEdit(motion=2, joints=("arms",)),),
+    )
+    assert request.python("text", "cuda").splitlines() == [
+        "import flame_mdm",
+        "",
+        "model = flame_mdm.load('base', 'cuda', adapter='styles.safetensors')",
+        "motions = flame_mdm.generate(model, texts='walks', samples=1, seed=0)",
+        "motions = flame_mdm.edit(model, motions[2], joints=['arms'], samples=1, seed=0)",
+        'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4',
+    ]
+    plain = DemoRequest(model="base").python("none", "cpu").splitlines()
+    assert plain[2:4] == [
+        "model = flame_mdm.load('base')",
+        "motions = flame_mdm.generate(model, samples=1, seed=0, cleanup=True)",
+    ]
+
+
+def test_empty_fields_are_left_to_the_model_and_zeros_are_not():
+    fields = {"text": "walks", "seconds": "", "sampler": None, "guidance_scale": 0, "seed": "0"}
+    assert checked(fields) == DemoRequest(text="walks", guidance_scale=0.0, seed=0)
+    with pytest.raises(UserError, match=r"^samples=0: input should be greater than or equal to 1"):
+        checked({"samples": 0})
+
+
+def test_messages_are_escaped_and_suggest_texts_as_buttons():
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    from flame_mdm.conditions.language.reading import NotUnderstood
+    from flame_mdm.demo.studio_page import PROGRAMS, _buttons, _links, _note, _refusal, _still
+
+    line = "never seen in training: <b>. Did you mean 'a man walks'?"
+    assert _note("warning", line) == (
+        '<p class="warning">never seen in training: &lt;b&gt;. '
+        '<button type="button">a man walks</button></p>'
+    )
+    assert _note("error", "too long") == '<p class="error" role="alert">too long</p>'
+    assert _refusal(NotUnderstood("'<x>': no word says what happens", ())) == (
+        '<p class="error" role="alert">&#x27;&lt;x&gt;&#x27;: no word says what happens. '
+        "Name an action</p>"
+    )
+    nearest = ("a person kicks with the left leg", "a person jumps")
+    shown = _refusal(NotUnderstood("no", nearest))
+    assert re.findall(r"<button type=\"button\"><img[^>]*>([^<]*)</button>", shown) == list(nearest)
+    left, right = (_still(f"a person kicks with the {side} leg") for side in ("left", "right"))
+    assert left.startswith("data:image/webp;base64,")
+    assert left != right
+    assert left in shown
+    assert _buttons({"<walk>": ""}) == '<button type="button">&lt;walk&gt;</button>'
+    assert _links([("motion.bvh?a", "BVH")]) == '<a href="motion.bvh?a" download>BVH</a>'
+    for name, (ending, rig) in PROGRAMS.items():
+        program, *written = name.lower().split()
+        assert rig == ("" if program == "blender" else f"&amp;rig={program}")
+        assert ending == (written[0] if written else "glb")
+        assert program == "blender" or program in presets()
+
+
+def test_the_page_and_the_server_have_the_same_limits():
+    page, live = ((ROOT / "flame_mdm" / "demo" / name).read_text() for name in ("page.js", "live.js"))  # fmt: skip
+    numbers = {
+        name: float(value)
+        for text in (page, live)
+        for name, value in re.findall(r"\b([A-Z][A-Z_]+) = (\d+(?:\.\d+)?)\b", text)
+    }
+    assert numbers == {
+        **{"FAR": FAR, "STRENGTH": 0.5, "SAMPLES": 3, "MOST_POINTS": MAX_WAYPOINTS},
+        **{"AHEAD": 1, "SLOW": 0.15, "EASE": 0.15, "LEAD": 0.25, "STEP": 0.1},
+        **{"CHIPS": 6, "SPARE": 1.4, "TIMED": 5},
+    }
+    assert f'maxlength="{MAX_TEXT}"' in live
+    assert page.count(f"|| {USUAL_SECONDS:g}") == 2  # without a number of seconds
+    goes = re.findall(r"const GOES = /(.*)/i;", live)[0]
+    assert re.search(goes, WALK)
+    assert not re.search(goes, STAND)
+    for text in ("she runs", "tiptoe", "crawls", "jogging"):
+        assert bool(re.search(goes, text)) == (text != "jogging"), text
+
+
+def waiting(time: float | None) -> Any:
+    """A connection that waits until a time, or one whose request is being answered."""
+    closed: list[bool] = []
+    deadline = None if time is None else SimpleNamespace(when=lambda: time)
+    return SimpleNamespace(deadline=deadline, closed=closed, close=lambda: closed.append(True))
+
+
+@pytest.mark.parametrize(
+    ("times", "limit", "closed", "is_refused"),
+    [
+        ([3.0, 1.0, 2.0], 4, [], False),
+        ([3.0, 1.0, 2.0], 3, [1], False),
+        ([3.0, 1.0, 2.0], 2, [1, 2], False),
+        ([None, 5.0, None], 3, [1], False),
+        ([None, 5.0, None], 2, [1], True),
+        ([None, None, None], 3, [], True),
+    ],
+)
+def test_connections_that_have_waited_longest_make_room_for_a_new_one(
+    times, limit: int, closed: list[int], is_refused: bool
+):
+    connections = pytest.importorskip("flame_mdm.demo.connections", reason="uvicorn is missing")
+    new, others = waiting(0.5), [waiting(time) for time in times]
+    new.limit_concurrency = None
+    connections.Connection._make_room(new, [*others, new], limit)
+    assert [k for k, other in enumerate(others) if other.closed] == closed
+    assert not new.closed
+    assert (new.limit_concurrency == 0) == is_refused

@@ -29,6 +29,8 @@ from flame_mdm.data.synthetic_actions import ACTIONS
 from flame_mdm.demo.chips import _with_action, chips
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_package_yaml
+from flame_mdm.sampling.motion_request import read_parts
+from flame_mdm.sampling.referee.kinds import KINDS
 from flame_mdm.sampling.referee.sentences import read_claims
 
 ATTRIBUTES = ("side", "count", "direction", "speed")
@@ -691,13 +693,31 @@ def table_rows() -> dict[str, str]:
     folder = ROOT / "flame_mdm" / "conditions" / "language"
     referee = ROOT / "flame_mdm" / "sampling" / "referee"
     rows = {}
-    for path in (folder / "actions.yaml", folder / "phrases.yaml", referee / "thresholds.yaml", referee / "sentences.yaml"):  # fmt: skip
+    paths = [folder / name for name in ("actions.yaml", "phrases.yaml")]
+    paths += [referee / name for name in ("thresholds.yaml", "sentences.yaml")]
+    for path in paths:
         content = read_package_yaml(path)
         content = content.get("thresholds", content)
         for name, row in content.items():
             text = json.dumps(row, sort_keys=True, default=str)
             rows[f"{path.stem}: {name}"] = hashlib.sha256(text.encode()).hexdigest()[:12]
+    for name, kind in KINDS.items():
+        text = repr((kind.group, kind.measure.__name__, kind.no, kind.yes, kind.is_timed))
+        rows[f"kinds: {name}"] = hashlib.sha256(text.encode()).hexdigest()[:12]
     return rows
+
+
+def chips_of(reader: Reader, text: str) -> str:
+    """The chips of a text, and the values that the model knows for its actions."""
+    parts = read_parts(text)
+    return chips(reader.abilities, parts, [reader.read(words) for words, _ in parts])
+
+
+WITH_CHIPS = [
+    "kicks twice with the left leg @1.5 | walks slowly <nervously> | jumps and sits down",
+    "walks backward | waves quickly with both hands @2",
+    "while walking, a man waves with the left hand",
+]
 
 
 def golden() -> dict[str, dict[str, Any]]:
@@ -707,6 +727,8 @@ def golden() -> dict[str, dict[str, Any]]:
         "understood": {text: shown_understanding(text) for text in all_texts()},
         "read": {text: [shown_reading(reader, text) for reader in readers] for text in all_texts()},
         "claims": {text: [f"{claim} '{claim.words}'" for claim in read_claims(text)] for text in all_texts()},
+        "chips": {text: [chips_of(reader, text) for reader in readers] for text in WITH_CHIPS},
+        "choices": {action: [reader.abilities.choices(action) for reader in readers] for action in actions()},
         "tables": table_rows(),
     }  # fmt: skip
 
@@ -730,6 +752,15 @@ def test_models_read_the_captions_of_the_committed_list(committed, number: int):
     reader = models()[number]
     read = {text: shown_reading(reader, text) for text in all_texts()}
     assert read == {text: both[number] for text, both in committed["read"].items()}, REPEAT
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_chips_and_choices_are_those_of_the_committed_list(committed, number: int):
+    reader = models()[number]
+    shown = {text: chips_of(reader, text) for text in WITH_CHIPS}
+    assert shown == {text: both[number] for text, both in committed["chips"].items()}, REPEAT
+    choices = {action: reader.abilities.choices(action) for action in actions()}
+    assert choices == {name: both[number] for name, both in committed["choices"].items()}, REPEAT
 
 
 def test_claims_of_texts_are_those_of_the_committed_list(committed):

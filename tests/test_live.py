@@ -12,10 +12,13 @@ from support.runs import TINY_DIP, untrained
 
 from flame_mdm import stream
 from flame_mdm.data.standing import standing
+from flame_mdm.demo import guard
 from flame_mdm.demo import live as making
 from flame_mdm.demo.live import LiveStreams
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
+from flame_mdm.representations.skeleton import SMPL22
 
 WALK, SIT = "a person walks", "a person sits down"
 
@@ -320,3 +323,178 @@ def test_replaced_frames_are_no_part_of_a_file_that_begins_after_the_start(model
     np.testing.assert_array_equal(kept[:10], before[15:25])
     apart = np.abs(joints_of(block["motion"]) - kept[10:]).max()
     assert apart < 0.001 + block["motion"]["step"]
+
+
+class Numbered:
+    """A stream whose frames are numbered: frame f is at x = f / 100 m."""
+
+    def __init__(self, fps: float):
+        self.frames, self.fps = 0, fps
+        self.reached: list[int] = []
+        self.calls: list[Any] = []
+
+    def lead(self, path: Any) -> None:
+        self.calls.append(("lead", path))
+
+    def go_back(self, at: float) -> None:
+        self.calls.append(("go_back", at))
+        self.frames = round(at * self.fps)
+
+    def change(self, text: str) -> None:
+        self.calls.append(("change", text))
+
+    def __next__(self) -> Motion:
+        frames = np.arange(self.frames, self.frames + 30)
+        self.frames += 30
+        joints = np.zeros((30, 22, 3), np.float32)
+        joints[..., 0] = frames[:, None] / 100
+        return Motion(joints, self.fps, SMPL22)
+
+
+@pytest.fixture
+def shown(model, monkeypatch) -> list[tuple[Motion, int]]:
+    """What the player gets of numbered streams at 30 frames per second: motions and numbers of frames before."""
+    packed: list[tuple[Motion, int]] = []
+    monkeypatch.setattr(model.representation, "fps", 30.0)
+    monkeypatch.setattr(making, "stream", lambda model, text: Numbered(30.0))
+    monkeypatch.setattr(
+        making, "packed_motion", lambda motion, before: packed.append((motion, before)) or {}
+    )
+    return packed
+
+
+def numbers_of(joints: np.ndarray) -> list[int]:
+    return np.round(joints[:, 0, 0] * 100).astype(int).tolist()
+
+
+def test_a_block_is_shown_with_the_ten_frames_before_it(model, shown):
+    live = LiveStreams(model, Clock())
+    answers = [live.block("", WALK, 0)]
+    name = answers[0]["stream"]
+    answers += [live.block(name, text, begin) for text, begin in ((WALK, 30), (SIT, 45), (SIT, 75))]
+    assert [(answer["from"], answer["frames"]) for answer in answers] == [
+        (0, 30),
+        (30, 30),
+        (45, 30),
+        (75, 30),
+    ]
+    assert [before for _, before in shown] == [0, 10, 10, 10]
+    assert [numbers_of(motion.joints) for motion, _ in shown] == [
+        list(range(30)),
+        list(range(20, 60)),
+        list(range(35, 75)),
+        list(range(65, 105)),
+    ]
+    assert [motion.text for motion, _ in shown] == [WALK, WALK, SIT, SIT]
+    assert {motion.fps for motion, _ in shown} == {30.0}
+    running: Any = live._streams[name].stream
+    calls = [call for call in running.calls if call[0] != "lead"]
+    assert calls == [("go_back", 1.5), ("change", SIT)]  # and no change for the last block
+
+
+def test_a_minute_of_the_stream_is_kept_at_its_frame_rate(model, shown, monkeypatch):
+    clock = Clock()
+    live = LiveStreams(model, clock)
+    name = live.block("", WALK, 0)["stream"]
+    for number in range(1, 63):
+        clock.time += 1.0
+        live.block(name, WALK if number < 40 else SIT, 30 * number)
+    assert numbers_of(live._streams[name].joints) == list(range(1890 - 1800, 1890))
+    saved: list[Motion] = []
+
+    def save(motion: Motion, path: Any) -> None:
+        saved.append(motion)
+        path.write_bytes(b"file")
+
+    monkeypatch.setattr(Motion, "save", save)
+    assert live.file(name, ".glb") == b"file"
+    assert (saved[0].fps, saved[0].text, len(saved[0].joints)) == (30.0, SIT, 1800)
+
+
+def test_sixteen_streams_run_at_once(model, shown):
+    clock = Clock()
+    live = LiveStreams(model, clock)
+    names = [live.block("", WALK, 0)["stream"] for _ in range(16)]
+    assert len(set(names)) == 16
+    with pytest.raises(UserError, match="too many streams are running"):
+        live.block("", WALK, 0)
+    clock.time = 60.0
+    live.block(names[0], WALK, 30)
+    clock.time = 121.0  # all others have ended
+    live.block("", WALK, 0)
+    assert list(live._streams)[0] == names[0]
+    assert len(live._streams) == 2
+
+
+@pytest.mark.parametrize(
+    ("path", "is_read"),
+    [
+        *((path, True) for path in ("/", "/theme.css", "/favicon.ico", "/manifest.json")),
+        *((path, True) for path in ("/assets/a-b.c.js", "/static/img/x.png", "/motion.bvh")),
+        *((path, True) for path in ("/live.html", "/live.bvh", "/live.glb")),
+        *((path, True) for path in ("/gradio_api/queue/data", "/gradio_api/heartbeat/" + "a" * 40)),
+        *((path, False) for path in ("/live", "/live.npz", "/motion.html5", "/motion", "/assets")),
+        *((path, False) for path in ("/assets/.env", "/assets//a", "/static/../a", "/theme.css/")),
+        *((path, False) for path in ("/gradio_api/file=/etc/passwd", "/gradio_api/upload")),
+        ("/gradio_api/heartbeat/" + "a" * 41, False),
+    ],
+)
+def test_the_page_reads_its_own_addresses_alone(path: str, is_read: bool):
+    assert (guard.READ.fullmatch(path) is not None) == is_read
+
+
+@pytest.mark.parametrize(
+    ("change", "is_valid"),
+    [
+        ({"begin": 10_000_000}, True),
+        ({"begin": 10_000_001}, False),
+        ({"stream": "a" * 32}, True),
+        ({"stream": "a" * 31}, False),
+        ({"stream": "A" * 32}, False),
+        ({"path": [[-1e4, 1e4]] * 16}, True),
+        ({"path": [[0.0, -10_000.1]]}, False),
+        ({"text": "x" * 300}, True),
+    ],
+    ids=str,
+)
+def test_requests_for_blocks_are_read_up_to_their_limits(change: dict[str, Any], is_valid: bool):
+    content = json.dumps({"stream": "", "text": WALK, "begin": 0} | change)
+    if is_valid:
+        call = guard.LiveCall.model_validate_json(content).model_dump(mode="json")
+        assert call | change == call
+    else:
+        with pytest.raises(ValueError, match="1 validation error"):
+            guard.LiveCall.model_validate_json(content)
+
+
+@pytest.mark.parametrize(
+    ("headers", "path", "status"),
+    [
+        ({"host": "localhost:7860", "origin": "http://localhost:7860"}, "/live", None),
+        ({"host": "LOCALHOST:7860", "origin": "http://localhost:7860"}, "/live", None),
+        ({"host": "localhost:7860", "origin": "http://localhost:7861"}, "/live", 403),
+        ({"host": "localhost", "origin": "https://Demo.example"}, "/live", None),
+        ({"host": "demo.example", "origin": "https://demo.example:8443"}, "/live", None),
+        ({"host": "demo.example", "origin": "https://other.example"}, "/live", 403),
+        ({"host": "other.example"}, "/", 421),
+        ({"host": ""}, "/", 421),
+        ({"host": "[::1]:7860"}, "/live", None),
+        ({"host": "localhost", "sec-fetch-site": "same-origin"}, "/live", None),
+        ({"host": "localhost", "sec-fetch-site": "none"}, "/live", None),
+        ({"host": "localhost", "sec-fetch-site": "same-site"}, "/live", 403),
+        ({"host": "localhost", "sec-fetch-site": "cross-site"}, "/live", 403),
+        ({"host": "localhost", "sec-fetch-site": "cross-site"}, "/", None),
+    ],
+    ids=str,
+)
+def test_requests_come_from_the_page_itself_also_behind_a_proxy(headers, path: str, status):
+    from starlette.datastructures import Headers
+    from starlette.exceptions import HTTPException
+
+    guarded = guard.Guard(None, ("DEMO.example", "10.0.0.1"), {}, bool)  # type: ignore[arg-type]
+    if status is None:
+        guarded._check_sender(Headers(headers), path)
+    else:
+        with pytest.raises(HTTPException) as refusal:
+            guarded._check_sender(Headers(headers), path)
+        assert refusal.value.status_code == status

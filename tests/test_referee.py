@@ -34,7 +34,14 @@ from flame_mdm.sampling.referee.judging import (
     decide,
     verdicts,
 )
-from flame_mdm.sampling.referee.kinds import KINDS, Kind, band, group_of, thresholds
+from flame_mdm.sampling.referee.kinds import (
+    KINDS,
+    Kind,
+    band,
+    group_of,
+    threshold_key,
+    thresholds,
+)
 from flame_mdm.sampling.referee.readings import (
     Reading,
     counted,
@@ -843,6 +850,159 @@ def test_a_generated_motion_of_half_a_second_is_not_judged(frames: int, is_judge
     assert (judging.try_judge(motion) is not None) == is_judged
     motion.text = "someone cooks"
     assert judging.try_judge(motion) is None
+
+
+@pytest.mark.parametrize(
+    ("claim", "group", "key"),
+    [
+        (Claim("walk"), "movement", "walk"),
+        (Claim("raise hand", side="left"), "side", "raise hand of a side"),
+        (Claim("raise hand", side="both"), "contact", "raise hand"),
+        (Claim("pace", speed="fast"), "speed", "fast pace"),
+        (Claim("walk", speed="slow", direction="left"), "speed", "slow walk"),
+        (Claim("travel", direction="left"), "direction", "travel in a direction"),
+        (Claim("count kicks", side="right", amount=2), "count", "count kicks of a side"),
+        (Claim("count kicks", side="both", amount=2), "count", "count kicks"),
+        (Claim("sit", when="end"), "end", "sit"),
+        (Claim("raise hand", side="left", when="start"), "start", "raise hand of a side"),
+        (Claim("run", seconds=2), "duration", "run"),
+        (Claim("order", parts=(Claim("sit"), Claim("walk"))), "order", "order"),
+    ],
+    ids=str,
+)
+def test_a_claim_belongs_to_the_attribute_that_it_states(claim: Claim, group: str, key: str):
+    assert (group_of(claim), threshold_key(claim)) == (group, key)
+
+
+def test_bands_are_calibrated_by_attribute_or_else_those_set_by_hand(monkeypatch):
+    calibrated = {"walk": {"no": 1, "yes": 2}, "raise hand of a side": {"no": 3, "yes": 4}}
+    monkeypatch.setattr(kinds, "thresholds", lambda: calibrated)
+    assert band(Claim("walk")) == band(Claim("walk", when="end")) == (1, 2)
+    assert band(Claim("walk", seconds=3)) == (-0.7, -0.4)
+    assert band(Claim("raise hand", side="right")) == (3, 4)
+    assert band(Claim("raise hand", side="both")) == (-0.3, 0.0)
+    assert band(Claim("order", parts=(Claim("walk"), Claim("sit")))) == (-0.3, 0.3)
+    assert band(Claim("hop")) == (0.02, 0.06)
+
+
+def test_a_judgment_is_summed_up_by_its_decided_claims():
+    assert str(judgment("yes", "no", "cannot tell")) == "1 of 2 decided claims are true, 3 read"
+    assert str(replace(judgment(), text="sings")) == "'sings': no claim that can be checked"
+    reading = Reading(-0.21, 0.21, "m from the head", "left wrist", ((1.2, 1.94), (2.5, 3)), "why")
+    verdict = Verdict(Claim("hand to head", side="left"), "cannot tell", reading, (-0.5, -0.3))
+    evidence = "left wrist: 0.21 m from the head, 1.2-1.9 s, 2.5-3.0 s (why)"
+    assert str(verdict) == f"cannot tell: hand to head: left; {evidence}"
+    assert verdict.group == "side"
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(10.0, 5), (30.0, 15), (60.0, 30)])
+def test_half_a_second_is_measured_at_the_frame_rate_of_the_motion(fps: float, frames: int):
+    motion = replace(raising("left", frames), fps=fps, text="a person raises the left hand")
+    assert judging.try_judge(motion) is None
+    longer = replace(raising("left", frames + 1), fps=fps, text=motion.text)
+    assert judging.try_judge(longer) is not None
+
+
+def test_a_sentence_that_is_passed_replaces_the_text_of_the_motion():
+    motion = replace(raising("left"), text="a person raises the left hand")
+    assert flame_mdm.judge(motion).accuracy == 1
+    other = flame_mdm.judge(motion, "a person raises the right hand")
+    assert (other.text, other.accuracy) == ("a person raises the right hand", 0)
+    with pytest.raises(UserError, match="text is missing"):
+        flame_mdm.judge(motion, "")
+    joints = flame_mdm.judge(motion.joints, motion.text, fps=motion.fps)
+    assert [str(verdict) for verdict in joints.verdicts] == [
+        str(verdict) for verdict in flame_mdm.judge(motion).verdicts
+    ]
+
+
+def walking(*legs: tuple[float, float, float], facing: float = 0.0, fps: float = 30.0) -> Body:
+    """A standing body that is moved: each leg has seconds and the velocity (x, z) in m/s."""
+    still = example({"action": "stand"})[0]
+    steps = [np.zeros((1, 2))]
+    for seconds, x, z in legs:
+        steps.append(np.tile([x / fps, z / fps], (round(seconds * fps), 1)))
+    ground = np.cumsum(np.concatenate(steps), axis=0)
+    joints = np.repeat(still[None], len(ground), axis=0)
+    turn = np.radians(facing)
+    x, z = joints[..., 0].copy(), joints[..., 2].copy()
+    joints[..., 0], joints[..., 2] = np.cos(turn) * x + np.sin(turn) * z, np.cos(turn) * z - np.sin(turn) * x  # fmt: skip
+    joints[..., [0, 2]] += ground[:, None]
+    return Body(joints, fps)
+
+
+LEG_SCALE = Body(example({"action": "stand"}), 20.0).scale
+
+
+@pytest.mark.parametrize("facing", [0.0, 90.0, 215.0])
+def test_travel_is_measured_relative_to_the_body_wherever_it_faces(facing: float):
+    turn = np.radians(facing)
+    ahead, left = (np.sin(turn), np.cos(turn)), (np.cos(turn), -np.sin(turn))
+    for name, (x, z) in {
+        "forward": ahead,
+        "backward": (-ahead[0], -ahead[1]),
+        "left": left,
+        "right": (-left[0], -left[1]),
+    }.items():
+        body = walking((3.0, x, z), facing=facing)
+        meters = 3.0 * LEG_SCALE
+        for way in ("forward", "backward", "left", "right"):
+            reading = KINDS["travel"].measure(body, Claim("travel", direction=way))
+            assert reading.score == pytest.approx(meters if way == name else 0, rel=0.05, abs=1e-6)
+        assert KINDS["travel"].measure(body, Claim("travel")).number == pytest.approx(meters, rel=0.05)  # fmt: skip
+
+
+def test_travel_back_makes_a_direction_unclear_from_three_fifths_of_the_way_on():
+    for seconds, is_clear in ((1.5, True), (2.3, False)):
+        body = walking((3.0, 0.0, 1.0), (1.0, 0.0, 0.0), (seconds, 0.0, -1.0))
+        reading = KINDS["travel"].measure(body, Claim("travel", direction="forward"))
+        assert (reading.unclear == "") == is_clear
+
+
+def test_a_return_is_the_last_distance_relative_to_the_largest_one():
+    half = walking((2.0, 0.0, 1.0), (1.0, 0.0, -1.0), (1.0, 0.0, 0.0))
+    reading = KINDS["return place"].measure(half, Claim("return place"))
+    assert reading.score == pytest.approx(-0.5, abs=0.02)
+    assert reading.number == pytest.approx(LEG_SCALE, rel=0.02)
+    assert reading.spans == ((half.seconds - 0.3, half.seconds),)
+    near = walking((0.45, 0.0, 1.0), (1.0, 0.0, 0.0))
+    assert np.isnan(KINDS["return place"].measure(near, Claim("return place")).score)
+
+
+@pytest.mark.parametrize(("speed", "slow", "fast"), [(0.8, 0.3, -0.3), (1.5, -0.4, 0.4)])
+def test_a_pace_is_compared_with_eleven_decimeters_per_second(speed, slow, fast):
+    body = walking((1.0, 0.0, 0.0), (3.0, 0.0, speed / LEG_SCALE), (1.0, 0.0, 0.0))
+    for name, score in (("slow", slow), ("fast", fast)):
+        reading = KINDS["pace"].measure(body, Claim("pace", speed=name))
+        assert reading.score == pytest.approx(score, abs=0.02)
+        assert reading.number == pytest.approx(speed, abs=0.02)
+
+
+@pytest.mark.parametrize(("speed", "score"), [(0.25, np.nan), (0.35, 1.0), (2.0, 1.0)])
+def test_a_stop_is_undecided_unless_the_body_was_faster_than_3_decimeters_per_second(speed, score):
+    body = walking((2.0, 0.0, speed / LEG_SCALE), (1.5, 0.0, 0.0))
+    reading = KINDS["stop"].measure(body, Claim("stop"))
+    assert reading.score == pytest.approx(score, abs=0.01, nan_ok=True)
+    assert reading.spans == ((body.seconds - 0.3, body.seconds),)
+
+
+def test_a_veer_is_the_largest_displacement_to_a_side_of_the_first_heading():
+    body = walking((1.0, 0.0, 1.0), (2.0, 0.5, 1.0), facing=0.0)
+    reading = KINDS["veer"].measure(body, Claim("veer", direction="left"))
+    assert reading.score == pytest.approx(LEG_SCALE, rel=0.05)
+    assert reading.unclear == ""
+    other = KINDS["veer"].measure(body, Claim("veer", direction="right"))
+    assert other.score == pytest.approx(0.0, abs=0.01)
+    both = walking((2.0, 0.5, 0.0), (3.0, -0.5, 0.0))
+    assert KINDS["veer"].measure(both, Claim("veer", direction="left")).unclear != ""
+
+
+def test_walking_is_slower_than_running():
+    body = walking((2.0, 0.0, 1.5 / LEG_SCALE), (2.0, 0.0, 3.0 / LEG_SCALE))
+    walk = KINDS["walk"].measure(body, Claim("walk"))
+    assert walk.number == pytest.approx(3.0, abs=0.25)
+    assert walk.spans[0][1] == pytest.approx(2.0, abs=0.2)
+    assert KINDS["run"].measure(body, Claim("run")).number == pytest.approx(3.0, abs=0.05)
 
 
 if __name__ == "__main__":

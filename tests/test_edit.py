@@ -1,5 +1,6 @@
 """Edits keep what they promise to keep, whatever the motion comes from."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from flame_mdm.sampling.editing import (
     Edited,
     _part_length,
     edit,
+    kept_parts,
     method_options,
     resolve_edit,
 )
@@ -523,3 +525,57 @@ def test_edits_of_a_file_that_is_read_differently_have_different_folders():
 
     assert len({keys(), *(keys(**changes) for changes in READINGS)}) == 1 + len(READINGS)
     assert keys(seed=1) == keys(samples=5) == keys()
+
+
+def test_seconds_are_frames_at_the_rate_of_the_motion():
+    representation = HumanML(fps=30.0)
+    editing = EditRequest(region_seconds=[[0.5, 1.0], [1.5, 2.0]], joints="left_arm")
+    keep, joints = kept_parts(representation, 60, editing)
+    new = [frame for frame in range(60) if 15 <= frame < 30 or frame >= 45]
+    assert torch.nonzero(~keep.all(1))[:, 0].tolist() == new
+    assert torch.nonzero(~joints.all(1))[:, 0].tolist() == new
+    arm = find_joints(representation.skeleton, "left_arm")
+    assert torch.nonzero(~joints[20])[:, 0].tolist() == sorted(arm)
+    for options, shown in (
+        ({"region_seconds": [1.5, 2.02]}, "region_seconds=[1.5, 2.02]"),
+        ({"region": [30, 61]}, "region=[30, 61]"),
+        ({"region": [-1, 4]}, "region=[-1, 4]"),
+        ({"region": [4, 4]}, "region=[4, 4]"),
+    ):
+        says = f"{shown} is not a range within this motion, which has 60 frames (2 seconds)"
+        with one_line_error(re.escape(says)):
+            kept_parts(representation, 60, EditRequest(**options))
+    assert _part_length([("walks", 0.5), ("sits", None)], 60, 30.0) == 45
+    with one_line_error("the parts do not add up to the length of the motion, 2 seconds"):
+        _part_length([("walks", 0.5), ("sits", 1.0)], 60, 30.0)
+
+
+def test_a_cut_is_in_seconds_at_the_rate_of_the_model():
+    representation = HumanML(fps=30.0)
+    motion = with_features(representation, Motion(walk(30), 30.0, id="walk"))
+    part = part_of(representation, motion, [0.5, 1.52])  # frames 15 and 45.6
+    assert (len(part.features), part.fps) == (31, 30.0)
+    np.testing.assert_allclose(part.features[:, 3:], motion.features[15:46, 3:], atol=1e-4)
+    assert abs(part.joints[0, 0, [0, 2]]).max() < 1e-5
+    with one_line_error(f"which lasts {len(motion.features) / 30:g} seconds"):
+        part_of(representation, motion, [1.0, 9.0])
+    for wrong in ([1.0], [0.0, float("nan")], "01"):
+        with one_line_error(re.escape("expected [begin, end], in seconds")):
+            part_of(representation, motion, wrong)  # type: ignore[arg-type]
+
+
+def test_features_are_kept_at_the_rate_of_the_model_and_computed_again_at_another():
+    at_30, at_20 = HumanML(fps=30.0), HumanML()
+    motion = with_features(at_30, Motion(walk(30), 30.0, text="walks", id="a"))
+    assert with_features(at_30, motion) is motion
+    other = with_features(at_20, motion)
+    assert (other.fps, other.text, other.id) == (20.0, "walks", "a")
+    assert len(other.features) == pytest.approx(len(motion.features) * 2 / 3, abs=1)
+    damaged = replace(motion, features=motion.features[:, :100])
+    says = f"a: features have shape ({len(motion.features)}, 100), not (frames, 263)"
+    with one_line_error(re.escape(says)):
+        with_features(at_30, damaged)
+    infinite = motion.features.copy()
+    infinite[3, 7] = np.inf
+    with one_line_error("a: features contain NaN or infinite values"):
+        with_features(at_30, replace(motion, features=infinite))

@@ -422,7 +422,7 @@ def test_sixteen_streams_run_at_once(model, shown):
     live.block(names[0], WALK, 30)
     clock.time = 121.0  # all others have ended
     live.block("", WALK, 0)
-    assert list(live._streams)[0] == names[0]
+    assert next(iter(live._streams)) == names[0]
     assert len(live._streams) == 2
 
 

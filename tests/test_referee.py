@@ -926,7 +926,8 @@ def walking(*legs: tuple[float, float, float], facing: float = 0.0, fps: float =
     joints = np.repeat(still[None], len(ground), axis=0)
     turn = np.radians(facing)
     x, z = joints[..., 0].copy(), joints[..., 2].copy()
-    joints[..., 0], joints[..., 2] = np.cos(turn) * x + np.sin(turn) * z, np.cos(turn) * z - np.sin(turn) * x  # fmt: skip
+    joints[..., 0] = np.cos(turn) * x + np.sin(turn) * z
+    joints[..., 2] = np.cos(turn) * z - np.sin(turn) * x
     joints[..., [0, 2]] += ground[:, None]
     return Body(joints, fps)
 

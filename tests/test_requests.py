@@ -27,11 +27,11 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.processes.guidance import Positions
 from flame_mdm.sampler_options import SamplerOptions
-from flame_mdm.sampling import generation, motion_request, resolution
+from flame_mdm.sampling import generation, motion_request, output, resolution
 from flame_mdm.sampling.generation import _edit, _rows, _stages, best
 from flame_mdm.sampling.keywords import EditKeywords, SamplerKeywords, SamplingKeywords
 from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest, path_targets
-from flame_mdm.sampling.output import degenerate_notes, summary
+from flame_mdm.sampling.output import degenerate_notes, refuse_no_condition, summary
 from flame_mdm.sampling.resolution import (
     ResolvedPrompt,
     ResolvedRequest,
@@ -629,3 +629,155 @@ def test_samples_of_different_requests_are_written_to_different_folders(model, m
         assert folder(**same) == first
     monkeypatch.setattr(model, "sha256", "f00d")
     assert folder() != first
+
+
+@pytest.mark.parametrize(
+    ("options", "fps", "lengths"),
+    [
+        ({"seconds": 0.5}, 30.0, [15.0, 15.0]),
+        ({"seconds": (0.5, 2)}, 12.5, [6.25, 25.0]),
+        ({"seconds": np.array([1.0, 3.0])}, 20.0, [20.0, 60.0]),
+        ({"seconds": 0.0}, 20.0, [0.0, 0.0]),
+        ({"frames": (3, 40)}, 30.0, [3.0, 40.0]),
+        ({"frames": np.int64(7)}, 30.0, [7.0, 7.0]),
+        ({}, 30.0, [None, None]),
+    ],
+    ids=str,
+)
+def test_lengths_are_requested_in_frames_or_in_seconds_at_the_rate_of_the_model(
+    options, fps: float, lengths
+):
+    assert SamplingRequest(texts=["walks", "jumps"], **options).lengths(fps) == lengths
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("walks@2", [("walks", 2.0)]),
+        ("walks @ 2.5s | sits", [("walks", 2.5), ("sits", None)]),
+        ("mails a@b @3", [("mails a@b", 3.0)]),
+        ("a | b|c @1e0", [("a", None), ("b", None), ("c", 1.0)]),
+    ],
+)
+def test_a_part_ends_with_its_seconds(text: str, parts):
+    assert motion_request.read_parts(text) == parts
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("walks | | sits", "'walks | | sits': part 2 is empty"),
+        ("walks |", "'walks |': part 2 is empty"),
+        ("@3", "'@3': part 1 is empty"),
+        ("walks | sits @0", "'sits @0': the duration of a part must be a number of seconds above 0"),
+        ("walks @inf", "'walks @inf': the duration of a part"),
+        ("walks @-1", "'walks @-1': the duration of a part"),
+        ("walks @x", "'walks @x': the duration of a part"),
+    ],
+)  # fmt: skip
+def test_a_part_that_is_empty_or_has_no_duration_is_named(text: str, message: str):
+    with pytest.raises(UserError) as error:
+        motion_request.read_parts(text)
+    assert str(error.value).startswith(message)
+
+
+def test_options_of_editing_methods_are_those_of_the_papers():
+    edit = EditRequest(strength=0.5)
+    shared = {"resample": 1, "strength": 0.5}
+    assert edit.method_options("mdm") == {"mode": "x0", **shared}
+    assert edit.method_options("flame") == {"mode": "x_t", "blend": "after", **shared}
+    assert edit.method_options("flame_code") == {"mode": "x_t", "blend": "before", **shared}
+    assert edit.method_options("mfm") == {"mode": "trajectory", "until": 0.2, **shared}
+    assert EditRequest(until=0.0).method_options("mfm")["until"] == 0
+    assert EditRequest(resample=4).method_options("flame")["resample"] == 4
+    for options, method in (({"until": 0.0}, "mdm"), ({"resample": 2}, "mfm")):
+        with pytest.raises(UserError, match=rf"applies only to method=.*, not to {method}"):
+            EditRequest(**options, method=method)
+
+
+def test_a_pair_is_one_range_and_a_list_of_pairs_is_several():
+    assert EditRequest(region=[2, 5]).ranges == [(2, 5)]
+    assert EditRequest(region=[(2, 5)], joints="arms").ranges == [(2, 5)]
+    assert EditRequest(region_seconds=[[0, 0.5], [1, 2]]).ranges == [(0, 0.5), (1, 2)]
+    assert EditRequest(region="prefix").ranges is None
+    assert EditRequest(strength=1).ranges is None
+    for wrong in ([], [1], [1, 2, 3], [[0, 1], 2], [0, math.inf], "0,1"):
+        with pytest.raises(UserError, match=r"^region_seconds="):
+            EditRequest(region_seconds=cast(Any, wrong))
+
+
+def test_warnings_name_the_text_if_there_are_several(model):
+    texts = ["a person walks moonily", "a person kicks four times", "a person bows"]
+    assert resolve(SamplingRequest(texts=texts), model).warnings == (
+        "'a person walks moonily': not understood: moonily",
+        "'a person kicks twice | a person kicks twice': four times is sampled as 2 + 2",
+    )
+    assert resolve(SamplingRequest(texts=texts[0]), model).warnings == ("not understood: moonily",)
+    parts = resolve(SamplingRequest(texts="walks moonily @1 | jumps @1"), model)
+    assert parts.warnings == ("not understood: moonily",)
+    assert (parts.is_sequence, parts.prompts[0].is_split) == (True, False)
+    split = resolve(SamplingRequest(texts=texts[1], seconds=1.5), model).prompts[0]
+    assert (split.is_split, split.frames) == (True, (30, 30))
+
+
+def test_a_prompt_that_is_refused_leaves_the_others(model):
+    refused: dict[int, UserError] = {}
+    texts = ["xyzzy", "a person walks @0.1", "a person jumps twice", "a person waves @1"]
+    resolved = resolve(SamplingRequest(texts=texts), model, refused)
+    assert sorted(refused) == [0, 1]
+    assert [prompt.text for prompt in resolved.prompts] == texts[2:]
+    assert [prompt.frames for prompt in resolved.prompts] == [(44,), (20,)]
+    assert "0.1 seconds is too short" in str(refused[1])
+
+
+def test_examples_are_spread_over_the_captions_or_actions_of_the_model():
+    captions = [f"caption {number}" for number in range(23)]
+    actions = ["walk", "run"]
+    for kind, facts, says in (
+        ("text", {"captions": captions, "actions": actions}, 'text="a person walks". Examples: caption 0; caption 4; caption 8; caption 12; caption 16'),
+        ("action", {"captions": captions, "actions": actions}, "action=NAME. Examples: walk; run"),
+        ("text", {"captions": captions[:3]}, 'text="a person walks". Examples: caption 0; caption 1; caption 2'),
+        ("none", {}, "unconditioned=true"),
+    ):  # fmt: skip
+        untold: Any = SimpleNamespace(conditioned_on=kind, facts=facts)
+        with pytest.raises(UserError) as error:
+            refuse_no_condition(untold)
+        assert str(error.value) == f"nothing to sample. Set {says}"
+
+
+@pytest.mark.parametrize("texts", [["walks"] * 9, ["walks", ""] + ["jumps"] * 7])
+def test_a_folder_has_all_motions_and_pictures_of_eight(texts: list[str], tmp_path, monkeypatch):
+    shown: dict[str, Any] = {}
+
+    def picture(path: Path, motions: Sequence[Motion], *titles: str, body: Any = None) -> None:
+        shown[path.name] = [motion.text for motion in motions], *titles
+        path.write_text("picture")
+
+    for name in ("write_player", "write_gif", "write_mp4", "contact_sheet"):
+        monkeypatch.setattr(output, name, picture)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name in ("motion_009.npz", "motion_0010.npz", "motions.mp4", "trajectory.png", "notes.npz"):
+        (folder / name).write_text("earlier")
+    motions = [
+        Motion(np.full((3, 22, 3), number, np.float32), 20.0, text=text)
+        for number, text in enumerate(texts)
+    ]
+    output.write_motions(folder, motions, {"seed": 5}, body=None)
+    titles = [text or "unconditioned" for text in texts]
+    assert shown == {
+        "player.html": (titles, "walks" if texts[1] else "Motions"),
+        "motions.gif": (titles[:8],),
+        "motions.png": (titles[:8],),
+    }
+    files = [f"motion_{number:03d}.npz" for number in range(9)]
+    pictures = ["motions.gif", "motions.png", "player.html"]
+    assert sorted(path.name for path in folder.iterdir()) == [*files, *pictures, "notes.npz"][:9] + sorted([*pictures, "notes.npz"])  # fmt: skip
+    with np.load(folder / "motion_008.npz") as file:
+        assert file["joints"].max() == 8
+        assert int(file["seed"]) == 5
+    output.write_motions(folder, motions[:1], {}, motions[:2], mp4=True)
+    assert shown["trajectory.png"] == (texts[:2],)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        [files[0], *pictures, "notes.npz", "motions.mp4", "trajectory.png"]
+    )

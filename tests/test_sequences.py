@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -19,9 +20,11 @@ from flame_mdm.conditions import vocabulary
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
 from flame_mdm.losses import bone_lengths
 from flame_mdm.processes.guidance import Positions, reach
 from flame_mdm.processes.windows import blended, cover, spans
+from flame_mdm.representations.rotation import rotate_y
 from flame_mdm.sampling import targets as targets_module
 from flame_mdm.sampling.motion_request import read_parts
 from flame_mdm.sampling.sequences import overlap, part_frames
@@ -746,3 +749,93 @@ def test_sentences_of_several_actions_are_split_at_their_verbs(subtests):
         "walks in limp style",
         "turns in limp style",
     ]
+
+
+@pytest.mark.parametrize("heading", [None, 0.0, -90.0, 135.0])
+def test_a_pose_is_turned_to_its_heading_about_its_root(model, heading, monkeypatch):
+    """A pose that faces 30 degrees to the left and stands at (3, 1) is placed at a position."""
+    still = np.asarray(Synthetic(clips=1).clip(0, 20.0).motion)[:1]
+    turn = torch.tensor(math.radians(30.0) - facing(still[0]))
+    joints = rotate_y(torch.from_numpy(still).double(), turn).numpy()
+    joints[..., [0, 2]] += np.array([3.0, 1.0]) - joints[:, :1, [0, 2]]
+    features = np.arange(263, dtype=np.float32)[None]
+    monkeypatch.setattr(
+        targets_module, "read_motion", lambda *_: Motion(joints, 20.0, features=features)
+    )
+    entry = {"time": 0.5, "file": "pose.npz", "position": [0.5, -0.25]}
+    entry |= {} if heading is None else {"heading": heading}
+    goal = read_targets(model.representation, {"poses": [entry]}).positions
+    assert set(goal.frames.tolist()) == {10}
+    pose = goal.values.reshape(22, 3).numpy()
+    expected = 30.0 if heading is None else heading
+    assert math.degrees(facing(pose)) == pytest.approx(expected, abs=1e-3)
+    np.testing.assert_allclose(pose[0], [0.5, joints[0, 0, 1], -0.25], atol=1e-5)
+    np.testing.assert_allclose(pose[:, 1], joints[0, :, 1], atol=1e-5)
+    apart = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (pose, joints[0])]
+    np.testing.assert_allclose(*apart, atol=1e-5)
+    free = read_targets(model.representation, {"poses": [entry | {"position": None}]})
+    ((frame, kept),) = free.poses
+    assert (frame, kept.tolist()) == (10, features[0].tolist())
+    assert free.positions.axes.tolist() == [1]  # the height of the root
+    assert float(free.positions.values[0]) == pytest.approx(joints[0, 0, 1], abs=1e-6)
+    other = read_targets(model.representation, {"poses": [entry | {"position": [None, 2.0]}]})
+    assert 0 not in other.positions.axes.tolist()
+
+
+def facing(pose: np.ndarray) -> float:
+    """The heading of a pose (22, 3) in radians, from its hips and shoulders."""
+    left = pose[1] - pose[2] + pose[16] - pose[17]
+    return math.atan2(-left[2], left[0])
+
+
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        ([(1.0, 10.5), (2.0, 18.6)], None),
+        ([(1.0, 10.5), (2.0, 21.1)], r"root\[1\]: 10.6 m from targets: root\[0\] in 1 seconds"),
+        ([(2.0, 18.6), (1.0, 10.6)], r"root\[1\]: 10.6 m from the start in 1 seconds is too far"),
+        ([(1.0, 0.0), (2.0, 10.5)], None),
+        ([(0.0, 2.6)], r"root\[0\]: 2.6 m from the start in 0 seconds is too far"),
+        ([(0.0, 2.5)], None),
+    ],
+)
+def test_waypoints_require_eight_meters_per_second_at_most(model, goals, message):
+    """The body reaches 2.5 m farther than it runs, from one waypoint to the next in time."""
+    content = {"root": [{"time": time, "position": [0, z]} for time, z in goals]}
+    if message is None:
+        read = read_targets(model.representation, content)
+        assert read.positions.values.tolist()[1::2] == pytest.approx([z for _, z in goals])
+    else:
+        with pytest.raises(UserError, match=message):
+            read_targets(model.representation, content)
+
+
+@pytest.mark.parametrize("fps", [20.0, 30.0])
+def test_messages_about_lengths_are_in_seconds_of_the_model(fps: float):
+    made: Any = SimpleNamespace(
+        representation=SimpleNamespace(fps=fps),
+        facts={"max_frames": 90},
+        denoiser=SimpleNamespace(context_frames=0),
+    )
+    longest = {20.0: "4.5", 30.0: "3"}[fps]
+    long = {20.0: "5", 30.0: "3.33333"}[fps]
+    with pytest.raises(UserError) as error:
+        part_frames(made, "a", [("a", None)], [100.0], is_sequence=False, loop=False)
+    assert str(error.value) == (
+        f"{long} seconds (100 frames) cannot be sampled: the model was trained on motions of up to "
+        f"{longest} seconds. To generate a longer motion in overlapping windows, state the seconds "
+        f"in the text: 'walks @{long}'"
+    )
+    with pytest.raises(UserError, match=rf"0.1 seconds is too short. Use at least {overlap(made) / fps:g} seconds, the overlap"):  # fmt: skip
+        part_frames(made, "a", [("a", 0.1)], [None], is_sequence=True, loop=False)
+    with pytest.raises(UserError, match=r"^'a \| b': 601 seconds is too long. Use at most 600 seconds"):  # fmt: skip
+        part_frames(made, "a | b", [("a", 600), ("b", 1)], [None] * 2, is_sequence=True, loop=False)
+    window = 90 - overlap(made)
+    parts = [("a", 600 - 60 / fps), ("b", None)]
+    lengths = part_frames(made, "", parts, [None, 60.0], is_sequence=True, loop=False)
+    assert lengths == [600 * fps - 60, 60]
+    alone = [("a", None)]
+    three = min(90, 3 * fps)
+    for loop, several, length in ((False, False, three), (True, False, min(3 * fps, window))):
+        usual: list[float | None] = [None]
+        assert part_frames(made, "", alone, usual, is_sequence=True, loop=loop) == [length], several

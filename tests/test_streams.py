@@ -962,3 +962,44 @@ def test_an_action_counts_as_recognized_if_it_is_shown_in_time(subtests):
             request = [[("kicks", {"action": "kick"})]]
             recognized = drift.recognized(motion, request, FPS)
             assert recognized["right"] == recognized["in_time"] == right
+
+
+def test_times_of_a_stream_are_frames_at_the_rate_of_the_model(model, monkeypatch):
+    monkeypatch.setattr(model.representation, "fps", 30.0)
+    running = stream(model, "a person walks")
+    schedule = running._streams.schedules[0]
+    running.change("a person jumps", at=1.5)
+    assert schedule.changes == [(0, "a person walks"), (45, "a person jumps")]
+    block = next(running)
+    assert (len(block.joints), block.fps, running.frames) == (30, 30.0, 30)
+    assert len(next(running).joints) == 15  # until the change
+    running.go_back(0.5)
+    assert running.frames == 15
+    assert schedule.changes == [(0, "a person walks")]
+    assert running._streams._root == pytest.approx(block.joints[14, 0, [0, 2]].tolist(), abs=1e-5)
+    with pytest.raises(UserError, match=r"^at=0.4: the stream is already at 0.5 seconds"):
+        running.change("a person jumps", at=0.4)
+    again = next(running).joints
+    apart = np.linalg.norm(again[0, 0] - block.joints[14, 0])
+    assert apart < 0.1 + np.linalg.norm(np.diff(block.joints[:, 0], axis=0), axis=1).max()
+
+
+def test_streams_of_actions_and_without_a_condition_are_encoded_as_such(model, monkeypatch):
+    batches: list[tuple[MotionBatch, bool]] = []
+    prefix, _ = starting_point(model, None)
+    monkeypatch.setitem(model.facts, "actions", ["run", "walk", "sit"])
+    monkeypatch.setattr(
+        model, "encode", lambda batch, unconditioned: batches.append((batch, unconditioned))
+    )
+    names = ["sit", "run"]
+    for kind in ("action", "none", "text"):
+        streams = Streams(
+            model, ["a#0", "b#0"], names, prefix.expand(2, -1, -1), None, SamplerOptions(), kind=kind
+        )  # fmt: skip
+        streams._encode(names)
+        streams._encode(list(names))  # not encoded again
+        streams._encode(["sit", "walk"])
+    numbers = [batch.action.tolist() for batch, _ in batches[:2] if batch.action is not None]
+    assert numbers == [[2, 0], [2, 1]]
+    assert [unconditioned for _, unconditioned in batches] == [False] * 2 + [True] * 2 + [False] * 2
+    assert [batch.text for batch, _ in batches] == [None] * 4 + [["sit", "run"], ["sit", "walk"]]

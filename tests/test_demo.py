@@ -892,3 +892,25 @@ def test_connections_that_have_waited_longest_make_room_for_a_new_one(
     assert [k for k, other in enumerate(others) if other.closed] == closed
     assert not new.closed
     assert (new.limit_concurrency == 0) == is_refused
+
+
+def test_the_page_offers_texts_that_the_model_knows_and_lists_its_words():
+    pytest.importorskip("gradio", reason="gradio is not installed")
+    from flame_mdm.demo.studio_page import EXAMPLES, _examples, _vocabulary
+
+    captions = [f"caption {number}" for number in range(20)]
+    facts: dict[str, Any] = {"captions": captions, "actions": ["walk", "<run>"]}
+    labeled: Any = SimpleNamespace(conditioned_on="action", facts=facts | {"vocabulary": ["a"]})
+    assert _examples(labeled) == {"walk": "", "<run>": ""}
+    assert _vocabulary(labeled) == "walk, &lt;run&gt;"
+    read: Any = SimpleNamespace(conditioned_on="text", facts=facts | {"vocabulary": ["a", "b"]})
+    assert list(_examples(read)) == [captions[number] for number in (0, 3, 6, 9, 12, 15)]
+    assert _vocabulary(read) == "a, b"
+    unknown: Any = SimpleNamespace(conditioned_on="none", facts={})
+    assert _examples(unknown) == {"a person walks": ""}
+    assert _vocabulary(unknown) == "The model does not list them."
+    words = "a person walks forward runs waves with the left hand jumps twice"
+    single = {"actions": ["walk", "wave"], "verbs": ["walks"], "vocabulary": words.split()}
+    reader: Any = SimpleNamespace(conditioned_on="text", facts=single)
+    assert list(_examples(reader)) == [EXAMPLES[0], EXAMPLES[2]]
+    assert all(picture.startswith("data:image/webp") for picture in _examples(reader).values())

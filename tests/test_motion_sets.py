@@ -21,6 +21,7 @@ import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.commands.sample import SampleSettings
 from flame_mdm.data.synthetic import Attributes, example
+from flame_mdm.errors import UserError
 from flame_mdm.formats import fbx, fbx_scene, glb, glb_animation
 from flame_mdm.formats.cleanup import bend
 from flame_mdm.formats.gaits import (
@@ -54,7 +55,13 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import JOINT, SMPL22
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.sampling import motion_sets
-from flame_mdm.sampling.motion_sets import make_set, read_set, rig_clips, write_set
+from flame_mdm.sampling.motion_sets import (
+    SetMotion,
+    make_set,
+    read_set,
+    rig_clips,
+    write_set,
+)
 from flame_mdm.sampling.reading import decoded, with_features
 from flame_mdm.visualize.body import mannequin
 
@@ -998,3 +1005,37 @@ def test_the_cycle_of_a_gait_is_the_pair_of_frames_that_differ_least(walk: Groun
     assert cycle is not None
     assert (cycle.first, cycle.last) == min(differences, key=lambda pair: differences[pair])
     assert cycle.difference == pytest.approx(min(differences.values()))
+
+
+def test_a_set_that_states_motions_alone_has_the_documented_values(tmp_path):
+    path = tmp_path / "my.yaml"
+    path.write_text("stand: Idle\nmotions:\n  Idle: {kind: loop, text: stands}\n")
+    content = read_set(str(path))
+    assert content.model_dump() == {
+        "stand": "Idle",
+        "motions": {"Idle": {"text": "stands", "kind": "loop", "seconds": None, "degrees": 0.0}},
+        "prefix": "",
+        "format": "fbx",
+        "rig": "unreal",
+        "fps": 30.0,
+        "candidates": 8,
+    }
+    other = motion_sets.changed(content, fps=60.0, rig=None, format="glb")
+    assert (other.fps, other.rig, other.format, other.candidates) == (60.0, None, "glb", 8)
+    assert other.motions == content.motions
+    for values, message in (
+        ({"fps": 240.1}, "set: fps is 240.1"),
+        ({"fps": 9.9}, "set: fps is 9.9"),
+        ({"rig": "unty"}, "rig=unty: unknown. Did you mean unity?"),
+    ):
+        with pytest.raises(UserError) as error:
+            motion_sets.changed(content, **values)
+        assert str(error.value).startswith(message)
+    assert motion_sets.changed(content, fps=240.0).fps == 240
+    assert motion_sets.changed(content, fps=10.0).fps == 10
+
+
+def test_a_motion_that_no_candidate_shows_is_left_out_with_its_direction_or_angle():
+    gait_, turn_ = (SetMotion(text="a", kind=kind, degrees=-45.5) for kind in ("gait", "turn"))
+    assert motion_sets._missing(gait_) == "goes steadily in the direction of -45.5 degrees"
+    assert motion_sets._missing(turn_) == "turns by -45.5 degrees"

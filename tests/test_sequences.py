@@ -26,8 +26,8 @@ from flame_mdm.processes.guidance import Positions, reach
 from flame_mdm.processes.windows import blended, cover, spans
 from flame_mdm.representations.rotation import rotate_y
 from flame_mdm.sampling import targets as targets_module
-from flame_mdm.sampling.motion_request import read_parts
-from flame_mdm.sampling.sequences import overlap, part_frames
+from flame_mdm.sampling.motion_request import SamplingRequest, read_parts
+from flame_mdm.sampling.sequences import overlap, part_frames, windows
 from flame_mdm.sampling.targets import Targets, errors, read_targets
 
 CPU, TEXT = torch.device("cpu"), "a person walks forward"
@@ -826,7 +826,10 @@ def test_messages_about_lengths_are_in_seconds_of_the_model(fps: float):
         f"{longest} seconds. To generate a longer motion in overlapping windows, state the seconds "
         f"in the text: 'walks @{long}'"
     )
-    with pytest.raises(UserError, match=rf"0.1 seconds is too short. Use at least {overlap(made) / fps:g} seconds, the overlap"):  # fmt: skip
+    shortest = (
+        f"0.1 seconds is too short. Use at least {overlap(made) / fps:g} seconds, the overlap"
+    )
+    with pytest.raises(UserError, match=shortest):
         part_frames(made, "a", [("a", 0.1)], [None], is_sequence=True, loop=False)
     with pytest.raises(UserError, match=r"^'a \| b': 601 seconds is too long. Use at most 600 seconds"):  # fmt: skip
         part_frames(made, "a | b", [("a", 600), ("b", 1)], [None] * 2, is_sequence=True, loop=False)
@@ -839,3 +842,33 @@ def test_messages_about_lengths_are_in_seconds_of_the_model(fps: float):
     for loop, several, length in ((False, False, three), (True, False, min(3 * fps, window))):
         usual: list[float | None] = [None]
         assert part_frames(made, "", alone, usual, is_sequence=True, loop=loop) == [length], several
+
+
+@pytest.mark.parametrize("mask_padding", [True, False])
+def test_each_window_has_the_text_or_the_action_of_its_part(mask_padding: bool):
+    made: Any = SimpleNamespace(
+        representation=SimpleNamespace(fps=20.0),
+        facts={"max_frames": 60, "actions": ["sit", "walk", "jump"]},
+        denoiser=SimpleNamespace(context_frames=0, mask_padding=mask_padding),
+        device=CPU,
+    )
+    names = [["walk", "sit"], ["jump"]]
+    lengths = [[90, 20], [30]]
+    for request in (SamplingRequest(actions=["a", "b"]), SamplingRequest(texts=["a", "b"])):
+        covered = windows(made, request, names, lengths)
+        expected = [
+            (row, names[row][part], first, size)
+            for row, parts in enumerate(lengths)
+            for part, first, size in spans(parts, 60, overlap(made), False)
+        ]
+        labels = [name for _, name, _, _ in expected]
+        assert [name for _, name, _, _ in expected].count("walk") > 1
+        if request.kind == "action":
+            assert covered.batch.text is None
+            assert covered.batch.action is not None
+            assert covered.batch.action.tolist() == [made.facts["actions"].index(x) for x in labels]
+        else:
+            assert covered.batch.text == labels
+        sizes = [size for *_, size in expected]
+        assert covered.batch.mask.sum(1).tolist() == sizes
+        assert covered.batch.mask.shape[1] == (max(sizes) if mask_padding else 60)

@@ -1003,3 +1003,17 @@ def test_streams_of_actions_and_without_a_condition_are_encoded_as_such(model, m
     assert numbers == [[2, 0], [2, 1]]
     assert [unconditioned for _, unconditioned in batches] == [False] * 2 + [True] * 2 + [False] * 2
     assert [batch.text for batch, _ in batches] == [None] * 4 + [["sit", "run"], ["sit", "walk"]]
+
+
+def test_waypoints_are_reached_one_after_another_within_three_decimeters():
+    route = waypoints.Route([(0.0, 1.0), (0.1, 1.0), (2.0, 1.0), (0.0, 1.0)])
+    roots = np.array([[0, 9, 0.69], [0.1, 9, 0.8], [1.7, 9, 1.0], [1.71, 9, 1.0], [0, 9, 1.0]])
+    route.follow(100, roots)
+    assert route.reached == [101, 101, 103, 104]
+    assert route.left == []
+    route.go_back(103)
+    assert (route.reached, route.left) == ([101, 101], [(2.0, 1.0), (0.0, 1.0)])
+    route.go_back(102)
+    assert len(route.left) == 2
+    route.follow(103, roots[3:4])
+    assert route.reached == [101, 101, 103]

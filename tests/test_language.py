@@ -6,23 +6,26 @@ import re
 from collections import defaultdict
 from html import unescape
 from itertools import chain
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from support.fixtures import ROOT
 
-from flame_mdm.conditions.language import meaning
+from flame_mdm.conditions.language import meaning, tokens
 from flame_mdm.conditions.language.abilities import Abilities
+from flame_mdm.conditions.language.attributes import MEASURES
 from flame_mdm.conditions.language.meaning import is_thing, nearest_actions
 from flame_mdm.conditions.language.parsing import understand
 from flame_mdm.conditions.language.reading import NotUnderstood, Reader
 from flame_mdm.conditions.language.spelling import corrections, distance
 from flame_mdm.conditions.language.tables import actions, words_of
-from flame_mdm.conditions.language.tokens import corrected_to_action, tokenize
+from flame_mdm.conditions.language.tokens import corrected_to_action, is_english, tokenize
 from flame_mdm.conditions.language.understanding import Mention, Understanding
 from flame_mdm.conditions.language.vectors import FILE, WordTable, word_table
-from flame_mdm.conditions.language.wording import caption, predicate
+from flame_mdm.conditions.language.wording import attribute_words, caption, predicate
+from flame_mdm.conditions.prompts import read_prompt
 from flame_mdm.conditions.vocabulary import known_form
 from flame_mdm.data.synthetic import draw_captions, prompts
 from flame_mdm.data.synthetic_actions import ACTIONS
@@ -607,6 +610,56 @@ def test_a_word_is_a_thing_if_three_of_the_five_closest_words_are(monkeypatch, t
     assert not meaning.is_thing("unlisted")
 
 
+@pytest.mark.parametrize("measure", [measure for measure in MEASURES if measure != "step"])
+def test_a_number_of_a_measure_is_no_count(measure: str):
+    (mention,) = understand(f"a person hops 3 {measure}").mentions
+    assert (mention.action, mention.attributes.get("count")) == ("hop", None)
+    assert understand("a person hops 3 steps").mentions[0].attributes["count"] == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("count", 1, "once"),
+        ("count", 6, "six times"),
+        ("count", 7, "7 times"),
+        ("amount", "half", "halfway around"),
+        ("amount", "quarter", "a quarter"),
+        ("direction", "left", "to the left"),
+        ("direction", "right", "to the right"),
+        ("direction", "circle", "in a circle"),
+        ("direction", "up", "up"),
+        ("speed", "fast", "quickly"),
+        ("speed", "normal", "normal"),
+        ("side", "both", "both"),
+    ],
+)
+def test_an_attribute_is_named_as_in_captions(name: str, value: str | int, words: str):
+    assert attribute_words(name, value) == words
+
+
+@pytest.mark.parametrize(("rank", "is_frequent"), [(11_999, True), (12_000, False), (None, False)])
+def test_the_twelve_thousand_most_frequent_words_are_english(rank, is_frequent, monkeypatch):
+    table = SimpleNamespace(rank=lambda word: rank, vector=lambda word: None)
+    monkeypatch.setattr(tokens, "word_table", lambda: table)
+    assert is_english("zzqxvv") == is_frequent
+    doge = tokenize("doge")
+    words = [token.word for token in corrected_to_action(doge, [0])]
+    assert words == (["doge"] if is_frequent else ["dodge"])
+
+
+def test_words_that_a_model_gets_unchanged_are_not_said_to_change():
+    text = "a person kicks four times nervously"
+    whole = read_prompt(text, [(text, None)], FACTS)
+    assert (whole.captions, whole.changes) == ((text,), ("not understood: nervously",))
+    parts = read_prompt(f"{text} | bwos", [(text, 2.0), ("bwos", None)], FACTS)
+    assert parts.captions == (text, "a person bows")
+    assert parts.changes == ("not understood: nervously", "'bwos' is read as 'bows'")
+    split = read_prompt(text, [(text, None)], FACTS, splits=True)
+    assert split.captions == ("a person kicks twice",) * 2
+    assert split.changes == ("four times is sampled as 2 + 2", "not understood: nervously")
+
+
 GOLDEN = ROOT / "tests" / "golden" / "language.json"
 MORE_TEXTS = [
     "", "!!!", "kicks ４ times", "kicks x 3, then faster", "jumps 13 times", "walks, then slower",
@@ -631,6 +684,7 @@ MORE_TEXTS = [
     "spins clockwise twice", "turns clockwise", "swings a sword with the right hand at a goblin",
     "dances happily like a robot", "a person limps slowly", "crouches 7 times", "jumps 4 times",
     "a person walks four steps nervously", "climbs a ladder", "a person is upset", "a blue grenade",
+    "walks 10 percent faster", "jumps 2 feet high", "turns a quarter", "turns a quarter to the left quickly",
 ]  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from flame_mdm.formats.readers import read
 from flame_mdm.safe_io import read_package_yaml, sha256
 from flame_mdm.sampling import targets
 from flame_mdm.sampling.output import default_folder
+from flame_mdm.sampling.prompt_file import PromptFile
 
 SENTENCES = read_package_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
 PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, waving"]
@@ -322,3 +323,41 @@ def test_distances_from_targets_are_printed_in_centimeters_over_all_motions(monk
     monkeypatch.setattr(targets, "errors", lambda *_: np.array(next(distances)))
     line = _distance(cast(Any, None), cast(Any, [None, None]))
     assert line == "distance from the targets: mean 5.1 cm, max 12.3 cm"
+
+
+def test_refused_lines_keep_their_numbers_and_the_others_their_lengths(tmp_path):
+    path = tmp_path / "prompts.txt"
+    lines = [
+        "\ufeffwalks",
+        "",
+        "  waves @0",
+        "sits | ",
+        "jumps  ",
+        "x" * 2001,
+        "y" * 2000,
+        "bows @2",
+    ]
+    path.write_text("\r\n".join(lines), encoding="utf-8", newline="")
+    file = PromptFile.read(str(path))
+    assert list(file.lines) == [1, 3, 4, 5, 6, 7, 8]
+    assert sorted(file.refused) == [3, 4, 6]
+    assert list(file.accepted.values()) == ["walks", "jumps", "y" * 2000, "bows @2"]
+    assert file.lengths("seconds", [1, 3, 4, 5, 6, 7, 8]) == [1, 5, 7, 8]
+    assert file.lengths("seconds", 2.5) == 2.5
+    with pytest.raises(UserError) as error:
+        file.lengths("frames", [1, 2])
+    assert str(error.value) == (
+        "frames=[1, 2]: the number of lengths is 2, but the number of prompts is 7. "
+        "Use one length, or one per prompt"
+    )
+    file.refuse({1: UserError("first\nsecond"), 3: UserError("last")})
+    assert sorted(file.refused) == [3, 4, 5, 6, 8]
+    assert list(file.accepted) == [1, 7]
+    assert file.lengths("frames", range(10, 17)) == [10, 15]
+    shown = [line.removeprefix(f"{path}, ") for line in file.report()]
+    assert [line.split(":")[0] for line in shown] == [f"line {n}" for n in (3, 4, 5, 6, 8)]
+    assert (shown[2], shown[4]) == ("line 5: first", "line 8: last")
+    for content in ("", " \n\t\n", "walks\0"):
+        path.write_text(content)
+        with pytest.raises(UserError, match=r"contains no prompts\. Write one per line"):
+            PromptFile.read(str(path))

@@ -1006,5 +1006,27 @@ def test_walking_is_slower_than_running():
     assert KINDS["run"].measure(body, Claim("run")).number == pytest.approx(3.0, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("words", "seconds"),
+    [
+        ("for ten seconds", 10),
+        ("for about ten seconds", 10),
+        ("for 3 full seconds", 3),
+        ("for 2 s", 2),
+        ("for 12 secs", 12),
+        ("for a second", None),
+        ("for zero seconds", None),
+        ("for 100 seconds", None),
+        ("for 3 minutes", None),
+    ],
+)
+def test_seconds_are_read_with_a_word_before_or_after_the_number(words: str, seconds: int | None):
+    claims = read_claims(f"a person runs {words}")
+    assert [claim.seconds for claim in claims if claim.seconds is not None] == (
+        [] if seconds is None else [seconds]
+    )
+    assert Claim("run") in [replace(claim, words="") for claim in claims]
+
+
 if __name__ == "__main__":
     np.savez_compressed(MEASURED, allow_pickle=False, **measured())

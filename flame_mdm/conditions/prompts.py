@@ -2,7 +2,7 @@
 """Prompts as models read them: captions for each part, a summary, changes and unknown words."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flame_mdm.conditions.language.reading import Reader, Reading
@@ -107,6 +107,11 @@ def _with_actions(
         fitting = tuple(
             reading.seconds()[0] if reading and reading.steps else None for reading in single
         )
+        # No change applies to words that are passed to the model unchanged.
+        readings = [
+            replace(reading, changes=()) if one is None else reading
+            for reading, one in zip(readings, single, strict=True)
+        ]
     ignored = [word for reading in readings for word in reading.ignored]
     unread = [word for text in captions for word in unread_words(text, max_words)]
     return ReadPrompt(

@@ -536,12 +536,13 @@ def test_seconds_are_frames_at_the_rate_of_the_motion():
     assert torch.nonzero(~joints.all(1))[:, 0].tolist() == new
     arm = find_joints(representation.skeleton, "left_arm")
     assert torch.nonzero(~joints[20])[:, 0].tolist() == sorted(arm)
-    for options, shown in (
+    refused: list[tuple[dict[str, Any], str]] = [
         ({"region_seconds": [1.5, 2.02]}, "region_seconds=[1.5, 2.02]"),
         ({"region": [30, 61]}, "region=[30, 61]"),
         ({"region": [-1, 4]}, "region=[-1, 4]"),
         ({"region": [4, 4]}, "region=[4, 4]"),
-    ):
+    ]
+    for options, shown in refused:
         says = f"{shown} is not a range within this motion, which has 60 frames (2 seconds)"
         with one_line_error(re.escape(says)):
             kept_parts(representation, 60, EditRequest(**options))

@@ -690,7 +690,8 @@ def test_options_of_editing_methods_are_those_of_the_papers():
     assert edit.method_options("mfm") == {"mode": "trajectory", "until": 0.2, **shared}
     assert EditRequest(until=0.0).method_options("mfm")["until"] == 0
     assert EditRequest(resample=4).method_options("flame")["resample"] == 4
-    for options, method in (({"until": 0.0}, "mdm"), ({"resample": 2}, "mfm")):
+    refused: list[tuple[dict[str, Any], str]] = [({"until": 0.0}, "mdm"), ({"resample": 2}, "mfm")]
+    for options, method in refused:
         with pytest.raises(UserError, match=rf"applies only to method=.*, not to {method}"):
             EditRequest(**options, method=method)
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import zlib
 from collections import defaultdict
 from html import unescape
 from itertools import chain
@@ -26,7 +27,16 @@ from flame_mdm.conditions.language.understanding import Mention, Understanding
 from flame_mdm.conditions.language.vectors import FILE, WordTable, word_table
 from flame_mdm.conditions.language.wording import attribute_words, caption, predicate
 from flame_mdm.conditions.prompts import read_prompt
-from flame_mdm.conditions.vocabulary import known_form
+from flame_mdm.conditions.vocabulary import (
+    MAX_CAPTIONS,
+    advice,
+    hashed,
+    in_parts,
+    known_form,
+    nearest,
+    plainest,
+    vocabulary,
+)
 from flame_mdm.data.synthetic import draw_captions, prompts
 from flame_mdm.data.synthetic_actions import ACTIONS
 from flame_mdm.demo.chips import _with_action, chips
@@ -830,3 +840,131 @@ def test_tables_are_those_for_which_the_documented_shares_were_measured(committe
 
 if __name__ == "__main__":
     GOLDEN.write_text(json.dumps(golden(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("word", "seen", "form"),
+    [
+        *(
+            ("waving", ["wave"], "wave"),
+            ("hopping", ["hop"], "hop"),
+            ("walked", ["walks"], "walks"),
+        ),
+        *(("waves", ["waving"], "waving"), ("waved", ["waves"], "waves"), ("runs", ["run"], "run")),
+        *(("kicks", ["kicking"], "kicking"), ("stretches", ["stretched"], "stretched")),
+        *(("kicked", ["kicks", "kick"], "kick"), ("kicked", ["kicked", "kick"], "kicked")),
+        *(("used", ["us"], None), ("goes", ["go"], None), ("hopes", ["hop"], "hop")),
+        *(("ten", ["tens"], None), ("sevens", ["seven"], "seven"), ("walker", ["walk"], None)),
+    ],
+)
+def test_a_word_stands_for_another_form_of_itself(word: str, seen: list[str], form: str | None):
+    assert known_form(word, seen) == form
+
+
+@pytest.mark.parametrize("count", [3, 1000, 1001, 1999, 2500])
+def test_captions_of_a_checkpoint_are_evenly_spaced_in_sorted_order(count: int):
+    captions = [f"walks {number:04d} times" for number in range(count)]
+    facts = vocabulary([*captions, "Sits, sits"], [*captions[::-1], captions[0]])
+    size = min(count, MAX_CAPTIONS)
+    positions = [int(caption.split()[1]) for caption in facts["captions"]]
+    assert positions == [count * number // size for number in range(size)]
+    assert {len(caption.split()) for caption in facts["captions"]} == {3}
+    numbers = [f"{number:04d}" for number in range(count)]
+    assert facts["vocabulary"] == [*numbers, "sits", "times", "walks"]
+    assert vocabulary(captions).keys() == {"vocabulary"}
+
+
+@pytest.mark.parametrize("buckets", [7, 4096])
+def test_the_two_rows_of_a_word_are_the_digits_of_its_checksum(buckets: int):
+    for word in ("walks", "läuft"):
+        number = zlib.crc32(word.encode("utf-8"))
+        assert hashed(word, buckets) == (number % buckets, (number // buckets) % buckets)
+
+
+def test_similar_captions_share_content_words_and_then_a_large_fraction_of_all_words():
+    captions = [
+        "the man sits",
+        "a person waves",
+        "a person walks and then waves with one hand while standing",
+        "a man walks",
+        "a person walks",
+        "he walks and waves",
+    ]
+    ranked = nearest("a person walks and waves", captions, 9)
+    # Two content words, then one. Among equals, the shares of common words are 5/11 and 3/5, and
+    # 3/5, 3/5 and 2/6.
+    assert ranked == [captions[k] for k in (5, 2, 1, 4, 3)]
+    assert nearest("a person walks and waves", captions) == ranked[:3]
+    assert nearest("jumps", captions) == []
+    assert nearest("The man", captions, 1) == ["the man sits"]
+
+
+def test_plain_captions_begin_with_a_person_and_are_short():
+    captions = ["he sits", "a person walks", "a person sits", "the man runs", "a personal walk"]
+    assert plainest(captions) == [*captions[2:0:-1], captions[0], captions[3], captions[4]]
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (
+            "walks, turns left and waves. Then she sits",
+            ["walks", "turns left", "waves", "she sits"],
+        ),
+        ("raises both hands and waves", ["raises both hands and waves"]),
+        ("walks, waves in limp style", ["walks in limp style", "waves in limp style"]),
+        (
+            "walks in limp style, waves in limp style",
+            ["walks in limp style", "waves in limp style"],
+        ),
+        ("walks in limp style, waves", ["walks in limp style", "waves"]),
+        ("walks, slowly turns", ["walks", "slowly turns"]),
+        ("walks, a dog then he waves", ["walks, a dog", "he waves"]),
+        ("quickly then walks", ["quickly then walks"]),
+        ("first walks; afterwards sits!", ["walks", "sits"]),
+        ("walks\nsits", ["walks", "sits"]),
+        ("walks. Finally, sits.", ["walks", "sits"]),
+        ("walks, after that waves", ["walks", "waves"]),
+    ],
+)
+def test_a_sentence_has_one_part_per_verb(text: str, parts: list[str]):
+    verbs = ["walks", "turns", "waves", "sits", "raises"]
+    result = in_parts(text, verbs)
+    assert result == (parts if len(parts) > 1 else [text])
+
+
+@pytest.mark.parametrize(
+    ("text", "suggestion"),
+    [
+        ("a person wlaks", "a person walks"),
+        ("wlaks and wvaes", "walks and waves"),
+        ("waalxs quickly", "a man walks quickly"),
+        ("zalks quickly", "a man walks quickly"),
+        ("Wlaks ZZYZX", None),
+        ("Quickly zzyzx", "a man walks quickly"),
+        ("zzyzx", None),
+    ],
+)
+def test_typos_are_replaced_by_words_with_the_same_first_letter(text: str, suggestion: str | None):
+    facts = {
+        "vocabulary": ["a", "and", "man", "person", "quickly", "walks", "waves"],
+        "captions": ["a person waves", "a man walks quickly"],
+    }
+    (line,) = advice(text, facts)
+    assert line.partition(".")[2] == (f" Did you mean '{suggestion}'?" if suggestion else "")
+    assert advice("a person walked", facts) == []
+    assert advice("zzyzx", {}) == []
+
+
+def test_parts_of_a_prompt_keep_their_durations_and_words_that_are_not_read_are_named():
+    facts = {"vocabulary": ["person", "walks", "sits", "down"], "verbs": ["walks", "sits"]}
+    parts = [("a person walks happily", 1.5), ("sits down", None)]
+    read = read_prompt("", parts, facts, 3, splits=False)
+    assert read.parts == parts
+    assert read.captions == ("a person walks happily", "sits down")
+    assert read.unknown == ("happily", "happily")
+    assert (read.summary, read.changes, read.fitting) == ("", (), ())
+    unchecked = read_prompt("", [("jumps", 2.0)], facts, 3, check_words=False)
+    assert (unchecked.captions, unchecked.unknown) == (("jumps",), ("jumps",))
+    with pytest.raises(UserError, match="the model knows none of its content words"):
+        read_prompt("", [("walks", None), ("jumps", 2.0)], facts, 3)

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any, cast
 
 import numpy as np
@@ -953,3 +954,83 @@ def test_a_salute_lasts_two_fifths_of_a_second_at_any_rate(frames: int, salutes:
     view = arm_view(frames, 30, left_wrist=np.array([0.2, 1.6, 0.0]))
     shown = _arms(view.smooth, view.forward, 30.0)
     assert (shown == {"action": "salute", "side": "left"}) == salutes
+
+
+VARIANTS = """
+walk 10778.1341; run 5872.2105; turn 2974.0920; jump 2374.5218; wave 2408.1447;
+raise 2584.6757; kick 3106.2329; punch 4676.1959; squat 1446.3350; bow 746.6929;
+stand 730.0480; sit 179.9105; rise 1169.5234; dance 827.8001; leap 1690.3054;
+pick 1364.7221; throw 1961.7646; crawl 1553.9208; lie -541.4124; clap 2336.5787;
+salute 1568.7406; nod 2266.2360; idle 756.5110; look around 750.8615; stretch 884.7714;
+stretch sideways 1647.6497; lean 1507.5817; point 1578.9790; beckon 1564.2168;
+shrug 777.9679; celebrate 803.2100; pray 841.8385; cry 889.3299; laugh 760.7559;
+drink 1584.5226; phone 1633.2673; type 648.2723; wipe 1620.5179; knock 4514.8169;
+guitar 822.4992; cross arms 801.7220; hands on hips 768.1794; touch head 1563.9014;
+touch face 1560.7661; talk 760.1416; seated 587.8148; lift 697.6949; kneel 350.3586;
+jumping jacks 2310.5294; push-ups 554.6941; hop 4602.3353; sneak 1799.3604;
+crouch walk 2282.9387; limp 4120.9493; stagger 2174.4324; march 2583.7800;
+march in place 786.5589; run in place 821.0186; carry 2552.7427; push 1814.7712;
+pull -196.2240; climb ladder 2110.3902; climb stairs 2235.3830; stumble 2949.2577;
+strafe 1466.4304; skip 3603.6703; spin 1528.3566; waltz 743.3201; dodge 1866.7081;
+fighting stance 780.9399; duck 717.1750; hit 607.4964; block 706.6105; slash 1741.7079;
+fall -564.4881; get up 1010.2286
+"""
+"""Weighted sums of examples of each action over all attributes, at two durations."""
+
+
+def variants(name: str) -> list[Attributes]:
+    """All attributes that an action can have. Only walks ahead have a speed."""
+    values = ACTIONS[name].values
+    rows = [
+        {"action": name} | dict(zip(values, row, strict=True)) for row in product(*values.values())
+    ]
+    for row in rows:
+        if row.get("direction", "forward") != "forward":
+            row.pop("speed", None)
+    return [row for number, row in enumerate(rows) if row not in rows[:number]]
+
+
+def numbers_of(table: str) -> list[tuple[str, float]]:
+    rows = (line.strip().rpartition(" ") for line in table.split(";"))
+    return [(name, float(number)) for name, _, number in rows]
+
+
+@pytest.mark.parametrize(("name", "expected"), numbers_of(VARIANTS))
+def test_the_motions_of_all_variants_of_an_action_do_not_change(name: str, expected: float):
+    number, total = list(ACTIONS).index(name), 0.0
+    for variant, attributes in enumerate(variants(name)):
+        for seed, frames in ((2, 33), (3, 41)):
+            rng = np.random.default_rng((seed, number, variant))
+            total += weighted(_joints(rng, np.arange(frames) / 12.5, attributes))
+    assert total == pytest.approx(expected, abs=3e-3)
+
+
+ADDED = """
+wave 6061.2448; raise 5769.8184; clap 5160.0547; point 5318.2607; salute 5803.9051;
+phone 5238.4970; drink 5624.6969; carry 6078.9952; walk cycle 2299.9571;
+run cycle 3386.2477; run in place cycle 395.9350; sneak cycle 865.1895;
+crouch walk cycle 1161.0951
+"""
+"""Weighted sums of gestures during each of the other actions, and of parts of cycles."""
+
+
+@pytest.mark.parametrize(("name", "expected"), numbers_of(ADDED))
+def test_gestures_during_other_actions_and_parts_of_cycles_do_not_change(
+    name: str, expected: float
+):
+    drawn: list[Attributes] = []
+    if cycle := name.removesuffix(" cycle") if name.endswith(" cycle") else "":
+        number = list(CYCLES).index(cycle)
+        draws = [np.random.default_rng((5, number))]
+        drawn = [{"action": cycle, "ends": "cycle"} | CYCLES[cycle].draw(draws[0], cycle)]
+    else:
+        number = list(GESTURES).index(name)
+        draws = [np.random.default_rng((4, number, base)) for base in range(len(BASES))]
+        for base, rng in zip(BASES, draws, strict=True):
+            first, second = BASES[base].draw(rng, base), GESTURES[name].draw(rng, name)
+            drawn.append(first | second | {"action": base, "while": name})
+    motions = (
+        _joints(rng, np.arange(36) / 12.5, attributes)
+        for rng, attributes in zip(draws, drawn, strict=True)
+    )
+    assert sum(weighted(motion) for motion in motions) == pytest.approx(expected, abs=3e-3)

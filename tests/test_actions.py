@@ -550,3 +550,31 @@ def test_splits_of_the_action_sets_follow_from_the_hashes_of_their_names(tmp_pat
         of_action = [clip for clip in clips if clip.action == action]
         assert {clip.source: clip.split for clip in of_action} == expected
         assert [clip.source for clip in of_action] == [f"{label} {k // 10}" for k in range(30)]
+
+
+def test_all_videos_and_the_subjects_of_the_used_videos_are_counted():
+    source = UESTC("there")
+    videos = [(1, 8, 1), (2, 8, 2), (3, 7, 2), (1, 0, 1)]
+    source.videos = [
+        uestc.Video(k, f"{k}", 0, view, subject, side)
+        for k, (subject, view, side) in enumerate(videos)
+    ]
+    assert source.counts() == {"videos": 4, "subjects": 2}
+    assert [video.index for video in source.used] == [0, 2, 3]
+    assert source.count() == 3
+
+
+@pytest.mark.parametrize("side", [1, 2])
+def test_a_camera_of_negative_scale_has_the_depth_of_its_size(side: int):
+    rng = np.random.default_rng(0)
+    pose, root = rng.normal(size=(4, 72)), rng.normal(size=(4, 3))
+    camera = rng.uniform(0.2, 0.9, (4, 4))
+    flipped = camera * [-1, 1, 1, 1]
+    video = uestc.Video(0, "x", 0, 3, 1, side)
+    shown, again = (front_view(pose, root, values, video) for values in (camera, flipped))
+    np.testing.assert_array_equal(shown, again)
+    assert shown.dtype == np.float32
+    np.testing.assert_allclose(shown[0, 1], root[0, 1], rtol=1e-6)
+    depth = 500 / (camera[:, 0] * 270)
+    if side == 1:
+        np.testing.assert_allclose(shown[:, 2], root[:, 2] + depth - depth[0], rtol=1e-5)

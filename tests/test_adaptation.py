@@ -224,3 +224,14 @@ def test_clips_are_counted_by_who_gave_them():
     del entries[5:]
     with pytest.raises(UserError, match="limp: all clips are shorter than 40 frames"):
         data.halves()
+
+
+@pytest.mark.parametrize(
+    ("fps", "frames", "rises"),
+    [(10.0, 4, 0), (10.0, 6, 1), (12.5, 5, 0), (30.0, 13, 0), (30.0, 16, 1), (60.0, 28, 0)],
+)
+def test_the_floor_of_the_last_second_is_half_a_second_before_the_end(fps, frames, rises):
+    """A foot that leaves the floor for less than half a second at the end does not raise it."""
+    joints = np.zeros((120, 22, 3))
+    joints[-frames:, :, 1] = 0.2
+    assert fault_of(joints, fps) == ("drifts upward by 20 cm (limit 5)" if rises else "")

@@ -11,7 +11,7 @@ from support.fixtures import Arrays, golden, golden_case
 from support.stores import BABEL_FILES, label, sequence, small_babel, write_amass, write_babel
 
 from flame_mdm.data.amass import read
-from flame_mdm.data.babel import FPS, Babel, Window
+from flame_mdm.data.babel import FPS, Babel, Label, Window, _starts
 from flame_mdm.data.store import write_store
 from flame_mdm.errors import UserError
 from flame_mdm.representations.smpl import SMPL
@@ -166,3 +166,20 @@ def test_absent_and_damaged_files_are_named(small: tuple[Path, Path], subtests):
     (small[0] / "val.json").unlink()
     with pytest.raises(FileNotFoundError, match=r"BABEL v1\.0 is published at"):
         open_babel(*small).count()
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "frames", "starts"),
+    [
+        *((0.0, 6.45, 129, [0]), (0.0, 6.45, 128, []), (0.0, 6.5, 130, [0])),
+        *((0.0, 6.95, 139, [0, 10]), (0.0, 6.94, 200, [0]), (0.0, 7.0, 140, [0, 10])),
+        *((1.09, 8.05, 161, [21, 31]), (1.05, 8.6, 172, [21, 31, 41]), (1.05, 8.6, 171, [])),
+        *((2.0, 2.1, 300, [40]), (2.0, 2.05, 300, []), (2.0, 2.1, 168, []), (-0.1, 9.0, 300, [])),
+        *((None, 9.0, 300, []), (0.0, None, 300, []), (3.0, 2.0, 300, [])),
+    ],
+)
+def test_a_label_has_a_clip_every_ten_frames(start, end, frames: int, starts: list[int]):
+    drawn, reason = _starts(Label("CMU/a", "walk", start, end, "words"), frames)
+    assert list(drawn) == starts
+    assert bool(reason) == (not starts)
+    assert not _starts(Label("CMU/a", "transition", start, end, "words"), frames)[0]

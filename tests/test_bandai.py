@@ -377,3 +377,53 @@ def test_captions_name_the_other_side_where_the_head_turns(content: str):
         assert (other in words) == ("head turned to the" in text)
         if "head turned to the" in text:
             assert text.rstrip(".").endswith(f"head turned to the {other}")
+
+
+@pytest.mark.parametrize("kind", ["w", "w:gz", "w:bz2", "w:xz", "zip", "zip after other bytes"])
+def test_archives_of_all_kinds_are_unpacked_to_the_deepest_common_folder(tmp_path, kind: str):
+    files = {
+        "a/b/one.bvh": b"1",
+        "a/b/c/two.bvh": b"22",
+        "a/notes.txt": b"not wanted",
+        "__MACOSX/a/b/._one.bvh": b"attributes",
+    }
+    if kind.startswith("w"):
+        del files["__MACOSX/a/b/._one.bvh"]
+    for name, content in files.items():
+        path = tmp_path / "files" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    packed = tmp_path / "packed"
+    if kind.startswith("w"):
+        with tarfile.open(packed, kind) as archive:  # pyright: ignore[reportArgumentType, reportCallIssue]
+            archive.add(tmp_path / "files", "")
+    else:
+        packed.write_bytes(b"#!/bin/sh\n" if "after" in kind else b"")
+        with zipfile.ZipFile(packed, "a") as archive:
+            for name in files:
+                archive.write(tmp_path / "files" / name, name)
+    owner = Counter[str]()
+    folder = archives.as_folder(packed, owner, lambda name: name.endswith(".bvh"))
+    unpacked = {path.relative_to(folder).as_posix() for path in folder.rglob("*.bvh")}
+    assert unpacked == {"one.bvh", "c/two.bvh"}
+    assert (folder / "c" / "two.bvh").read_bytes() == b"22"
+    assert archives.as_folder(folder, owner, lambda name: False) == folder
+
+
+@pytest.mark.parametrize(("size", "is_read"), [(6, True), (7, False)])
+def test_members_of_archives_have_at_most_the_maximum_size(tmp_path, monkeypatch, size, is_read):
+    monkeypatch.setattr(archives, "MEMBER_LIMIT", 6)
+    (tmp_path / "a.bvh").write_bytes(b"x" * size)
+    with (
+        tarfile.open(tmp_path / "a.tar", "w") as tar,
+        zipfile.ZipFile(tmp_path / "a.zip", "w") as z,
+    ):
+        tar.add(tmp_path / "a.bvh", "a.bvh")
+        z.write(tmp_path / "a.bvh", "a.bvh")
+    for name in ("a.tar", "a.zip"):
+        if is_read:
+            members = dict(archives.members(tmp_path / name, lambda name: True))
+            assert members == {"a.bvh": b"x" * size}
+        else:
+            with pytest.raises(UserError, match="7 bytes, which is too large"):
+                list(archives.members(tmp_path / name, lambda name: True))

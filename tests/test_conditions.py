@@ -15,10 +15,11 @@ from support.fixtures import ROOT
 from torch import Tensor
 
 from flame_mdm.batch import Condition, MotionBatch
-from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.conditions import ConditionEncoder, text
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.conditions.text import Pretrained, PretrainedText
 from flame_mdm.conditions.tokens import LearnedTokens
+from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.errors import UserError
 
 EXPERIMENTS = ROOT / "experiments"
@@ -544,3 +545,60 @@ def test_offline_minilm_has_the_published_values_and_refuses_other_weights():
         UserError, match=r"model\.safetensors is not the published file .*flame-mdm\[offline\]"
     ):
         other(batch_of(["a person walks"]))
+
+
+@pytest.mark.parametrize("tokens", [True, False])
+def test_captions_that_are_encoded_in_several_batches_are_found_again(tokens, models, monkeypatch):
+    """The cache has a float32 vector per caption and float16 tokens without padding."""
+    captions = [" ".join(WORDS[k : k + 1 + k % 4]) for k in range(10)]
+    captions = sorted({*captions, ""}, key=len, reverse=True)
+    encoder = PretrainedText(models["distilbert"], WIDTH, 20, "mean", tokens=tokens)
+    expected = [encoder(batch_of([caption])) for caption in captions]
+    monkeypatch.setattr(text, "CAPTIONS_AT_ONCE", 3)
+    encoded = encoder._encode_frozen(captions, CPU)
+    pooled, values, mask = encoded.gather(captions[::-1], CPU)
+    lengths = [len(caption.split()) + 2 if tokens else 0 for caption in captions]
+    assert mask.sum(1).tolist() == lengths[::-1]
+    for row, alone in zip(range(len(captions) - 1, -1, -1), expected, strict=True):
+        size = alone.tokens.shape[1]
+        torch.testing.assert_close(pooled[row], alone.pooled[0], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(values[row, :size], alone.tokens[0], rtol=2e-3, atol=1e-4)
+        assert not values[row, size:].any()
+    assert encoded.pooled.nbytes == 4 * WIDTH * len(captions)
+    assert encoded.tokens.nbytes == 2 * WIDTH * sum(lengths)
+
+
+def test_the_size_of_a_cache_is_that_of_its_vectors_and_tokens(models, tmp_path):
+    encoder = PretrainedText(models["distilbert"], WIDTH, 20, "mean", tokens=True)
+    encoder.precompute(CAPTIONS[:2], tmp_path)
+    sizes = [len(caption.split()) + 2 for caption in (*CAPTIONS[:2], "")]
+    assert encoder.load_cache(CAPTIONS[:2], tmp_path) == 4 * WIDTH * 3 + 2 * WIDTH * sum(sizes)
+    assert ConditionEncoder.load_cache(encoder, CAPTIONS, tmp_path) == 0
+    tuned = PretrainedText(models["distilbert"], WIDTH, 20, "mean", freeze=False)
+    assert tuned.load_cache(CAPTIONS, tmp_path) == 0
+
+
+def test_words_of_other_captions_are_replaced_or_dropped_before_words_are_counted():
+    encoder = LearnedTokens(8, heads=2, buckets=64, max_words=2).eval()
+    everything = encoder.rows("slowly walked, then waves")
+    encoder.seen = {"walks", "waves"}
+    assert encoder.rows("slowly walked, then waves") == [
+        everything[0],
+        *(hashed(word, 64) for word in ("walks", "waves")),
+    ]
+    assert encoder.rows("waves walks walks")[1:] == [hashed("waves", 64), hashed("walks", 64)]
+    assert everything[1:] == [hashed("slowly", 64), hashed("walked", 64)]
+    assert encoder.rows("nothing") == everything[:1]
+
+
+def test_padded_rows_of_captions_are_encoded_like_their_texts():
+    torch.manual_seed(0)
+    encoder = LearnedTokens(16, heads=2, buckets=64, max_words=8).eval()
+    texts = ["walks", "", "a person walks and waves"]
+    rows = [torch.tensor(encoder.rows(text)) for text in texts]
+    padded = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True, padding_value=5)
+    cond = encoder.encode(padded, torch.tensor([len(row) for row in rows]))
+    expected = encoder(batch_of(texts))
+    assert torch.equal(real_tokens(cond), real_tokens(expected))
+    torch.testing.assert_close(cond.pooled, expected.pooled, rtol=0, atol=1e-6)
+    torch.testing.assert_close(cond.tokens, expected.tokens, rtol=0, atol=1e-6)

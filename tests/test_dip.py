@@ -467,3 +467,27 @@ def test_time_and_condition_can_be_added_to_the_noisy_frames():
     added = plain.condition(t, cond.pooled)[:, None]
     torch.testing.assert_close(adding(x_t, t, mask, cond), plain(x_t + added, t, mask, cond))
     assert not torch.allclose(adding(x_t, t, mask, cond), plain(x_t, t, mask, cond))
+
+
+@pytest.mark.parametrize("modulo_pi", [False, True])
+def test_targets_are_at_the_last_real_frame_of_motions_of_any_length(modulo_pi: bool):
+    choices = [["left_wrist", "traj", "heading"], ["pelvis"], []]
+    aims = TargetConditions(
+        SMPL22.joints, SMPL22.facing, choices=choices, weight=0.7, heading_modulo_pi=modulo_pi
+    )
+    generator = torch.Generator().manual_seed(0)
+    real_motions, moved = torch.randn(2, 4, 9, 22, 3, generator=generator)
+    u, lengths = torch.tensor([0.0, 0.3, 0.5, 0.99]), torch.tensor([9, 4, 1, 6])
+    target = aims.draw(real_motions, u, lengths)
+    error = aims.error(moved, target, lengths)
+    for row, length in enumerate(lengths.tolist()):
+        alone = aims.draw(real_motions[row : row + 1, :length], u[row : row + 1])
+        torch.testing.assert_close(target[row : row + 1], alone)
+        torch.testing.assert_close(
+            error[row : row + 1], aims.error(moved[row : row + 1, :length], alone)
+        )
+    assert target[..., 3].sum(1).tolist() == [3, 3, 1, 0]
+    assert error[3] == 0
+    difference = (moved - real_motions)[2, 0, SMPL22.joints.index("pelvis")]
+    torch.testing.assert_close(error[2], 0.7 * difference.square().mean())
+    assert not target[0, SLOTS.index("traj"), 1]

@@ -202,3 +202,18 @@ def test_limits_of_the_length_are_included_and_do_not_apply_to_the_test_split(mm
     names: dict[str, Split] = {name: "train" if name < "e" else "test" for name in kit.frames}
     kit.names = names
     assert [name for name in kit.frames if kit._fits(name)] == ["b", "c", "e", "f"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "frames", "fits"),
+    [(1, 1, False), (72, 9, False), (73, 10, True), (4000, 500, True), (4001, 501, False)],
+)
+def test_a_last_group_of_fewer_than_eight_rows_has_a_frame(tmp_path, rows, frames, fits):
+    numbers = "1" + ",0" * 63 + "\n"
+    (tmp_path / "1_fke.csv").write_text("head\n" + numbers * rows)
+    kit = KITTemos(str(tmp_path), "")
+    kit.texts, kit.names = {"1": ["walks"]}, {"1": "train"}
+    assert kit.frames == {"1": frames}
+    assert kit._fits("1") == fits
+    if rows < 100:
+        assert len(read_joints(tmp_path / "1_fke.csv")) == frames

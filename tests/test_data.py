@@ -43,7 +43,14 @@ from flame_mdm.data.humanml3d import HumanML3D, HumanML3DSMPL
 from flame_mdm.data.kit import KIT, KITTemos
 from flame_mdm.data.mixture import Mixture
 from flame_mdm.data.resident import ResidentLoader, free_memory, resident_features
-from flame_mdm.data.store import Store, _fingerprint, write_store
+from flame_mdm.data.store import (
+    Entry,
+    Store,
+    _entries,
+    _fingerprint,
+    _line,
+    write_store,
+)
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.data.synthetic_sequences import SyntheticSequences
 from flame_mdm.data.uestc import UESTC
@@ -980,3 +987,25 @@ def test_the_first_columns_of_published_features_are_stored_for_a_part_of_them(t
     for representation in (HumanML(variant="legacy"), Essential(variant="legacy")):
         with pytest.raises(UserError, match=f"cannot be converted to {representation.name}"):
             write_store(tmp_path / "other", source, representation)
+
+
+@pytest.mark.parametrize(
+    ("start", "action", "is_valid"),
+    [(15, 2, True), (16, 2, False), (0, 3, False), (0, None, True), (10, 0, True)],
+)
+def test_the_last_frame_and_the_last_action_of_a_store_are_valid(tmp_path, start, action, is_valid):
+    path = tmp_path / "clips.jsonl"
+    entry = Entry("a", start, 5, "train", "take", ["walks\u2028on"], action)
+    path.write_text(_line(entry) + "\n", encoding="utf-8")
+    if is_valid:
+        assert _entries(path, 20, 3) == [entry]
+    else:
+        with pytest.raises(UserError, match=r"clips\.jsonl is damaged: line 1: a: "):
+            _entries(path, 20, 3)
+
+
+def test_the_captions_of_a_set_are_those_of_all_splits_without_copies(root):
+    data = module(root, CROPS[0])
+    clips = data.open().clips
+    assert {clip.split for clip in clips} == {"train", "val", "test"}
+    assert data.captions() == sorted({caption for clip in clips for caption in clip.captions})

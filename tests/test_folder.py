@@ -25,11 +25,12 @@ from flame_mdm.data.captions import drawn_splits
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh, fbx, fbx_scene
 from flame_mdm.formats.layouts import LAYOUTS, read_skeleton
 from flame_mdm.formats.readers import PELVIS, read
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.reading import read_motion
 
@@ -691,3 +692,45 @@ def test_reading_a_folder_again_reports_each_motion_once(tmp_path: Path):
         assert source.findings() == ["SMPL, unit 1, 30 fps: 2 motions"]
         assert len(source.failures) == 1
     assert source.failure_lines()[-1].startswith("error: 1 of 3 motions in ")
+
+
+def test_mirror_images_have_the_joints_of_the_representation(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", joints=WALK, fps=30)
+    kit = HumanML("kit21", "legacy", fps=12.5, units_per_metre=640)
+    for representation, skeleton in ((kit, KIT21), (HumanML(), SMPL22)):
+        source = Folder(str(tmp_path), mirror=True)
+        source.suit(representation)
+        original, image = source.clips(representation.fps)
+        assert (original.id, image.id) == ("a", "Ma")
+        expected = skeleton.mirror(torch.from_numpy(original.motion)).numpy()
+        assert expected.shape[1:] == (len(skeleton.joints), 3)
+        np.testing.assert_array_equal(image.motion, expected)
+
+
+def test_motions_of_each_split_are_counted_and_the_first_failure_is_named(tmp_path: Path):
+    splits = {"a": "train", "b": "train", "c": "test"}
+    for name in splits:
+        np.savez(tmp_path / f"{name}.npz", joints=WALK, fps=30)
+    write_table(tmp_path, [{"id": name, "split": split} for name, split in splits.items()])
+    source = Folder(str(tmp_path), mirror=True)
+    source.name = "mine"
+    *_, line = source.check(20.0)
+    assert line == "mine: 5 clips can be prepared (motions: 2 train, 0 val, 1 test)"
+    source.failures = ["a.bvh: damaged", "b.bvh: damaged", "c.bvh: damaged"]
+    with pytest.raises(UserError, match=r"^a\.bvh: damaged \(and 2 more\)$"):
+        source.require_all()
+    source.failures = ["a.bvh: damaged"]
+    with pytest.raises(UserError, match=r"^a\.bvh: damaged$"):
+        source.require_all()
+
+
+@pytest.mark.parametrize(
+    ("values", "is_refused"),
+    [([0.9, 0.9, -3.0], False), ([0.9, -0.9, -0.9], True), ([0.9, 0.9, -9.0, 0.9], False)],
+)
+def test_some_motions_may_show_a_body_that_lies(values: list[float], is_refused: bool):
+    if not is_refused:
+        folder_reader._check_upright(Path("x"), {"SMPL": values})
+        return
+    with pytest.raises(UserError, match=r"lying down in most motions \(SMPL\)"):
+        folder_reader._check_upright(Path("x"), {"BVH": [0.9] * 9, "SMPL": values})

@@ -1034,3 +1034,22 @@ def test_gestures_during_other_actions_and_parts_of_cycles_do_not_change(
         for rng, attributes in zip(draws, drawn, strict=True)
     )
     assert sum(weighted(motion) for motion in motions) == pytest.approx(expected, abs=3e-3)
+
+
+@pytest.mark.parametrize("fps", [12.5, 24, 30, 60])
+@pytest.mark.parametrize("number", [0, 3, 8])
+def test_clips_have_the_same_duration_at_every_rate(fps: float, number: int):
+    source = Synthetic(10, seed=7, actions="all")
+    exact, clip = source.clip(number, 1000), source.clip(number, fps)
+    assert len(clip.motion) - 1 == pytest.approx((len(exact.motion) - 1) / 1000 * fps, abs=0.6)
+    assert (clip.captions, clip.attributes) == (exact.captions, exact.attributes)
+
+
+@pytest.mark.parametrize("name", ["walk", "sneak", "crouch walk"])
+def test_parts_of_cycles_show_the_same_motion_at_every_rate(name: str):
+    attributes: Attributes = {"action": name, "ends": "cycle", "speed": "normal"}
+    slow, fast = (
+        _joints(np.random.default_rng(3), np.arange(2 * fps + 1) / fps, attributes)
+        for fps in (20, 60)
+    )
+    np.testing.assert_allclose(slow, fast[::3], atol=1e-4)

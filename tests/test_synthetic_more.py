@@ -981,9 +981,9 @@ fall -564.4881; get up 1010.2286
 def variants(name: str) -> list[Attributes]:
     """All attributes that an action can have. Only walks ahead have a speed."""
     values = ACTIONS[name].values
-    rows: list[Attributes] = [
-        {"action": name} | dict(zip(values, row, strict=True)) for row in product(*values.values())
-    ]
+    rows: list[Attributes] = []
+    for row in product(*values.values()):
+        rows.append({"action": name, **dict(zip(values, row, strict=True))})
     for row in rows:
         if row.get("direction", "forward") != "forward":
             row.pop("speed", None)

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -28,7 +29,10 @@ from flame_mdm.commands.tables import (
 from flame_mdm.config import compose, compose_data
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
+from flame_mdm.records import Result
 from flame_mdm.reporting.tables import build as builder
+from flame_mdm.reporting.tables import format as format_module
+from flame_mdm.reporting.tables import settings
 from flame_mdm.reporting.tables.build import build
 from flame_mdm.reporting.tables.format import (
     Cell,
@@ -40,6 +44,7 @@ from flame_mdm.reporting.tables.format import (
     draw,
     ranks,
     rendered,
+    write,
 )
 from flame_mdm.reporting.tables.specs import (
     Evaluation,
@@ -50,6 +55,7 @@ from flame_mdm.reporting.tables.specs import (
 )
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.safe_io import write_json
+from flame_mdm.schemas import check_shape
 from flame_mdm.training.start import recipe_changes
 
 SPEC = """
@@ -997,3 +1003,418 @@ def test_the_largest_number_of_a_column_has_three_digits(numbers: list[float], t
     printed = [cell.text for line in lines if (cell := line.cells[0])]
     assert printed[0] == texts[0]
     assert float(printed[1]) == pytest.approx(float(texts[1]))
+
+
+def parsed(**changes: Any) -> Result:
+    content = measured(0.5, 0.6, 9.5)
+    for key, value in changes.items():
+        is_added = isinstance(value, dict) and isinstance(content.get(key), dict)
+        content[key] = content[key] | value if is_added else value
+    return check_shape(content, Result)
+
+
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "limits": {"data": {"frames": [40, 60]}},
+    "exclusions": {"data": {"excluded": {"short": 3}}},
+    "time": {"device": "NVIDIA H200"},
+    "published split": {"published_split": True},
+    "force": {"forced": True},
+    "warnings": {"warnings": ["a warning"]},
+    "extractor": {"extractor": None},
+    "skeleton": {"skeleton": {"stand_in": True, "smpl_sha256": None}},
+    "changes of the recipe": {"checkpoint": {"recipe_changes": ["seed=3"]}},
+}
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_each_difference_between_measurements_is_a_condition_with_its_own_sentence(name: str):
+    changed, usual = (
+        builder._conditions(result, timed=True, shows_multimodality=False)
+        for result in (parsed(**CONDITIONS[name]), parsed())
+    )
+    differences = {key for key in usual if usual[key] != changed[key]}
+    assert name in differences
+    assert differences <= {name, "audit"}  # cards belong to an extractor
+
+
+def test_conditions_state_frames_devices_and_all_warnings():
+    several = parsed(data={"frames": [40, 196]}, warnings=["one", "two"], device="a GPU")
+    facts = builder._conditions(several, timed=True, shows_multimodality=False)
+    assert facts["limits"] == "Motions have 40 to 196 frames."
+    assert facts["warnings"] == "Warning: one. Warning: two."
+    assert facts["time"] == "Timed in batches of 64 on a GPU."
+    equal = parsed(data={"frames": [60, 60]}, extractor=None)
+    facts = builder._conditions(equal, timed=False, shows_multimodality=False)
+    assert facts["limits"] == "Motions have 60 frames."
+    assert (facts["time"], facts["extractor"]) == ("", "No extractor.")
+
+
+@pytest.mark.parametrize(("count", "is_short"), [(1, True), (3, True), (4, False)])
+def test_a_footnote_with_up_to_three_differences_lists_only_these(count: int, is_short: bool):
+    first = {f"fact {number}": f"Fact {number}." for number in range(6)}
+    second = {
+        name: f"Other {number}." if number < count else text
+        for number, (name, text) in enumerate(first.items())
+    }
+    second["fact 0"] = ""
+    notes = dict(builder._condition_notes([first, second], {"b": {"FID": None, "NFE": None}}))
+    assert notes["a"] == " ".join(first.values())
+    shown = ["No fact 0.", *(f"Other {number}." for number in range(1, count))]
+    same = f"Same as footnote a, except for the following: {' '.join(shown)}"
+    assert (
+        notes["b"] == f"FID, NFE: {same if is_short else ' '.join(filter(None, second.values()))}"
+    )
+
+
+def test_footnotes_after_the_twenty_sixth_have_two_letters():
+    conditions: list[dict[str, str]] = []
+    letters = [builder._letter({"seed": str(number)}, conditions) for number in range(53)]
+    assert [letters[k] for k in (0, 25, 26, 51, 52)] == ["a", "z", "aa", "zz", "aaa"]
+    assert builder._letter({"seed": "26"}, conditions) == "aa"
+    assert len(conditions) == 53
+
+
+def test_only_a_distance_of_zero_between_real_motions_is_explained():
+    cells: list[Cell | None] = [Cell("", 0.0), Cell("", 0.0), Cell("", 0.5)]
+    line = Line("Real motions", "real", cells)
+    notes = builder._warnings([line], ["fid", "foot_skating", "fid"], ["FID", "Skating", "FID 2"])
+    assert [text.partition(" of real")[0] for _, text in notes] == ["FID"]
+
+
+def test_labels_that_contain_commas_are_joined_by_semicolons():
+    assert builder._listed(["MDM", "MFM"]) == "MDM, MFM"
+    assert builder._listed(["MDM, 50 steps", "MFM"]) == "MDM, 50 steps; MFM"
+
+
+@pytest.mark.parametrize(("value", "real", "text"), [
+    ({"replications": 1}, 400, "1 replication with N = 400 motions."),
+    ({"n": None, "n_per_replication": [64, 5], "replications": 2}, 64,
+     "2 replications with N = 64 + 5 motions (real motions: N = 64)."),
+    ({"n_real": 378}, 400, "5 replications with N = 400 motions, compared with sets of 378 real motions."),
+    ({"n_real": 400}, 378, "5 replications with N = 400 motions (real motions: N = 378)."),
+])  # fmt: skip
+def test_a_footnote_states_motions_per_replication_and_sizes_that_differ(value, real, text):
+    result = parsed(
+        values={"fid": entry(0.5) | value}, ground_truth={"fid": entry(0) | {"n": real}}
+    )
+    assert builder._numbers(result) == text
+
+
+def test_a_row_is_not_valid_if_any_of_its_results_is_not_even_if_it_is_quick():
+    valid = parsed(quick=True)
+    wrong = parsed(invalid_because=["a", "b"], checkpoint={"averaged_weights": False})
+    row, values = {"label": "MDM", "eta": 0, "guidance_scale": 0.0}, ["fid", "diversity"]
+    first = builder._line(row, [valid, wrong], values, ["x", "y"])
+    assert (first.state, first.facts["not valid because"]) == ("NOT VALID", "a; b")
+    assert (first.facts["weights"], first.facts["result"]) == ("averaged", "x y")
+    assert builder._line(row, [valid, valid], values, ["x", "y"]).state == "QUICK"
+    assert builder._line(row, [wrong, None], values, ["x", "y"]).facts["weights"] == "raw"
+    # An option of 0 is a position on the x-axis
+    assert (first.options["eta"], first.options["guidance_scale"]) == (0, 0)
+
+
+def test_options_of_an_edit_are_shown_and_parameters_are_in_millions():
+    edited = parsed(checkpoint={"edit": {"until": 0.2, "method": "mfm"}})
+    assert builder._about(edited, "until") == 0.2
+    assert builder._about(edited, "parameters") == pytest.approx(12.345678)
+    assert builder._about(edited, "seconds_per_sample") == 0.11
+    assert builder._cell(None, "until", {"until": 0}) == Cell("0", 0.0)
+
+
+def test_a_row_lists_the_most_common_count_and_the_exceptions():
+    few = entry(1.0) | {"n": 30, "replications": 2}
+    result = parsed(values={"a": few, "b": entry(1.0), "c": entry(1.0)})
+    counts = builder._counts([result, result, result, None], ["a", "b", "c", "b"])
+    assert counts == "5 x 400; a 2 x 30"
+    assert builder._counts([None], ["a"]) == ""
+
+
+def test_settings_of_a_column_keep_their_digits_unless_one_has_an_interval_or_two_decimals():
+    def texts(*cells: Cell) -> list[str]:
+        lines = [Line("", "measured", [cell]) for cell in cells]
+        builder._print_cells([*lines, Line("", "reported", [Cell("as printed", 1e6)])], 1)
+        return [cell.text for cell in cells]
+
+    assert texts(Cell("2.5", 2.5), Cell("1", 1.0)) == ["2.5", "1"]
+    assert texts(Cell("2.55", 2.55), Cell("1", 1.0)) == ["2.550", "1.000"]
+    assert texts(Cell("1", 1.0), Cell("", 2.55, 0.1)) == ["1", "2.550 ±0.100"]
+    assert texts(Cell("", -2e-5), Cell("", -1.5)) == ["-0.000020", "-1.500"]
+
+
+def test_measured_rows_are_ranked_only_beside_one_real_row_of_their_own_footnote():
+    def ranked(*lines: Line) -> list[int]:
+        builder._rank(lines, {"Diversity": "real"})
+        return [
+            cell.rank
+            for line in lines
+            if line.kind in ("measured", "reported")
+            for cell in line.cells
+            if cell
+        ]
+
+    def line(value: float, marks: str = "a", kind: str = "measured") -> Line:
+        return Line("", kind, [Cell("", value)], marks)
+
+    pair = (line(9.0), line(8.0))
+    assert ranked(*pair, line(8.1, kind="real")) == [2, 1]
+    assert ranked(*pair, line(8.1, "b", "real")) == [0, 0]
+    assert ranked(*pair, line(8.1, kind="real"), line(9.1, kind="real")) == [0, 0]
+    printed = (line(9.0, "†", "reported"), line(8.0, "†", "reported"))
+    assert ranked(*printed, line(8.1, "††", "reported real")) == [2, 1]
+    assert ranked(*printed, line(8.1, "a", "real")) == [0, 0]
+
+
+def test_a_reported_zero_is_a_value(folder, monkeypatch):
+    printed = [
+        {"label": "none", "values": {"Diversity": 0}},
+        {"label": "some", "values": {"Diversity": 0.5}},
+    ]
+    real = {"label": "Real", "real": True, "values": {"Diversity": 0.1}}
+    assert ranks_of_diversity(folder, monkeypatch, [real, *printed]) == {"none": 1, "some": 2}
+
+
+@pytest.mark.parametrize(
+    ("longest", "step"), [(39, 1), (40, 1), (41, 2), (196, 5), (200, 5), (201, 6)]
+)
+def test_a_histogram_of_lengths_has_at_most_forty_one_bars(tmp_path, longest: int, step: int):
+    lengths = {"fingerprint": "f", "fps": 30.0, "lengths": [longest, 10, 20, 30]}
+    write_json(tmp_path / "lengths" / "mine.json", lengths)
+    spec = {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}
+    (part,) = build("x", spec, tmp_path).parts
+    histogram = part.histograms["mine"]
+    assert (histogram.step, sum(histogram.counts)) == (step, 4)
+    assert histogram.counts[longest // step] == 1
+    median = part.lines[0].cells[list(part.columns).index("median")]
+    assert median is not None
+    assert median.value == 30  # of an even number of lengths, the upper one
+
+
+def test_a_value_of_zero_and_an_option_of_zero_are_points_of_a_figure():
+    lines = [
+        Line("MDM", "measured", [Cell("", value)], options={"eta": eta})
+        for eta, value in ((0.0, 1.0), (1.0, 0.0))
+    ]
+    part = Part("P", {"FID": "lower"}, lines)
+    ((series,), _) = _series(part, Figure(part="P", x="eta", y=["FID"]), "FID")
+    assert list(series.points) == [(0.0, 1.0), (1.0, 0.0)]
+
+
+def test_a_figure_has_a_panel_per_column_and_a_logarithmic_axis_if_requested():
+    lines = [
+        Line("MDM", "measured", [Cell("", 1.0), Cell("", 2.0)], options={"num_inference_steps": x})
+        for x in (1.0, 10.0, 100.0)
+    ]
+    part = Part("P", {"FID": "lower", "Diversity": "none"}, lines)
+
+    def middle(**options: Any) -> list[float]:
+        drawing = str(draw(part, Figure(part="P", x="num_inference_steps", **options)))
+        dots = [float(x) for x in re.findall(r'<circle class="c0" cx="([\d.]+)"', drawing)]
+        assert len(dots) == 3 * len(options["y"])
+        assert drawing.count(">sampling steps<") == len(options["y"])
+        return [
+            (second - first) / (last - first)
+            for first, second, last in zip(*[iter(dots)] * 3, strict=True)
+        ]
+
+    assert middle(y=["FID", "Diversity"]) == pytest.approx([9 / 99] * 2, abs=0.01)
+    assert middle(y=["FID"], log=True) == pytest.approx([0.5], abs=0.01)
+
+
+@pytest.mark.parametrize(("figures", "parts", "names"), [
+    (1, 1, ["t-figure.svg"]), (2, 1, ["t-figure1.svg", "t-figure2.svg"]),
+    (1, 2, ["t-in-meters-figure.svg", "t-p-figure.svg"]),
+])  # fmt: skip
+def test_figures_are_numbered_if_there_are_several(tmp_path, figures, parts, names):
+    lines = [Line("MDM", "measured", [Cell("", x)], options={"eta": x}) for x in (0.0, 1.0)]
+    drawn = [Figure(part="P", x="eta", y=["FID"])] * figures
+    table = Table("t", "T", [
+        Part(name, {"FID": "lower"}, lines, figures=drawn) for name in ("P", "In (meters)")[:parts]
+    ])  # fmt: skip
+    write(table, tmp_path)
+    assert sorted(path.name for path in tmp_path.glob("*.svg")) == names
+    text = (tmp_path / "t.md").read_text()
+    assert all(f"]({name})" in text for name in names)
+
+
+def test_the_legend_and_the_sources_are_those_of_all_parts():
+    facts = {"checkpoint sha256": "c", "recipe": "r", "sampler": "ddim", "seed": "0"}
+    first = Part("P", {"FID": "lower"}, [Line("MDM", "measured", [None], facts=facts)])
+    other = Line("real", "measured", [None], state="QUICK", facts=facts | {"baseline": "real"})
+    second = Part("Q", {"FID": "lower"}, [other])
+    both = "of the rows with the same mark, except sanity-check baselines and rows that are quick"
+    assert both in rendered(Table("t", "T", [first, second]), "md")
+    assert "of the rows with the same mark." in rendered(Table("t", "T", [first]), "md")
+    assert format_module._sources(Table("t", "T", [first])) == [
+        "MDM: checkpoint sha256 = c; recipe = r; sampler = ddim; seed = 0"
+    ]
+    assert [line[:7] for line in format_module._sources(Table("t", "T", [first, second]))] == [
+        "P: MDM:", "Q: real",
+    ]  # fmt: skip
+
+
+def test_rows_of_one_checkpoint_with_other_samplers_have_sources_of_their_own():
+    shared = {"checkpoint sha256": "c", "recipe": "r"}
+    options = (("ddim", "5"), ("ddim", ""), ("ancestral", "5"))
+    lines = [
+        Line(f"row {steps}", "measured", [None], facts=shared | {"sampler": name, "steps": steps})
+        for name, steps in options
+    ]
+    sources = format_module._sources(Table("t", "T", [Part("P", {"FID": "none"}, lines)]))
+    assert sources == [
+        "row 5 / row : checkpoint sha256 = c; recipe = r; sampler = ddim; steps = 5 / –",
+        "row 5: checkpoint sha256 = c; recipe = r; sampler = ancestral; steps = 5",
+    ]
+
+
+def test_a_footnote_links_an_audit_card_that_exists(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cards").mkdir()
+    (tmp_path / "cards" / "a.html").write_text("")
+    table = Table("t", "T", [], folder=Path("runs/tables"))
+    texts = [f"audit cards/{name}.html (40 motions)." for name in "ab"]
+    assert format_module._linked(table, texts[0]) == [
+        ("audit ", ""), ("cards/a.html", "../../cards/a.html"), (" (40 motions).", ""),
+    ]  # fmt: skip
+    assert {link for _, link in format_module._linked(table, texts[1])} == {""}
+
+
+@pytest.mark.parametrize(("values", "better", "expected"), [
+    ([None, 3.0], "lower", [0, 0]), ([None, 3.0, 0.0], "lower", [0, 2, 1]),
+    ([2.0, 1.0, 1.0, 3.0], "lower", [2, 1, 1, 0]), ([0.0, 0.5], "real", [1, 2]),
+])  # fmt: skip
+def test_a_missing_value_has_no_rank_and_a_zero_has_one(values, better, expected):
+    assert ranks(values, better, 0.0) == expected
+
+
+def test_a_column_overrides_the_options_of_its_row_and_a_row_those_of_its_part():
+    part = {
+        "protocol": "text_to_motion", "extractor": "part", "seed": 1, "samples": 5, "data": "kit",
+        "columns": {"A": {"value": "fid"}, "B": {"value": "fid", "protocol": "latency", "seed": 3}},
+        "rows": [{"label": "a", "note": "n", "ckpt": "x.ckpt", "seed": 2, "eta": [0.5]}],
+    }  # fmt: skip
+    ((row, (first, second)),) = evaluations(part)
+    assert row["label"] == "a"  # a list with one value is not a sweep
+    shared = {"ckpt": "x.ckpt", "eta": 0.5, "extractor": "part", "samples": 5}
+    assert first.keys == shared | {"protocol": "text_to_motion", "seed": 2}
+    assert second.keys == shared | {"protocol": "latency", "seed": 3}
+    part["rows"] = [{"label": "b", "baseline": "real"}]
+    ((_, (first, _)),) = evaluations(part)
+    assert first.keys["data"] == "kit"  # a baseline has no recipe that states its data set
+
+
+def test_labels_of_rows_name_the_options_that_vary_and_have_no_column():
+    part = {
+        "columns": {"Steps": {"value": "num_inference_steps"}},
+        "rows": [
+            {"label": "MDM", "ckpt": "x.ckpt", "num_inference_steps": [5, 10], "eta": [0, 1],
+             "strength": [0.5, 1], "spacing": "stride"},
+        ],
+    }  # fmt: skip
+    labels = [row["label"] for row, _ in evaluations(part)]
+    assert len(labels) == 8
+    assert labels[:2] == [f"MDM (eta 0, strength of the variation {x})" for x in (0.5, 1)]
+    assert labels[:4] == labels[4:]
+
+
+def test_the_path_of_a_result_depends_on_the_keys_but_not_on_their_order():
+    keys = {"protocol": "a/synthetic.yaml", "ckpt": "runs/kit/mdm/default/checkpoints/last.ckpt"}
+    path = Evaluation("one", keys | {"seed": 0}).path(Path("results"))
+    assert path == Evaluation("other", {"seed": 0} | keys).path(Path("results"))
+    assert re.fullmatch(r"results/synthetic/kit-mdm-last-[0-9a-f]{10}\.json", path.as_posix())
+    others = [keys, keys | {"seed": 1}, keys | {"seed": 0, "eta": 0}]
+    assert path not in [Evaluation("", other).path(Path("results")) for other in others]
+
+
+@pytest.mark.parametrize(
+    ("key", "reason"),
+    [("ckpt", "no checkpoint"), ("from_samples", "no samples"), ("extractor", "no extractor")],
+)
+def test_missing_files_of_a_row_are_named_by_their_kind(tmp_path, key: str, reason: str):
+    assert Evaluation("", {key: str(tmp_path / "x")}).absent == {reason: str(tmp_path / "x")}
+    assert Evaluation("", {key: str(tmp_path)}).absent == {}
+    assert Evaluation("", {key: "none"}).absent == Evaluation("", {}).absent == {}
+
+
+def test_settings_of_a_recipe_are_its_own_even_if_they_are_zero_and_else_those_of_the_class():
+    config = {
+        "denoiser": {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "dropout": 0.0},
+        "optimizer": {"_target_": "torch.optim.AdamW", "weight_decay": 0, "betas": [0.9, 0.99]},
+        "condition": {"freeze": False},
+        "ema": None,
+    }
+    assert settings.value(config, "denoiser.dropout") == 0
+    assert (
+        settings.value({"optimizer": {"_target_": "torch.optim.AdamW"}}, "optimizer.weight_decay")
+        == 0.01
+    )
+    assert settings.value(config, "optimizer.weight_decay") == 0
+    assert settings.value(config, "optimizer._target_") == "AdamW"
+    assert settings.value(config, "condition.freeze") is False
+    assert settings.value(config, "ema.decay") is None
+
+
+@pytest.mark.parametrize(("value", "text"), [
+    (True, "yes"), (False, "no"), (0, "0"), (1000, "1,000"), (0.0001, "0.0001"), (0.9, "0.9"), (12.3456, "12.35"),
+    ([0.9, 0.999], "0.9, 0.999"), ("cosine", "cosine"), ([1000, False], "1,000, no"),
+])  # fmt: skip
+def test_settings_are_printed_with_four_digits(value, text: str):
+    assert settings.setting_text(value) == text
+
+
+def test_the_longer_side_of_a_table_of_settings_has_the_rows(monkeypatch):
+    recipes = {"a": {"features": 263, "task.cond_drop_prob": 0.0}, "b": {"features": 251}}
+    monkeypatch.setattr(settings, "hyperparameters", recipes.__getitem__)
+    keys = {"Width": "features", "Drop": "task.cond_drop_prob"}
+    part = {"keys": keys, "recipes": {"A": "a", "B": "b"}}
+    printed = {"source": "a paper", "rows": [{"label": "Width", "values": {"B": "251"}}]}
+    table = settings.settings_table("P", part, printed)
+    assert list(table.columns) == ["A", "B", "B, reported"]  # as many keys as recipes
+    texts = {line.label: [cell and cell.text for cell in line.cells] for line in table.lines}
+    assert texts == {"Width": ["263", "251", "251"], "Drop": ["0", None, None]}
+    assert table.notes == [("", "A: recipe a"), ("", "B: recipe b"), ("", "reported: a paper")]
+    fewer = settings.settings_table("P", part | {"keys": {"Width": "features"}}, printed)
+    assert list(fewer.columns) == ["Width", "Width, reported"]
+    assert [line.label for line in fewer.lines] == ["A", "B"]
+    assert [cell and cell.text for cell in fewer.lines[1].cells] == ["251", "251"]
+
+
+def test_the_command_counts_rows_that_are_complete_and_passes_its_keys_on(
+    folder, monkeypatch, capsys
+):
+    change(folder, "MFM", quick=True)
+    change(folder, "MDM", invalid_because=["x"])
+    assert command(folder, folder / "a") == 3
+    assert "spec: 5 of 8 rows measured" in capsys.readouterr().out
+    requests = []
+    monkeypatch.setattr(evaluators.evaluation, "evaluate", requests.append)
+    text = SEVERAL.format(folder=folder, more=", Multimodality: {value: multimodality}")
+    (folder / "several.yaml").write_text(text.replace("extractor: none", "multimodality: false"))
+    words = [
+        f"results={folder / 'none'}",
+        f"out={folder / 'out'}",
+        "force=true",
+        "device=cpu",
+        "data_root=/d",
+    ]
+    assert main(["tables", f"table={folder / 'several.yaml'}", *words]) == 0
+    (request,) = requests
+    assert (request.force, request.device, request.data_root) == (True, "cpu", "/d")
+    assert (request.batch_size, request.multimodality) == (64, False)
+
+
+def test_a_failed_evaluation_is_an_error_and_the_others_are_still_evaluated(
+    folder, monkeypatch, capsys
+):
+    def evaluate(request: EvaluationRequest) -> None:
+        if str(request.ckpt).endswith("mdm.ckpt"):
+            raise UserError("the first line\nmore")
+        write_json(str(request.out), measured(0, 0, 0, invalid_because=["off"]))
+
+    monkeypatch.setattr(evaluators.evaluation, "evaluate", evaluate)
+    words = [f"results={folder / 'none'}", f"out={folder / 'out'}"]
+    assert main(["tables", f"table={folder / 'spec.yaml'}", *words]) == 1
+    shown = capsys.readouterr()
+    assert "error: 5 evaluations failed: MDM: the first line; " in shown.err
+    assert "evaluating 7 of 7" in shown.out
+    assert "spec: 0 of 8 rows measured" in shown.out
+    assert "NOT VALID: spec, Text-to-motion, MFM: off" in shown.err

@@ -1,6 +1,7 @@
 """Evaluator audits: measurement, resumption, cards, and links to them."""
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -32,6 +33,7 @@ from flame_mdm.records import AuditCard, AuditedPerturbation
 from flame_mdm.reporting.audit_cards import (
     CitedCard,
     Seen,
+    _curve,
     card_name,
     card_of,
     findings,
@@ -854,3 +856,123 @@ def test_motions_pass_through_every_other_representation_of_their_skeleton_and_f
         (through,) = perturbations.through_others(representation)
         assert (through.name, through.group) == (f"through {other.name}", "plumbing")
     assert perturbations.through_others(HumanML(fps=31)) == []
+
+
+def card_with(card: AuditCard, perturbations: list[dict[str, Any]], **changes: Any) -> AuditCard:
+    """A card with these perturbations, each with a name, a group, and the values of its grades."""
+    content = card.model_dump() | {"perturbations": perturbations} | changes
+    return check_shape(json.loads(json.dumps(content)), AuditCard)
+
+
+def perturbed(
+    name: str, group: str, *grades: tuple[float, dict[str, list[float | None]]]
+) -> dict[str, Any]:
+    values = [{"grade": grade, "values": metrics} for grade, metrics in grades]
+    return {"name": name, "group": group, "about": f"about {name}", "unit": "", "grades": values}
+
+
+SEES: list[float | None] = [2.0, 0.1, 1.0, 0.1]
+BLIND: list[float | None] = [1.0, 0.1, 0.0, 0.1]
+BETTER: list[float | None] = [0.5, 0.1, -0.5, 0.1]
+
+
+def test_findings_name_what_one_metric_alone_sees_what_summaries_miss_and_biased_values(card):
+    def of(fid: list[float | None], jitter: list[float | None]) -> tuple[float, dict[str, Any]]:
+        return (0.5, {"fid": fid, "jitter": jitter})
+
+    rows = [
+        perturbed("both", "joints", of(SEES, SEES)),
+        perturbed("joints only fid", "joints", of(SEES, BLIND)),
+        perturbed("meaning only fid", "meaning", of(SEES, BLIND)),
+        perturbed("nobody", "meaning", of(BLIND, BLIND)),
+        perturbed("nobody:variant", "joints", of(BLIND, BLIND)),
+        perturbed("memorized", "set", of(BLIND, BLIND)),
+        perturbed("another set", "set", of(BLIND, BETTER)),
+        perturbed("better", "joints", of(SEES, BETTER)),
+        perturbed("fewer", "set", of(SEES, BLIND), (8.0, {"fid": [3.25, *SEES[1:]], "jitter": BLIND})),
+    ]  # fmt: skip
+    facts = {"jitter": {"sees_meaning": False}, "fid": {"depends_on_count": True}}
+    real = {"fid": [1.0, 0.1], "jitter": [1.0, 0.1]}
+    assert findings(card_with(card, rows, facts=facts, real=real)) == [
+        "No metric detects these perturbations: nobody, memorized.",
+        "Only fid detects these perturbations: joints only fid, meaning only fid.",
+        "jitter does not detect these perturbations: joints only fid.",
+        "jitter is better for these perturbations than for real motions: better.",
+        "With 8 real motions, fid is 3.25. With all motions, decoded and encoded again, it is 1.",
+    ]
+    facts["jitter"] |= {"sums_up": False}
+    lines = findings(card_with(card, rows, facts=facts, real=real))
+    assert not any("jitter does not" in line for line in lines)
+
+
+def test_cells_of_a_card_say_yes_for_a_single_grade_and_mark_what_is_not_monotone(card, tmp_path):
+    first = (1.0, {"fid": SEES, "jitter": BLIND})
+    rows = [
+        perturbed("single", "joints", (0.5, {"fid": [3.0, 0.1, 2.0, 0.1], "jitter": BETTER})),
+        perturbed("dips", "joints", first, (2.0, {"fid": [1.5, 0.1, 0.5, 0.1], "jitter": BLIND})),
+        perturbed("within", "joints", first, (2.0, {"fid": [1.95, 0.1, 0.95, 0.1], "jitter": BLIND})),
+    ]  # fmt: skip
+    real = {"fid": [1.0, 0.9], "jitter": [1.0, 0.4]}
+    page, text = write_card([card_with(card, rows, real=real)], tmp_path)
+    lines = text.read_text().replace("\\", "").splitlines()
+    assert "| single | yes | yes |" in lines
+    assert "| dips | 1 → – ~ | – |" in lines
+    assert "| within | 1 | – |" in lines
+    kinds = re.findall(r'<span class="(\w+)">(?:yes|1 → – ~|1|–)</span>', page.read_text())
+    assert kinds == ["seen", "bad", "weak", "faint", "seen", "faint"]
+
+
+def test_the_curve_of_a_perturbation_spans_the_box_from_real_motions_to_the_strongest_grade(card):
+    curve = _curve(card, card.perturbations[0], "fid")
+    assert curve is not None
+    points = [tuple(map(float, pair.split(","))) for pair in curve["line"].split()]
+    assert [x for x, _ in points] == [3, 45, 87, 129]  # 3 pixels from the edges of 132
+    means, halves = np.array([1.0, 1.1, 1.5, 3.0]), np.array([0.9, 0.3, 0.3, 0.3])
+    low, high = (means - halves).min(), (means + halves).max()
+    expected = 3 + 42 * (high - means) / (high - low)  # the largest values are at the top
+    assert [y for _, y in points] == pytest.approx(expected, abs=0.06)
+    band = [tuple(map(float, pair.split(","))) for pair in curve["band"].split()]
+    assert [x for x, _ in band] == [3, 45, 87, 129, 129, 87, 45, 3]
+    assert min(y for _, y in band) == 3
+    assert max(y for _, y in band) == 45
+    assert float(curve["level"]) == points[0][1]
+    assert curve["text"] == "1 to 3"
+    assert _curve(card, card.perturbations[1], "fid") is None  # it is constant
+
+
+def test_the_name_of_a_card_depends_on_the_motions_and_resamples_but_not_on_its_values(card):
+    changes: list[dict[str, Any]] = [
+        {"seed": 1}, {"split": "train"}, {"resamples": 11}, {"motions": 41}, {"extractor": None},
+        {"data": card.data.model_copy(update={"fingerprint": "g"})},
+        {"data": card.data.model_copy(update={"frames": [24, 61]})},
+        {"protocol": card.protocol.model_copy(update={"version": 2})},
+    ]  # fmt: skip
+    names = {card_name(card.model_copy(update=change)) for change in changes}
+    assert len(names | {card_name(card)}) == len(changes) + 1
+    assert card_name(card.model_copy(update={"real": {}, "packages": {}})) == card_name(card)
+
+
+def test_a_card_of_another_data_set_is_not_cited(card, tmp_path, monkeypatch):
+    monkeypatch.setenv("FLAME_MDM_AUDITS", str(tmp_path))
+    longer = card.model_copy(update={"data": card.data.model_copy(update={"dataset": "x-y"})})
+    write_json(tmp_path / f"{card_name(longer)}.json", longer.model_dump())
+    assert card_of(card.data, "ab" * 32) is None
+    other = card_of(longer.data, "ab" * 32)
+    assert other is not None
+    assert other.path == tmp_path / f"{card_name(longer)}.html"
+
+
+def test_metrics_that_are_exact_are_the_last_columns_and_facts_state_the_conditions(card, tmp_path):
+    facts = {"fid": {"exact": True}}
+    values = {"seed": 3, "resamples": 200, "not_computed": {"mid": "too few motions"}}
+    exact = card_with(card, [row.model_dump() for row in card.perturbations], facts=facts, **values)
+    lines = write_card([exact], tmp_path)[1].read_text().splitlines()
+    assert "| detected from | jitter | fid |" in lines
+    for line in (
+        "- motions: 40 of 24 to 60 frames", "- protocol: text\\_to\\_motion version 1, seed 3",
+        "- intervals: 95 %, from 200 bootstrap resamples of the motions", "- not computed: mid: too few motions",
+        "- data: test split of x, fingerprint f, ", "- fid against exact attributes: AUC 0.9, rank correlation -0.5",
+    ):  # fmt: skip
+        assert any(
+            shown.replace("\\", "").startswith(line.replace("\\", "").strip()) for shown in lines
+        ), line

@@ -132,6 +132,10 @@ def test_the_command_shows_what_is_searched_and_writes_it(tmp_path, data_root, c
     assert (len(page.motions), page.texts["h1"]) == (10, "synthetic: 10 of 120 clips")
     assert run("split=train", "search=walks") == 0
     assert {("walks" in m["caption"], m["group"]) for m in Page(out).motions} == {(True, "train")}
+    count = len(Page(out).motions)
+    assert Page(out).texts["h1"] == f"synthetic: {count} of {count} clips in train with 'walks'"
+    size = f"{out.stat().st_size / 1e6:.1f} MB"
+    assert f"page.html: {count} of {count} clips, {size}" in capsys.readouterr().out
 
     folder = tmp_path / "real motions"
     assert run("split=test", "clips=4", f"motions={folder}") == 0
@@ -248,3 +252,35 @@ def test_a_data_set_is_described_by_its_minutes_lengths_and_words(monkeypatch):
     # clips, minutes, frames (shortest, median, longest), captions, different ones, words of each
     assert seen["rows"] == [["train", 3, "2.2", 600, "900", 1200, 3, 2, "1.7"]]
     assert seen["actions"] == [("run", 3)]
+
+
+@pytest.mark.parametrize(("fps", "frames"), [(12.5, 188), (20.0, 300), (30.0, 450)])
+def test_a_page_shows_fifteen_seconds_at_any_frame_rate(fps: float, frames: int):
+    body = np.random.default_rng(0).uniform(0, 1, (600, 22, 3)).astype(np.float32)
+    store = stored(body, captions=[["walks"]])
+    raw: Any = Raw()
+    raw.fps = fps
+    shown = motion(store, raw, store.clips[0])
+    assert (len(shown.joints), shown.fps) == (frames, fps)
+    assert shown.text == f"walks (the first 15 of {600 / fps:.0f} s)"
+
+
+def test_a_mirrored_copy_belongs_to_its_original_even_if_that_is_in_another_split():
+    entries = [entry("Ma", "train", "waves"), entry("a", "val", "waves")]
+    assert [[clip.id for clip in family] for family in find(entries, None, "")] == [["a", "Ma"]]
+    assert [[clip.id for clip in family] for family in find(entries, "train", "")] == [["Ma"]]
+
+
+def test_clips_are_cut_before_they_are_moved_to_the_origin(tmp_path):
+    class Ends(Raw):
+        def rebase(self, x: np.ndarray) -> np.ndarray:
+            return x - x[-1]
+
+    body = np.arange(50.0)[:, None, None].repeat(22, 1).repeat(3, 2).astype(np.float32)
+    store = stored(body, captions=[["walks"]])
+    write_clips(tmp_path / "out", store, cast(Any, Ends()), store.clips, 40)
+    (file,) = (tmp_path / "out").glob("*.npz")
+    with np.load(file) as arrays:
+        assert arrays["joints"][-1].max() == 0
+        assert arrays["joints"][0].min() == -39
+        assert str(arrays["split"]) == "train"

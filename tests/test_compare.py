@@ -1,22 +1,38 @@
 """Runs side by side, and how people judge their motions."""
 
 import json
+import re
 from html import unescape
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_rel
+from scipy.stats import binomtest, ttest_rel
 from support.pages import PROMPTS, a_run, data_of, motions, players, put, result
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
+from flame_mdm.commands.compare import _sampled
 from flame_mdm.errors import UserError
 from flame_mdm.records import Result, Value
-from flame_mdm.reporting.compare import _difference, _facts, differences, paired_difference
-from flame_mdm.reporting.study import tally
+from flame_mdm.reporting.compare import (
+    ComparedRun,
+    _charts,
+    _difference,
+    _differences,
+    _evaluations,
+    _facts,
+    differences,
+    find,
+    in_all,
+    paired_difference,
+    read_motions,
+)
+from flame_mdm.reporting.study import tally, wilson
 from flame_mdm.runs import read_run
+from flame_mdm.sampling.motion_request import SamplingRequest
 from flame_mdm.schemas import check_shape
 
 
@@ -355,3 +371,130 @@ def test_motions_are_paired_if_seed_lengths_and_skeleton_agree(change: dict, pai
     values = {"values": {"fid": of(4.5, [4.4, 4.6])}}
     pair = [check_shape(result(**values, **changes), Result) for changes in ({}, change)]
     assert isinstance(differences(*pair), list) == paired
+
+
+def test_differences_of_configurations_and_charts_leave_out_what_is_equal(tmp_path):
+    runs = {
+        name: read_run(a_run(tmp_path / name, name=name, **changes))
+        for name, changes in (("a", {"x": 0, "experiment": "one"}), ("b", {"x": 0, "y": {"z": 1}}))
+    }
+    assert _differences(runs) == [["y.z", "–", "1"]]
+    (tmp_path / "a" / "metrics.jsonl").write_text(
+        '{"step": 1, "train/loss": 2.0, "val/fid": 0.5, "val/fid/ci": 0.25, "train/lr": 0.1}\n'
+    )
+    (tmp_path / "b" / "metrics.jsonl").write_text(
+        '{"step": 5, "train/loss": 3.0, "val/fid": 0.75, "train/lr": 0.1}\n'
+    )
+    groups = _charts({name: read_run(run.folder) for name, run in runs.items()})
+    titles = {
+        heading: re.findall(r"<h3>(.*?)</h3>", "".join(charts))
+        for heading, charts in groups.items()
+    }
+    assert titles == {
+        "Validation": ["val/fid"],
+        "Training curves": ["train/loss"],  # the rate is the same in both
+    } or titles == {"Losses": ["train/loss"], "Validation": ["val/fid"], "Training curves": []}
+    (chart,) = groups["Validation"]
+    assert "polygon" in chart  # the interval of the first run
+    assert "a 0.5" in re.sub("<[^>]*>", "", chart)
+    assert "b 0.75" in re.sub("<[^>]*>", "", chart)
+
+
+def test_a_table_of_results_has_the_real_motions_and_each_label_with_its_unit(tmp_path):
+    names = ("first", "second", "third")
+    folders = [a_run(tmp_path / name, name=name) for name in names]
+    put(folders[0], values={"fid": of(4.5, [4.4, 4.6])})
+    put(folders[1], values={"drift": of(1.0, [1.0, 1.5]) | {"unit": "m"}, "fid": of(3.5, [3.4, 3.6])},
+        ground_truth={"fid": of(9.0, [9.0, 9.0])})  # fmt: skip
+    put(folders[2], values={"fid": of(5.5, [5.0, 5.0])}, invalid_because=["off"])
+    runs = {name: read_run(folder) for name, folder in zip(names, folders, strict=True)}
+    ((_, head, rows, notes, tables),) = _evaluations(runs)
+    assert head == ["", "real motions", "first [1]", "second [2]", "third [3]"]
+    assert rows == [
+        ["drift (m)", "–", "–", "1 ± 0.1", "–"],
+        ["fid", "0.125 ± 0.25", "4.5 ± 0.1", "3.5 ± 0.1", "5.5 ± 0.1"],
+    ]
+    assert [shown for _, shown in notes] == [[], [], ["not valid: off"]]
+    (title, differences_of), (other, empty) = tables
+    assert title == "[2] second − [1] first"
+    assert [row[:2] for row in differences_of] == [["fid", "-1"]]
+    assert (other, empty) == ("[3] third − [1] first: not compared: not valid: off", [])
+
+
+def test_runs_of_equal_names_have_their_folders_as_labels(tmp_path):
+    folders = [a_run(tmp_path / name, name="same") for name in "ab"]
+    folders += [a_run(tmp_path / "c", name="other"), motions(tmp_path / "real")]
+    labels = [entry.label for entry in find(folders)]
+    assert labels == [str(folders[0]), str(folders[1]), "mine/other", "real"]
+    assert [entry.run is None for entry in find(folders)] == [False, False, False, True]
+    with pytest.raises(UserError, match="needs two or more runs"):
+        find([folders[0], folders[0]])
+
+
+def test_motions_of_one_text_are_numbered_and_hidden_files_are_not_read(tmp_path):
+    folder = motions(tmp_path, ("walks", "jumps", "walks"))
+    (folder / ".hidden.npz").write_bytes(b"")
+    (folder / "below").mkdir()
+    (folder / "below" / "x.npz").write_bytes(b"")
+    assert list(read_motions(folder)) == [("walks", 0), ("jumps", 0), ("walks", 1)]
+    first = {("a", 0): 1, ("b", 0): 2, ("a", 1): 3}
+    second = {("a", 1): 1, ("a", 0): 2}
+    assert in_all(cast(Any, [first, second])) == [("a", 0), ("a", 1)]
+
+
+@pytest.mark.parametrize(("prompts", "seconds", "shown", "message"), [
+    ({("walk", 0): None, ("run", 0): None}, None, ("actions", ["walk", "run"]), ""),
+    ({("a person walks", 0): 3.0, ("a person walks", 1): 1.5}, [3.0, 1.5], ("texts", ["a person walks"] * 2), ""),
+    ({("a person walks", 0): 3.01, ("a person runs", 0): 9.0, ("a person sits", 0): 2.0}, [3.0, 3.0, 2.0],
+     ("texts", ["a person walks", "a person runs", "a person sits"]),
+     "2 of 3 motions are shortened to 3 seconds, the maximum length for one"),
+])  # fmt: skip
+def test_runs_are_sampled_for_texts_or_actions_of_their_lengths(
+    prompts, seconds, shown, message, monkeypatch, capsys
+):
+    requests: list[SamplingRequest] = []
+    model = SimpleNamespace(
+        facts={"max_frames": 90, "actions": ["walk", "run"]},
+        representation=SimpleNamespace(fps=30.0),
+    )
+
+    def resolve(request: SamplingRequest, _: Any, check_words: bool) -> SamplingRequest:
+        assert not check_words
+        requests.append(request)
+        return request
+
+    monkeypatch.setattr("flame_mdm.checkpoints.loading.load", lambda *_: model)
+    monkeypatch.setattr("flame_mdm.sampling.resolution.resolve", resolve)
+    monkeypatch.setattr(
+        "flame_mdm.sampling.generation.sample", lambda _, request: list(request.prompts)
+    )
+    entry = ComparedRun("one", Path("run"), None)
+    sampled = _sampled(entry, prompts, seed=7)
+    assert list(sampled) == list(prompts)
+    (request,) = requests
+    name, texts = shown
+    assert list(getattr(request, name) or ()) == texts
+    assert (request.seconds and list(request.seconds)) == seconds
+    assert (request.seed, request.split, request.samples) == (7, False, 1)
+    assert capsys.readouterr().out.strip() == message
+
+
+@pytest.mark.parametrize(("wins", "votes"), [(0, 5), (5, 5), (3, 10), (40, 90), (1, 1)])
+def test_bounds_of_a_share_are_those_of_wilson(wins: int, votes: int):
+    share, low, high = wilson(wins, votes)
+    interval = binomtest(wins, votes).proportion_ci(0.95, method="wilson")
+    assert share == wins / votes
+    assert (low, high) == pytest.approx((interval.low, interval.high), abs=1e-5)
+    assert 0 <= low <= share <= high <= 1
+    assert wilson(0, 0) == (0, 0, 1)
+
+
+def test_a_rater_of_two_pages_counts_once_and_sides_of_later_files_are_turned(tmp_path):
+    files = [
+        ratings(tmp_path / "a.json", "ab", a="ours", b="theirs"),
+        ratings(tmp_path / "b.json", "aaa", a="theirs", b="ours", study="t"),
+        ratings(tmp_path / "c.json", "b", rater="bob", a="theirs", b="ours"),
+    ]
+    (pair,) = tally(files)
+    assert (pair.a, pair.b, pair.wins_a, pair.wins_b, pair.raters) == ("ours", "theirs", 2, 4, 2)
+    assert (pair.votes, pair.share[0]) == (6, pytest.approx(1 / 3))

@@ -7,12 +7,14 @@ import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Literal, get_type_hints
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -20,11 +22,31 @@ from support.fixtures import recipe
 from support.refusals import one_error
 
 import flame_mdm
+from evaluators.evaluation_request import EvaluationRequest
 from flame_mdm import config
 from flame_mdm.__main__ import COMMANDS, main
-from flame_mdm.checkpoints.loading import NO_GPU
+from flame_mdm.checkpoints.hub import export
+from flame_mdm.checkpoints.loading import NO_GPU, load
+from flame_mdm.checkpoints.onnx_export import export_onnx
+from flame_mdm.checkpoints.released import import_released
+from flame_mdm.commands import WritingSettings, device_name
+from flame_mdm.commands.adapt import AdaptSettings
+from flame_mdm.commands.audit import AuditSettings
+from flame_mdm.commands.benchmark import BenchmarkSettings
+from flame_mdm.commands.browse import BrowseSettings
+from flame_mdm.commands.compare import CompareSettings
+from flame_mdm.commands.convert import ConvertSettings
+from flame_mdm.commands.demo import DemoSettings
+from flame_mdm.commands.edit import EditSettings
 from flame_mdm.commands.evaluate import EvaluateSettings
+from flame_mdm.commands.export import ExportSettings
+from flame_mdm.commands.import_released import ImportSettings
 from flame_mdm.commands.inspect import InspectSettings
+from flame_mdm.commands.judge import JudgeSettings
+from flame_mdm.commands.prepare import PrepareSettings
+from flame_mdm.commands.push import PushSettings
+from flame_mdm.commands.sample import SampleSettings
+from flame_mdm.commands.tables import TablesSettings
 from flame_mdm.config import (
     check,
     compose,
@@ -44,10 +66,17 @@ from flame_mdm.config.jobs import run_jobs
 from flame_mdm.config.options import option
 from flame_mdm.config.signatures import check_kind, source_file
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.demo.app import serve
+from flame_mdm.demo.request import PLUS
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import read_package_yaml, read_yaml
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.motion_request import EditRequest, SamplingRequest
+from flame_mdm.sampling.reading import read_motion
+from flame_mdm.training.adaptation import adapt
 from flame_mdm.training.fit import check_devices
 
 PARTS = ("task", "representation", "process", "condition", "denoiser", "data")
@@ -898,3 +927,208 @@ def test_a_sweep_of_trainings_ends_with_the_worst_code_and_a_signal_ends_it(
     assert seeds == [0, 1][:count]
     assert sweeps.run_recipe(train, "usage", []) == 2
     assert sweeps.run_recipe(train, "usage", ["--help"]) == 0
+
+
+SAME_AS_PYTHON: dict[type[Any], list[tuple[Callable[..., Any], dict[str, str]]]] = {
+    AdaptSettings: [(adapt, {})],
+    DemoSettings: [(serve, {})],
+    ExportSettings: [(export, {}), (export_onnx, {}), (load, {"adapter_strength": "strength"})],
+    ImportSettings: [(import_released, {})],
+    ConvertSettings: [(Motion.save, {}), (read, {})],
+    EditSettings: [(read_motion, {}), (EditRequest, {}), (SamplerOptions, {})],
+    SampleSettings: [(SamplingRequest, {}), (SamplerOptions, {})],
+    EvaluateSettings: [(EvaluationRequest, {}), (SamplerOptions, {})],
+    AuditSettings: [(EvaluationRequest, {})],
+    TablesSettings: [(EvaluationRequest, {})],
+    BenchmarkSettings: [(TablesSettings, {})],
+}
+"""Settings of commands, and the functions and classes to which they pass the keys of the same name."""
+
+OTHER_DEFAULTS = {
+    "SampleSettings.samples": None,  # 3, or 1 for a file
+    "EditSettings.samples": 3,
+    "ExportSettings.adapter": None,
+    "ConvertSettings.body": "mannequin",
+    "AuditSettings.resamples": 100,
+    "BenchmarkSettings.out": None,
+    "AuditSettings.protocol": None,  # depends on the data set
+    "TablesSettings.out": "runs/tables",
+    "AuditSettings.out": "runs/audit",
+    "TablesSettings.batch_size": 64,
+    "AuditSettings.batch_size": 64,
+    "AdaptSettings.data_root": "data",  # or FLAME_MDM_DATA
+    "EvaluateSettings.data_root": "",
+}
+
+
+@pytest.mark.parametrize("kind", SAME_AS_PYTHON)
+def test_defaults_of_a_command_are_those_of_the_function_that_it_calls(kind, monkeypatch):
+    monkeypatch.delenv("FLAME_MDM_DATA", raising=False)
+    defaults = {
+        entry.name: entry.default_factory() if callable(entry.default_factory) else entry.default
+        for entry in fields(kind)
+    }
+    compared = 0
+    for function, names in SAME_AS_PYTHON[kind]:
+        parameters_of = signature(function).parameters
+        for key, default in defaults.items():
+            parameter = parameters_of.get(names.get(key, key))
+            if parameter is None or parameter.default is parameter.empty or default is MISSING:
+                continue
+            expected = OTHER_DEFAULTS.get(f"{kind.__name__}.{key}", parameter.default)
+            if repr(expected) == "<factory>":
+                continue
+            values = [tuple(x) if isinstance(x, list) else x for x in (default, expected)]
+            assert values[0] == values[1], (key, function)
+            compared += 1
+    assert compared > 0
+
+
+def test_defaults_of_commands_without_a_function_are_those_that_their_pages_state():
+    defaults = {
+        f"{kind.__name__}.{entry.name}": entry.default
+        for kind in (
+            BrowseSettings,
+            InspectSettings,
+            JudgeSettings,
+            CompareSettings,
+            TablesSettings,
+        )
+        for entry in fields(kind)
+        if isinstance(entry.default, int)
+    } | {
+        f"{kind.__name__}.{entry.name}": entry.default
+        for kind in (AuditSettings, BenchmarkSettings, PrepareSettings, PushSettings)
+        for entry in fields(kind)
+        if isinstance(entry.default, int)
+    }
+    off = [
+        *("CompareSettings.rate", "TablesSettings.force", "PrepareSettings.check"),
+        *("PrepareSettings.verify", "PrepareSettings.force", "PushSettings.private"),
+        "PushSettings.dry_run",
+    ]
+    assert defaults == dict.fromkeys(off, False) | {
+        "BrowseSettings.clips": 200, "InspectSettings.clips": 24,
+        "JudgeSettings.clips": 24, "CompareSettings.seed": 0,
+        "TablesSettings.evaluate": True, "TablesSettings.batch_size": 64, "AuditSettings.seed": 0,
+        "AuditSettings.resamples": 100, "AuditSettings.batch_size": 64, "BenchmarkSettings.jobs": 1,
+        "BenchmarkSettings.batch_size": 64,
+    }  # fmt: skip
+
+
+def called_with(monkeypatch: pytest.MonkeyPatch, path: str) -> list[tuple[Any, ...]]:
+    """Replaces a function, and returns a list to which the arguments of its calls are added."""
+    calls: list[tuple[Any, ...]] = []
+
+    def function(*values: Any, **keywords: Any) -> str:
+        calls.append((*values, keywords))
+        return "the result"
+
+    monkeypatch.setattr(path, function)
+    return calls
+
+
+def test_export_push_and_demo_pass_their_keys_on(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "last.ckpt"
+    file.touch()
+    graphs = called_with(monkeypatch, "flame_mdm.checkpoints.onnx_export.export_onnx")
+    single = called_with(monkeypatch, "flame_mdm.checkpoints.hub.export")
+    words = [f"ckpt={file}", "out=x", "half=true", "adapter=a.safetensors b.safetensors"]
+    assert main(["export", *words, "adapter_strength=[0.5,0]"]) == 0
+    assert main(["export", *words[:2], "format=onnx"]) == 0
+    adapted = {"adapter": ["a.safetensors", "b.safetensors"], "strength": [0.5, 0]}
+    assert single == [(file, "x", {"half": True} | adapted)]
+    assert graphs == [(file, "x", {"half": False, "adapter": (), "strength": 1.0})]
+    assert capsys.readouterr().out == "written: the result\n" * 2
+
+    pushed = called_with(monkeypatch, "flame_mdm.checkpoints.hub.push")
+    assert main(["push", str(file), "me/walks", "private=true"]) == 0
+    assert main(["push", str(file), "me/walks", "out=here", "dry_run=true"]) == 0
+    folder = Path("push/walks")
+    assert pushed[0] == (file, "me/walks", folder, {"upload": True, "private": True})
+    assert pushed[1] == (file, "me/walks", "here", {"upload": False, "private": False})
+    printed = ["uploaded to me/walks: the result", "not uploaded: the result"]
+    assert capsys.readouterr().out.splitlines() == printed
+
+    served = called_with(monkeypatch, "flame_mdm.demo.app.serve")
+    assert main(["demo"]) == 0
+    assert main(["demo", "ckpt=a b", "adapter=x y", "port=0", "host=0.0.0.0", "hosts=m n"]) == 0
+    assert served[0][:4] == (["package", "package_dip"], "127.0.0.1", 7860, None)
+    sources = ["a", "b", f"a{PLUS}x", f"a{PLUS}y"]  # adapters are for the first model
+    assert served[1][:5] == (sources, "0.0.0.0", 0, None, ["m", "n"])
+    for port in (-1, 65536):
+        assert main(["demo", f"port={port}"]) == 1
+    assert len(served) == 2
+
+
+def test_adapt_and_import_pass_their_keys_on(tmp_path, monkeypatch):
+    file = tmp_path / "last.ckpt"
+    file.touch()
+    monkeypatch.setenv("FLAME_MDM_DATA", "elsewhere")
+    adapted = called_with(monkeypatch, "flame_mdm.training.adaptation.adapt")
+    words = ["source=mine", "name=limp", "rank=4", "action=true", "trainer.max_steps=9"]
+    assert main(["adapt", str(file), *words]) == 0
+    ((base, keywords),) = adapted
+    assert base == file
+    assert keywords == {
+        "source": "mine", "name": "limp", "out": None, "action": True, "full": False, "force": False,
+        "rank": 4, "data_root": "elsewhere", "overrides": ("trainer.max_steps=9",),
+    }  # fmt: skip
+    assert main(["adapt", str(file), "source=mine", "name=limp", "rank=0"]) == 1
+    imported = called_with(monkeypatch, "flame_mdm.checkpoints.released.import_released")
+    assert main(["import", "mdm", str(file), "out=x", "averaged=false", "num_heads=8"]) == 0
+    ((keywords,),) = imported
+    assert (keywords["kind"], keywords["file"], keywords["out"]) == ("mdm", str(file), "x")
+    assert (keywords["averaged"], keywords["num_heads"]) == (False, 8)
+    assert (keywords["time_token"], keywords["run_code"], keywords["stats"]) == (False, False, None)
+
+
+def test_a_data_set_of_a_command_has_its_root_representation_and_source(tmp_path, monkeypatch):
+    monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path))
+    words = ["data=synthetic", "representation=smpl", "data.source.seed=7"]
+    settings = read_settings(PrepareSettings, words)
+    data = settings.data_node()
+    assert (data["source"]["seed"], data["root"]) == (7, str(tmp_path))
+    assert settings.nodes["representation"]["_target_"].endswith("SMPL")
+    assert PrepareSettings(data="synthetic", data_root="").data_node()["root"] == "data"
+    source = PrepareSettings(data="humanml3d").data_node("here")["source"]
+    assert source["path"] == "here"
+    with pytest.raises(UserError, match=r"^source=here: synthetic is generated and has no source"):
+        settings.data_node("here")
+
+
+@pytest.mark.parametrize("kind", [PrepareSettings, BrowseSettings, InspectSettings])
+def test_commands_that_only_open_a_data_set_have_no_seed(kind):
+    words = ["motion=synthetic"] if kind is InspectSettings else ["data=synthetic"]
+    with pytest.raises(UserError, match="seed"):
+        read_settings(kind, [*words, "seed=1"])
+
+
+@pytest.mark.parametrize(("name", "is_valid"), [
+    ("cpu", True), ("cuda", True), ("cuda:0", True), ("cuda:12", True), ("mps", True), ("xpu", True),
+    ("cuda:", False), ("cuda:a", False), ("gpu", False), ("cpu:0", False), ("CUDA", False), ("", False),
+])  # fmt: skip
+def test_names_of_devices(name: str, is_valid: bool):
+    with nullcontext() if is_valid else pytest.raises(UserError, match=rf"^device={name}: unknown"):
+        device_name("device", name)
+
+
+def test_a_motion_is_resampled_only_if_a_rate_is_chosen():
+    motion = Motion(np.zeros((21, 22, 3), np.float32), 20.0)
+    assert WritingSettings().at_rate(motion) is motion
+    changed = WritingSettings(resample=30).at_rate(motion)
+    assert (changed.fps, len(changed.joints)) == (30, 31)
+    with pytest.raises(UserError, match="resample"):
+        WritingSettings(resample=0).at_rate(motion)
+
+
+@pytest.mark.parametrize(("argv", "code", "stream"), [
+    ([], 2, "out"), (["--help"], 0, "out"), (["-h"], 0, "out"), (["sampel"], 1, "err"),
+])  # fmt: skip
+def test_the_list_of_commands_is_shown_and_an_unknown_one_is_an_error(argv, code, stream, capsys):
+    assert main(argv) == code
+    shown = getattr(capsys.readouterr(), stream)
+    if stream == "err":
+        assert shown.startswith("error: unknown command: sampel. Did you mean sample?")
+    else:
+        assert all(f"  {name:10} {purpose}\n" in shown for name, purpose in COMMANDS.items())

@@ -3,7 +3,9 @@
 import math
 import re
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from evaluators import perturbations as p
 from evaluators.encoding import encode
 from flame_mdm.__main__ import main
 from flame_mdm.commands import FileSettings, read_motions
+from flame_mdm.commands.inspect import InspectSettings, _clips
+from flame_mdm.errors import UserError
 from flame_mdm.formats import faults as faults_module
 from flame_mdm.formats.faults import LIMITS, Fault, _away, _stretched, depths, find_faults
 from flame_mdm.formats.motion import Motion
@@ -504,3 +508,80 @@ def test_faults_last_for_seconds_and_have_speeds_per_second_at_any_rate(fps: int
     ):
         assert kind in kinds_of(faulty), kind
         assert kind not in kinds_of(sound), kind
+
+
+def faults_named(*kinds: str) -> list[Fault]:
+    return [Fault(kind, "head", number, number + 2, 1.0) for number, kind in enumerate(kinds)]
+
+
+@pytest.mark.parametrize(("clips", "lists"), [(3, True), (2, True), (1, False)])
+def test_faults_are_listed_if_the_player_shows_all_motions(
+    clips: int, lists: bool, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for name in "ab":
+        Motion(body(), FPS, text=name).save(f"motions/{name}.npz")
+    (tmp_path / "motions" / "damaged.npz").write_bytes(b"damaged")
+    many = faults_named(*[next(iter(LIMITS))] * 25)
+    monkeypatch.setattr(
+        faults_module, "find_faults", lambda motion: many if motion.text == "b" else []
+    )
+    # An unreadable file is the error that decides about the exit code
+    assert main(["inspect", "motions", "page.html", f"clips={clips}"]) == 1
+    shown = capsys.readouterr()
+    assert "motions: 1 of 2 motions have faults" in shown.out
+    assert "error: 1 of 3 motions could not be read" in shown.err
+    assert ("b: 25 faults" in shown.out) == lists
+    listed = [line for line in shown.out.splitlines() if line == f"  {many[0]}"]
+    assert len(listed) == lists
+    assert (f"  {many[19]}" in shown.out.splitlines()) == lists
+    assert f"  {many[20]}" not in shown.out.splitlines()
+    page = Page(tmp_path / "page.html")
+    assert [motion["caption"] for motion in page.motions] == ["b", "a"][:clips]
+    assert len(page.motions[0]["marks"]) == 25
+    last = "player: page.html" if lists else "page.html: the 1 worst motions (open in any browser)"
+    assert shown.out.splitlines()[-1] == last
+
+
+def test_clips_of_the_chosen_split_are_inspected(tmp_path):
+    assert main(["prepare", "synthetic", "data.source.clips=12", f"data_root={tmp_path}"]) == 0
+
+    def ids(split: str | None) -> list[str]:
+        words = ("data.source.clips=12",)
+        settings = InspectSettings(
+            motion="synthetic", data_root=str(tmp_path), split=split, composed=words
+        )
+        name, count, motions = _clips(settings)
+        assert name.startswith("synthetic-")
+        shown = [motion.id for motion in motions]
+        assert len(shown) == count
+        return shown
+
+    of_splits = [ids(split) for split in ("train", "val", "test")]
+    assert all(of_splits)
+    assert sorted(ids(None)) == sorted(chain(*of_splits))
+    with pytest.raises(UserError, match=r"^unknown split dev\. Available: train, val, test"):
+        ids("dev")
+
+
+def test_files_of_a_folder_are_read_with_the_keys_and_unreadable_ones_are_listed(
+    tmp_path, monkeypatch
+):
+    for name in ("a.npz", "deep/a.npz", "deep/damaged.npz"):
+        Motion(body(), FPS).save(tmp_path / name)
+    keys: list[tuple[Any, ...]] = []
+
+    def read(path: Path, *values: Any, animation: str | None = None) -> Motion:
+        keys.append((*values, animation))
+        if path.stem == "damaged":
+            raise UserError("the first line\nmore")
+        return Motion(body(), FPS)
+
+    monkeypatch.setattr("flame_mdm.formats.readers.read", read)
+    failures: list[str] = []
+    settings = FileSettings(fps=12.5, unit=0.01, up="z", animation="Wave")
+    name, total, motions = read_motions(str(tmp_path), settings, failures)
+    assert (name, total) == (tmp_path.name, 3)
+    assert [motion.id for motion in motions] == ["a", "deep/a"]
+    assert failures == ["the first line"]
+    assert set(keys) == {(12.5, 0.01, "z", "Wave")}

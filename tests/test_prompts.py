@@ -3,7 +3,8 @@
 import json
 import re
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,16 +14,18 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import ROOT
+from support.motions import Page
 from support.refusals import error_of, one_line_error
 
 import flame_mdm
 from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.commands.sample import _distance
+from flame_mdm.commands.sample import GALLERY, SampleSettings, _distance, _gallery, _write_files
 from flame_mdm.conditions.prompts import read_prompt
 from flame_mdm.conditions.vocabulary import advice, check_known
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.safe_io import read_package_yaml, sha256
 from flame_mdm.sampling import targets
@@ -361,3 +364,46 @@ def test_refused_lines_keep_their_numbers_and_the_others_their_lengths(tmp_path)
         path.write_text(content)
         with pytest.raises(UserError, match=r"contains no prompts\. Write one per line"):
             PromptFile.read(str(path))
+
+
+def test_files_of_several_motions_are_numbered_from_two_and_have_the_chosen_rate(tmp_path):
+    motions = [
+        Motion(np.zeros((11, 22, 3), np.float32), 10.0, text=name) for name in ("a", "b", "c")
+    ]
+    settings = SampleSettings(ckpt="x", text="a", resample=20)
+    _write_files(settings, tmp_path / "walk.npz", motions, None, None, {"seed": 3})
+    names = {"walk.npz": "a", "walk_2.npz": "b", "walk_3.npz": "c"}
+    assert {path.name for path in tmp_path.iterdir()} == set(names)
+    for name, text in names.items():
+        with np.load(tmp_path / name) as arrays:
+            assert (str(arrays["text"]), float(arrays["fps"]), int(arrays["seed"])) == (text, 20, 3)
+            assert len(arrays["joints"]) == 21
+
+
+def test_the_page_of_a_prompt_file_has_the_first_motion_of_each_prompt_up_to_200(
+    tmp_path, monkeypatch
+):
+    assert GALLERY == 200
+    monkeypatch.setattr("flame_mdm.commands.sample.GALLERY", 3)
+    motion = Motion(np.random.default_rng(0).random((5, 22, 3)).astype(np.float32), 10.0)
+    folders = {
+        tmp_path / f"{number}-walks": [replace(motion, text=f"{number} {k}") for k in range(2)]
+        for number in range(4)
+    }
+    line = _gallery(cast(Any, SimpleNamespace(path="some/mine.txt")), folders, None)
+    page = tmp_path / "mine.html"
+    assert line == f"8 motions for 4 prompts, one folder per prompt: {page}"
+    shown = [(entry["id"], entry["caption"]) for entry in Page(page).motions]
+    assert shown == [(f"{number}-walks", f"{number} 0") for number in range(3)]
+    assert Page(page).texts["h1"] == "4 prompts"
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"scorer": "claims"}, "scorer=claims chooses among several motions"),
+    ({"scorer": "claims", "candidates": 2}, None), ({"candidates": 2}, None),
+    ({"scorer": "claims", "candidates": 2, "text": None, "action": "walk"}, "Add text="),
+])  # fmt: skip
+def test_a_scorer_needs_several_candidates_for_a_text(options, message):
+    settings = SampleSettings(ckpt="x", **({"text": "walks"} | options))
+    with pytest.raises(UserError, match=message) if message else nullcontext():
+        settings.request_for(None)

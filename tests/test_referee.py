@@ -1,5 +1,6 @@
 """The referee: claims of sentences, measurements, verdicts, and what changes none of them."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
@@ -1030,3 +1031,30 @@ def test_seconds_are_read_with_a_word_before_or_after_the_number(words: str, sec
 
 if __name__ == "__main__":
     np.savez_compressed(MEASURED, allow_pickle=False, **measured())
+
+
+def test_the_command_marks_frames_of_the_motion_and_counts_all_verdicts(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    texts = {"a": "a person raises the left hand", "b": "a person raises the right hand", "c": "x"}
+    for name, text in texts.items():
+        motion = raising("left")
+        motion.text = text
+        motion.save(f"motions/{name}.npz")
+    assert main(["judge", "motions", "page.html"]) == 3
+    judgments = {name: flame_mdm.judge(raising("left"), text) for name, text in texts.items()}
+    counts = Counter(v.answer for judgment in judgments.values() for v in judgment.verdicts)
+    printed = capsys.readouterr().out
+    assert (
+        f"motions: in 3 motions, {counts['yes']} claims are true, {counts['no']} are false, and "
+        f"{counts['cannot tell']} cannot be decided"
+    ) in printed
+    assert "c: 'x'\n  the text contains no claim that can be checked" in printed
+    shown = {motion["caption"]: motion["marks"] for motion in Page(tmp_path / "page.html").motions}
+    for name, text in texts.items():
+        marks = [m for v in judgments[name].verdicts for m in v.marks(FPS, 60)]
+        assert [mark[:3] for mark in shown[text]] == [list(mark[:3]) for mark in marks]
+    # A text on the command line replaces those of the files
+    assert main(["judge", "motions", "page.html", f"text={texts['a']}"]) == 0
+    assert {motion["caption"] for motion in Page(tmp_path / "page.html").motions} == {texts["a"]}

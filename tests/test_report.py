@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from support.pages import a_run, put, result
+from support.pages import a_run, motions, put, result
 from support.runs import TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from wandb import Run
@@ -31,7 +31,16 @@ from flame_mdm.reporting.plots import (
     chart,
     svg,
 )
-from flame_mdm.reporting.report import _evaluation, _facts, charted, marks, sampling, write_report
+from flame_mdm.reporting.report import (
+    _chart,
+    _evaluation,
+    _facts,
+    _provenance,
+    charted,
+    marks,
+    sampling,
+    write_report,
+)
 from flame_mdm.runs import Provenance, RunConfig, made_by, read_history, read_run
 from flame_mdm.schemas import check_shape
 from flame_mdm.training import callbacks
@@ -648,3 +657,97 @@ def test_an_evaluation_in_a_report_names_its_audit_and_units(audit, motions, tex
     assert title == "p version 3, synthetic test, extractor 01234567"
     assert str(facts).endswith(f"; {text}")
     assert rows == [["drift (m)", "1 ± 0.5", "2 ± 0.5"], ["x (m)", "2 ± 0.5", "–"]]
+
+
+def test_samples_of_a_report_are_named_by_their_own_step_and_faulty_batches_by_their_process(
+    tmp_path,
+):
+    folder = a_run(tmp_path / "run")
+    motions(folder / "samples" / "step_0001200")
+    batches = [{"rank": 3, "batch": 7, "ids": ["a", "b"], "loss": "inf"}]
+    content = {"step": 8, "usual_loss": "0.5", "batches": batches}
+    (folder / "bad_batch.json").write_text(json.dumps(content))
+    text = write_report(folder).read_text()
+    assert "<h2>Samples at step 1,200</h2>" in text
+    row = ("process 3, batch 7", "inf", "a, b")
+    assert "".join(f"<td>{cell}</td>" for cell in row) in text
+
+
+def test_real_motions_are_drawn_beside_the_family_that_has_them(tmp_path):
+    folder = a_run(tmp_path / "run")
+    (folder / "metrics.jsonl").write_text(
+        '{"step": 1, "a/fid": 1.0, "b/fid": 2.0, "b/fid/real": 0.25, "b/fid/ci": 0.5}\n'
+        '{"step": 5, "a/fid": 1.5, "b/fid": 2.5, "b/fid/real": 0.25, "b/fid/ci": 0.5}\n'
+    )
+    drawing = str(_chart(read_run(folder), "fid", ["a", "b"]))
+    words = re.sub("<[^>]*>", " ", drawing.partition('class="key"')[2]).split()
+    assert " ".join(words[1:]) == "a 1.5 b 2.5 real motions 0.25"
+    assert re.findall(r'<polygon class="(c\d)"', drawing) == ["c1"]  # the band of b
+
+
+@pytest.mark.parametrize(("commit", "changed", "text"), [
+    ("abc", None, "abc"), ("abc", "f00d", "abc with uncommitted changes"), (None, None, "not from a clone"),
+])  # fmt: skip
+def test_provenance_names_the_commit_and_whether_it_was_changed(commit, changed, text):
+    content = {
+        "command": ["train", "x=1"], "commit": commit, "changed": changed, "python": "3.12", "machine": "m",
+        "packages": {"torch": "2", "numpy": "1"}, "device": "cpu", "parameters": None,
+        "data": {"fingerprint": "f00d", "dataset": "kit", "actions": ["walk"]},
+    }  # fmt: skip
+    rows = dict(_provenance(check_shape(content, Provenance)))
+    assert rows["commit"] == text
+    assert (rows["command"], rows["machine"]) == ("train x=1", "m, Python 3.12")
+    assert rows["packages"] == "torch 2, numpy 1"
+    assert "fingerprint f00d" in rows["data"]
+    assert "walk" not in rows["data"]
+
+
+def test_a_chart_lists_the_last_finite_values_and_begins_at_step_0():
+    nan = float("nan")
+    curve = {30: float("-inf"), 20: 0.5, 10: 2.0, 25: nan, 40: -1e301}
+    drawing = str(chart("x", {"a": curve, "b": {5: 1.0}, "none": {3: nan}}))
+    words = re.sub("<[^>]*>", " ", drawing.partition('class="key"')[2]).split()
+    assert " ".join(words[1:]) == "a 0.5 b 1 none –"
+    (first, second), width = points(drawing), 460 - 58 - 10
+    # Half of the axis, which ends at the last drawn step
+    assert (first[0], second[0]) == pytest.approx((58 + width / 2, 58 + width), abs=0.1)
+    assert first[1] < second[1]
+
+
+def test_bands_of_all_curves_and_all_levels_are_within_the_axes():
+    series = [
+        Series("a", [(0.0, 1.0), (1.0, 2.0)]),
+        Series("b", [(0.0, 1.0), (1.0, 2.0)], {1.0: 50.0}),
+    ]
+    panel = drawn(*series, levels=[30.0, 70.0], x="steps")
+    (*_, rim, _, _) = panel["lines"][1]
+    heights = [float(pair.split(",")[1]) for pair in rim.split()]
+    spans = [float(y) for y in panel["levels"]]
+    assert len(spans) == 2
+    assert spans[0] > heights[0] > spans[1]  # 30 is lower than 52, and 70 is higher
+    assert max(heights) - min(heights) == pytest.approx(100 * (spans[0] - spans[1]) / 40, abs=0.3)
+
+
+@pytest.mark.parametrize(("x", "legend", "high", "first"), [
+    ("steps", True, 278, 246), ("", True, 262, 230), ("steps", False, 246, None), ("", False, 230, None),
+])  # fmt: skip
+def test_a_drawing_has_room_for_its_labels(x: str, legend: bool, high: int, first: int | None):
+    panel = drawn(Series("a", [(0.0, 1.0)]), Series("b", [(1.0, 1.0)]), x=x, legend=legend)
+    assert panel["high"] == high
+    rows = [y for _, y, _ in panel["legend"]]
+    assert rows == ([] if first is None else [first, first + 16])
+
+
+def test_axes_of_four_decades_have_powers_of_ten_alone():
+    assert _log_axis(1.0, 100.0).ticks == [1, 2, 5, 10, 20, 50, 100]
+    assert _log_axis(1.0, 1000.0).ticks == [1, 10, 100, 1000]
+    assert _log_axis(0.0, 1.0).low > 0
+
+
+def test_more_than_eight_curves_repeat_the_colors_and_two_panels_stand_side_by_side():
+    many = [Series(str(number), [(0.0, float(number))]) for number in range(10)]
+    assert [color for color, *_ in drawn(*many)["lines"]] == [*range(8), 0, 1]
+    drawing = str(svg("t", [Panel(many[:1]), Panel(many[:1]), Panel([])]))
+    assert 'width="1380"' in drawing
+    assert re.findall(r'transform="(translate\([^"]*)"', drawing) == ["translate(460,0)"]
+    assert svg("t", [Panel([])]) is None

@@ -12,9 +12,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from support.fixtures import recipe
 from support.pages import result
 
 import evaluators.evaluation
+import flame_mdm
 from evaluators.evaluation_request import EvaluationRequest
 from evaluators.sources import SampleFolder
 from flame_mdm.__main__ import main
@@ -680,6 +682,7 @@ def test_footnotes_of_rows_with_several_protocols_name_their_columns(tmp_path):
         "NFE, FID, Training hours, Peak memory of training, GiB: Protocol text_to_motion_t2m"
     )
     assert notes["b"].startswith("Seconds per motion: ")
+    assert [" Timed in batches of " in notes[letter] for letter in "ab"] == [False, True]
     assert notes["†"].endswith("as run by Hu et al. on an unnamed device.")
     assert notes["††"].endswith("as run by Chen et al. on one V100."), (
         "the value that Hu et al. quote"
@@ -1418,3 +1421,63 @@ def test_a_failed_evaluation_is_an_error_and_the_others_are_still_evaluated(
     assert "evaluating 7 of 7" in shown.out
     assert "spec: 0 of 8 rows measured" in shown.out
     assert "NOT VALID: spec, Text-to-motion, MFM: off" in shown.err
+
+
+def test_parameters_of_a_recipe_are_counted_in_millions_without_the_text_encoder():
+    sizes = settings._sizes(recipe("quickstart"))
+    model = flame_mdm.load("quickstart")
+    count = sum(weights.numel() for weights in model.denoiser.parameters())
+    assert sizes == {"features": model.representation.features, "parameters": count / 1e6}
+    assert settings._sizes({"representation": recipe("quickstart")["representation"]}) == {
+        "features": model.representation.features
+    }
+
+
+@pytest.mark.parametrize(
+    ("file", "hashed"), [("a.safetensors", "weights"), ("a.ckpt", "weights"), ("a.tar", "bytes")]
+)
+def test_an_extractor_is_another_one_if_its_weights_differ_and_a_checkpoint_if_its_bytes_do(
+    tmp_path, monkeypatch, file: str, hashed: str
+):
+    monkeypatch.setattr("flame_mdm.checkpoints.model_files.weights_sha256", lambda _: "weights")
+    monkeypatch.setattr(tables_command, "sha256", lambda _: "bytes")
+    (tmp_path / file).touch()
+    (tmp_path / "mdm.safetensors").touch()
+    keys = {
+        "protocol": "p",
+        "ckpt": f"{tmp_path}/mdm.safetensors",
+        "extractor": str(tmp_path / file),
+    }
+    for extractor, checkpoint in ((hashed, "bytes"), ("other", "bytes"), (hashed, "weights")):
+        content = measured(0, 0, 0, extractor={"sha256": extractor})
+        content["checkpoint"]["sha256"] = checkpoint
+        path = put(Evaluation("MDM", keys), tmp_path, content)
+        is_same = (extractor, checkpoint) == (hashed, "bytes")
+        assert outdated(path, Evaluation("MDM", keys)) == (not is_same)
+
+
+@pytest.mark.parametrize(("stated", "root"), [("here", "here"), ("", "elsewhere")])
+def test_lengths_are_counted_in_the_chosen_folder_with_what_was_excluded(
+    tmp_path, monkeypatch, stated: str, root: str
+):
+    monkeypatch.setenv("FLAME_MDM_DATA", "elsewhere")
+    (tmp_path / "store.json").touch()
+    info = {"fingerprint": "f00d", "fps": 12.5, "excluded": {"short": 3}, "clips": {}}
+    clips = [SimpleNamespace(length=length) for length in (90, 40, 60)]
+    store = SimpleNamespace(info=info, clips=clips)
+    data = SimpleNamespace(folder=tmp_path, open=lambda: store)
+    roots: list[str] = []
+
+    def compose_node(name: str, *, data_root: str) -> dict[str, str]:
+        roots.append(data_root)
+        return {"data": name, "representation": name}
+
+    monkeypatch.setattr(tables_command, "compose_data", compose_node)
+    monkeypatch.setattr(tables_command, "instantiate", lambda node, **keywords: data)
+    count_lengths("kit", tmp_path / "results", TablesSettings(data_root=stated))
+    written = json.loads((tmp_path / "results" / "lengths" / "kit.json").read_text())
+    assert written["lengths"] == [40, 60, 90]
+    assert {name: written[name] for name in ("fingerprint", "fps", "excluded")} == {
+        "fingerprint": "f00d", "fps": 12.5, "excluded": {"short": 3},
+    }  # fmt: skip
+    assert roots == [root]

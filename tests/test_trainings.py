@@ -11,7 +11,7 @@ from support.fixtures import recipe
 from support.runs import TINY
 
 from flame_mdm.checkpoints.model_files import read_checkpoint
-from flame_mdm.commands import trainings
+from flame_mdm.commands import benchmark, trainings
 from flame_mdm.commands.benchmark import BenchmarkSettings, check, main
 from flame_mdm.commands.distill import DistillSettings, student_recipe
 from flame_mdm.commands.trainings import Training, plan, run_trainings
@@ -186,3 +186,93 @@ def test_a_student_trains_a_fifth_of_the_steps_at_a_tenth_of_the_rate(
     assert (student["experiment"], student["run"]["dir"]) == (name, f"runs/{name}/default")
     assert (student["data_root"], student["data"]["root"]) == ("elsewhere", "elsewhere")
     assert student["distillation"]["teacher"] == str(tmp_path / "last.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("count", "stated", "threads"), [(4, None, "1"), (2, None, "1"), (2, "7", "7"), (1, "7", "7")]
+)
+def test_each_training_has_at_least_one_thread_or_as_many_as_the_user_states(
+    processes, tmp_path, monkeypatch, count, stated, threads
+):
+    monkeypatch.setattr(trainings, "cores", lambda: 3)
+    if stated:
+        monkeypatch.setenv("OMP_NUM_THREADS", stated)
+    run_trainings(jobs(), count, tmp_path)
+    used = {process.options["env"].get("OMP_NUM_THREADS") for process in processes.started}
+    assert used == {threads}
+
+
+def test_runs_with_similar_names_do_not_depend_on_each_other(monkeypatch):
+    folders = {"a": "runs/a", "b": "runs/ab", "c": "runs/c", "d": "runs/d"}
+    texts = {"a": "", "b": "runs/abc", "c": "runs/a", "d": "runs/ab/checkpoints/last.ckpt"}
+    monkeypatch.setattr(
+        trainings, "compose",
+        lambda name, overrides: {"run": {"dir": folders[name]}, "path": texts[name], "words": overrides},
+    )  # fmt: skip
+    planned = plan([[name, "seed=1"] for name in "abcd"], "")
+    assert [training.needs for training in planned] == [set(), set(), {0}, {1}]
+    assert [training.title for training in planned] == [f"{name} seed=1" for name in "abcd"]
+
+
+@pytest.mark.parametrize(
+    ("code", "exit_code"), [(128, 128), (130, 130), (-15, 143), (127, None), (1, None), (0, 0)]
+)
+def test_a_signal_is_the_exit_code_and_other_codes_are_errors(code: int, exit_code: int | None):
+    training = Training(["quickstart", "seed=1"], "runs/x")
+    if exit_code == 0:
+        trainings._check(training, code)
+    elif exit_code is None:
+        with pytest.raises(UserError, match="training of quickstart seed=1 failed"):
+            trainings._check(training, code)
+    else:
+        with pytest.raises(SystemExit) as error:
+            trainings._check(training, code)
+        assert error.value.code == exit_code
+
+
+def test_a_benchmark_passes_its_keys_on_and_fails_if_a_value_is_not_as_expected(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    calls: dict[str, Any] = {}
+    table = Table(
+        "t", "T", [Part("P", {"FID": "lower"}, [Line("MDM", "measured", [Cell("", 0.5)])])]
+    )
+    described = {
+        "train": [["a"]],
+        "table": "synthetic",
+        "expected": {"P": {"MDM": {"FID": [0.1, 0.4]}}},
+    }
+    stubs = {
+        "read_package_yaml": lambda path: described,
+        "plan": lambda entries, root: calls.update(plan=(entries, root)) or ["planned"],
+        "run_trainings": lambda *values: calls.update(run=values),
+        "evaluate_missing": lambda *values: calls.update(evaluate=values) or [],
+        "build": lambda *values: calls.update(build=values) or table,
+        "write": lambda _, out: calls.update(write=out),
+    }
+    for name, stub in stubs.items():
+        monkeypatch.setattr(benchmark, name, stub)
+    settings = BenchmarkSettings(
+        exp="synthetic", jobs=3, device="cpu", batch_size=16, data_root="/d"
+    )
+    with pytest.raises(UserError, match=r"^MDM: FID 0\.5, expected 0\.1 to 0\.4$"):
+        main(settings)
+    out = Path("runs/benchmark/synthetic")
+    assert out.is_dir()
+    assert calls["plan"] == ([["a"]], "/d")
+    assert calls["run"] == (["planned"], 3, out)
+    specs, results, options = calls["evaluate"]
+    assert (list(specs), results) == (["synthetic"], Path("runs/results"))
+    assert (options.device, options.batch_size, options.data_root) == ("cpu", 16, "/d")
+    assert calls["build"][0] == "synthetic"
+    assert calls["build"][2] == results
+    assert calls["write"] == out
+    assert "NOT AS EXPECTED: MDM: FID 0.5, expected 0.1 to 0.4" in capsys.readouterr().out
+    described["expected"]["P"]["MDM"]["FID"] = [0.5, 0.5]
+    main(BenchmarkSettings(exp="synthetic", out="elsewhere"))
+    assert calls["write"] == Path("elsewhere")
+    assert "as expected: MDM: FID 0.5, expected 0.5 to 0.5" in capsys.readouterr().out
+    monkeypatch.setattr(benchmark, "evaluate_missing", lambda *values: ["MFM: out of memory"])
+    with pytest.raises(UserError, match=r"^MFM: out of memory$"):
+        main(settings)

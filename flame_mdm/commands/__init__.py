@@ -344,7 +344,6 @@ class DataSettings:
     data_root: str = option(
         usual_data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data"
     )
-    seed: int = option(0, "seed of generated data sets")
     composed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -367,7 +366,7 @@ class DataSettings:
             )
         chosen = [f"representation={self.representation}"] if self.representation else []
         return compose_data(
-            self.data, [*chosen, *self.composed], data_root=self.data_root or "data", seed=self.seed
+            self.data, [*chosen, *self.composed], data_root=self.data_root or "data"
         )
 
     def data_node(self, source: str | None = None) -> Config:

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from evaluators.evaluation_request import EvaluationKeys
 from flame_mdm.commands import DataSettings, device_name, model_source
-from flame_mdm.config.options import option
+from flame_mdm.config.options import option, same_option
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit_cards import card_name, read_card, write_card
 from flame_mdm.safe_io import write_json
@@ -39,6 +40,7 @@ class AuditSettings(DataSettings):
         "test", "split whose motions are used: train, val or test"
     )
     samples: int | None = option(None, "number of motions; default: all motions of the split")
+    seed: int = same_option(EvaluationKeys, "seed")
     resamples: int = option(
         100, "number of bootstrap resamples of the motions, for the confidence intervals"
     )

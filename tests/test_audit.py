@@ -32,6 +32,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.records import AuditCard, AuditedPerturbation
 from flame_mdm.reporting.audit_cards import (
     CitedCard,
+    ListedCard,
     Seen,
     _curve,
     card_name,
@@ -44,7 +45,7 @@ from flame_mdm.reporting.audit_cards import (
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import write_json
-from flame_mdm.schemas import check_shape
+from flame_mdm.schemas import check_shape, read_json
 from flame_mdm.seeds import key
 
 
@@ -976,3 +977,41 @@ def test_metrics_that_are_exact_are_the_last_columns_and_facts_state_the_conditi
         assert any(
             shown.replace("\\", "").startswith(line.replace("\\", "").strip()) for shown in lines
         ), line
+
+
+def test_a_metric_rewards_a_perturbation_by_its_strongest_grade(card):
+    def rewarded(metric_is_higher: bool, *changes: float) -> bool:
+        values = [
+            (float(grade), {"fid": [1.0 + d, 0.1, d, 0.1], "jitter": [1.0 + d, 0.1, d, 0.1]})
+            for grade, d in enumerate(changes, 1)
+        ]
+        shown = card_with(
+            card, [perturbed("x", "joints", *values)], metrics={"fid": metric_is_higher}
+        )
+        response = seen(shown, shown.perturbations[0], "fid")
+        assert response is not None
+        return response.rewarded
+
+    assert rewarded(True, -0.5, 0.5)
+    assert not rewarded(True, 0.5, -0.5)
+    assert rewarded(False, 0.5, -0.5)
+    assert not rewarded(False, -0.5, 0.5)
+    assert not rewarded(True, 0.5, 0.05)  # the strongest grade is not detected
+
+
+def test_a_difference_that_is_missing_is_named_even_if_the_value_is_known(card, tmp_path):
+    lacking = card.perturbations[0].model_dump()
+    lacking["grades"][0]["values"]["fid"][2:] = [None, None]
+    lacking["grades"][2]["values"]["jitter"][2:] = [None, None]
+    _, text = write_card([card_with(card, [lacking])], tmp_path)
+    assert "| noise (mm) | not computed at 1 | not computed at 5 |" in text.read_text()
+
+
+def test_no_card_of_the_repository_is_cited_for_another_data_set(tmp_path, monkeypatch):
+    monkeypatch.setenv("FLAME_MDM_AUDITS", str(tmp_path))
+    listed = read_json(ROOT / "flame_mdm" / "reporting" / "audited.json", list[ListedCard])
+    assert listed
+    for entry in listed:
+        assert card_of(entry.data, entry.extractor) is not None
+        other = entry.data.model_copy(update={"dataset": "another set"})
+        assert card_of(other, entry.extractor) is None

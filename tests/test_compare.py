@@ -16,6 +16,7 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.commands.compare import _sampled
 from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion
 from flame_mdm.records import Result, Value
 from flame_mdm.reporting.compare import (
     ComparedRun,
@@ -24,9 +25,12 @@ from flame_mdm.reporting.compare import (
     _differences,
     _evaluations,
     _facts,
+    _player,
     differences,
     find,
+    grouped,
     in_all,
+    in_common,
     paired_difference,
     read_motions,
 )
@@ -406,7 +410,8 @@ def test_a_table_of_results_has_the_real_motions_and_each_label_with_its_unit(tm
     put(folders[0], values={"fid": of(4.5, [4.4, 4.6])})
     put(folders[1], values={"drift": of(1.0, [1.0, 1.5]) | {"unit": "m"}, "fid": of(3.5, [3.4, 3.6])},
         ground_truth={"fid": of(9.0, [9.0, 9.0])})  # fmt: skip
-    put(folders[2], values={"fid": of(5.5, [5.0, 5.0])}, invalid_because=["off"])
+    put(folders[2], values={"fid": of(5.5, [5.0, 5.0])}, invalid_because=["off"],
+        ground_truth={"fid": of(8.0, [8.0, 8.0])})  # fmt: skip
     runs = {name: read_run(folder) for name, folder in zip(names, folders, strict=True)}
     ((_, head, rows, notes, tables),) = _evaluations(runs)
     assert head == ["", "real motions", "first [1]", "second [2]", "third [3]"]
@@ -498,3 +503,57 @@ def test_a_rater_of_two_pages_counts_once_and_sides_of_later_files_are_turned(tm
     (pair,) = tally(files)
     assert (pair.a, pair.b, pair.wins_a, pair.wins_b, pair.raters) == ("ours", "theirs", 2, 4, 2)
     assert (pair.votes, pair.share[0]) == (6, pytest.approx(1 / 3))
+
+
+def test_the_player_has_a_column_per_run_and_names_motions_without_a_condition(monkeypatch):
+    pages: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(
+        "flame_mdm.visualize.player_page",
+        lambda *values, **keywords: pages.append((*values, keywords)),
+    )
+    motion = Motion(np.zeros((5, 22, 3)), 20.0, text="x", id="y")
+    shown = [{("walks", 0): motion, ("", 0): motion}, {("", 0): motion, ("walks", 0): motion}] * 2
+    _player(["a", "b", "c"], shown[:3], None, lambda motion: [(0, 1, motion.id, motion.text)])
+    ((scene, title, keywords),) = pages
+    names = [(motion.text, motion.id) for motion in scene]
+    assert names == [(text, label) for text in ("walks", "unconditioned") for label in "abc"]
+    assert (title, keywords["columns"]) == ("", 3)
+    assert keywords["marks"] == [[(0, 1, label, text)] for text, label in names]
+    assert (
+        _player(["a", "b"], [{("walks", 0): motion}, {("sits", 0): motion}], None, lambda _: [])
+        == ""
+    )
+
+
+def test_two_results_of_one_run_are_no_evaluation_in_common(tmp_path):
+    folders = [a_run(tmp_path / name, name=name) for name in "ab"]
+    put(folders[0], "x")
+    put(folders[0], "y", seed=1)
+    runs = {folder.name: read_run(folder) for folder in folders}
+    title = "p version 3, synthetic test, data abc"
+    assert in_common(runs) == [
+        "No evaluation in common: differences need the same protocol, data and extractor.",
+        title,
+    ]
+    assert [label for label, _ in grouped(runs)[title]] == ["a", "a"]
+    assert in_common({"a": runs["a"]}) == []
+    put(folders[1], "z")
+    assert in_common({folder.name: read_run(folder) for folder in folders}) == []
+
+
+def test_pages_and_counts_have_different_files_by_default(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folders = [motions(tmp_path / name, ("walks",), at) for at, name in enumerate("ab")]
+    answers = ratings(tmp_path / "x.json", "ab")
+    runs = f"runs={' '.join(map(str, folders))}"
+    for words, name in (
+        ([runs], "compare.html"),
+        ([runs, "rate=true"], "rate.html"),
+        ([f"ratings={answers}"], "ratings.json"),
+    ):
+        assert main(["compare", *words]) == 0
+        assert f"runs/{name}" in capsys.readouterr().out
+    assert "Which animation better" in (tmp_path / "runs" / "rate.html").read_text()
+    assert "Which animation better" not in (tmp_path / "runs" / "compare.html").read_text()
+    assert json.loads((tmp_path / "runs" / "ratings.json").read_text())["pairs"][0]["wins_a"] == 1
+    assert main(["compare", runs, f"ratings={answers}"]) == main(["compare"]) == 1

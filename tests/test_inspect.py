@@ -544,10 +544,10 @@ def test_faults_are_listed_if_the_player_shows_all_motions(
 
 
 def test_clips_of_the_chosen_split_are_inspected(tmp_path):
-    assert main(["prepare", "synthetic", "data.source.clips=12", f"data_root={tmp_path}"]) == 0
+    assert main(["prepare", "synthetic", "data.source.clips=24", f"data_root={tmp_path}"]) == 0
 
     def ids(split: str | None) -> list[str]:
-        words = ("data.source.clips=12",)
+        words = ("data.source.clips=24",)
         settings = InspectSettings(
             motion="synthetic", data_root=str(tmp_path), split=split, composed=words
         )

@@ -7,7 +7,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -19,6 +19,7 @@ import pytest
 import torch
 import yaml
 from support.fixtures import recipe
+from support.motions import synthetic
 from support.refusals import one_error
 
 import flame_mdm
@@ -29,13 +30,13 @@ from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.loading import NO_GPU, load
 from flame_mdm.checkpoints.onnx_export import export_onnx
 from flame_mdm.checkpoints.released import import_released
-from flame_mdm.commands import WritingSettings, device_name
+from flame_mdm.commands import WritingSettings, device_name, distill, prepare
 from flame_mdm.commands.adapt import AdaptSettings
 from flame_mdm.commands.audit import AuditSettings
 from flame_mdm.commands.benchmark import BenchmarkSettings
 from flame_mdm.commands.browse import BrowseSettings
 from flame_mdm.commands.compare import CompareSettings
-from flame_mdm.commands.convert import ConvertSettings
+from flame_mdm.commands.convert import ConvertSettings, _targets
 from flame_mdm.commands.demo import DemoSettings
 from flame_mdm.commands.edit import EditSettings
 from flame_mdm.commands.evaluate import EvaluateSettings
@@ -69,6 +70,7 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.demo.app import serve
 from flame_mdm.demo.request import PLUS
 from flame_mdm.errors import UserError
+from flame_mdm.formats.layouts import head_height, leg_length
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.skeleton import SMPL22
@@ -1036,10 +1038,12 @@ def test_export_push_and_demo_pass_their_keys_on(tmp_path, monkeypatch, capsys):
     words = [f"ckpt={file}", "out=x", "half=true", "adapter=a.safetensors b.safetensors"]
     assert main(["export", *words, "adapter_strength=[0.5,0]"]) == 0
     assert main(["export", *words[:2], "format=onnx"]) == 0
+    assert main(["export", *words[:2], "adapter=a", "adapter_strength=0"]) == 0
     adapted = {"adapter": ["a.safetensors", "b.safetensors"], "strength": [0.5, 0]}
-    assert single == [(file, "x", {"half": True} | adapted)]
+    without = {"half": False, "adapter": ["a"], "strength": 0}  # the model without its adapter
+    assert single == [(file, "x", {"half": True} | adapted), (file, "x", without)]
     assert graphs == [(file, "x", {"half": False, "adapter": (), "strength": 1.0})]
-    assert capsys.readouterr().out == "written: the result\n" * 2
+    assert capsys.readouterr().out == "written: the result\n" * 3
 
     pushed = called_with(monkeypatch, "flame_mdm.checkpoints.hub.push")
     assert main(["push", str(file), "me/walks", "private=true"]) == 0
@@ -1132,3 +1136,126 @@ def test_the_list_of_commands_is_shown_and_an_unknown_one_is_an_error(argv, code
         assert shown.startswith("error: unknown command: sampel. Did you mean sample?")
     else:
         assert all(f"  {name:10} {purpose}\n" in shown for name, purpose in COMMANDS.items())
+
+
+def test_convert_reads_resamples_and_writes_with_the_keys_of_the_command(
+    tmp_path, monkeypatch, capsys
+):
+    motion = replace(synthetic("walk", size=40), notes=("a note",))
+    saved: list[tuple[Any, ...]] = []
+
+    def save(written: Motion, path: Path, *values: Any) -> str:
+        saved.append((written.fps, len(written.joints), written.poses is None, path, *values))
+        return f"written: {path.name}"
+
+    for name in ("a.glb", "deep/b.glb"):
+        motion.save(tmp_path / "in" / name, rig="mixamo")
+    frames = len(motion.joints)
+    readings: list[tuple[Any, ...]] = []
+
+    def read_stub(*values: Any, **keywords: Any) -> Motion:
+        readings.append((*values, keywords))
+        return replace(motion)
+
+    monkeypatch.setattr("flame_mdm.formats.readers.read", read_stub)
+    monkeypatch.setattr(Motion, "save", save)
+    source, words = tmp_path / "in" / "a.glb", ["fps=10", "unit=0.5", "up=z", "animation=Walk"]
+    keys = ["rest_pose=true", "rig=soma", "root_motion=true", "resample=40"]
+    assert main(["convert", str(source), str(tmp_path / "o.glb"), *words, *keys]) == 0
+    assert readings == [(source, 10, 0.5, "z", {"animation": "Walk"})]
+    assert saved == [(40, 2 * frames - 1, True, tmp_path / "o.glb", True, "soma", None, None, True)]
+    legs, head = leg_length(motion.joints), head_height(motion.joints)
+    assert capsys.readouterr().out.splitlines() == [
+        "written: o.glb", f"{source}: a note", f"legs {legs:.2f} m, head joint at {head:.2f} m",
+    ]  # fmt: skip
+    saved.clear()
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "out"), "format=npz"]) == 0
+    assert [row[3] for row in saved] == [tmp_path / "out" / "a.npz", tmp_path / "out/deep/b.npz"]
+    assert [row[:3] for row in saved] == [(20, frames, False)] * 2  # AMASS files have rotations
+    assert [row[4:] for row in saved] == [(False, None, None, None, False)] * 2
+    hero = tmp_path / "hero.GLB"
+    hero.touch()
+    settings = ConvertSettings(motion="x", out="out", character=str(hero))
+    targets = _targets(settings, tmp_path / "in", Path("out"))
+    assert list(targets) == [Path("out/a.glb"), Path("out/deep/b.glb")]
+    with pytest.raises(UserError, match="Also set the format of the files"):
+        _targets(ConvertSettings(motion="x", out="out"), tmp_path / "in", Path("out"))
+
+
+@pytest.mark.parametrize(("words", "is_prepared", "failures", "code", "calls"), [
+    ([], False, [], 0, ["write"]), ([], True, [], 0, []), (["force=true"], True, [], 0, ["write"]),
+    ([], False, ["a.bvh: damaged"], 1, ["write"]), (["check=true"], True, [], 0, ["check"]),
+    (["check=true"], False, ["a.bvh: damaged"], 1, ["check"]), (["verify=true"], True, [], 0, ["verify"]),
+])  # fmt: skip
+def test_prepare_writes_checks_or_verifies_and_fails_if_files_failed(
+    words, is_prepared, failures, code, calls, tmp_path, monkeypatch, capsys
+):
+    done: list[str] = []
+    info = {
+        "dataset": "mine", "representation": "raw", "fps": 12.5, "hours": 1.25, "shape": [900, 263],
+        "excluded": {"short": 3, "long": 1},
+    }  # fmt: skip
+    store = SimpleNamespace(info=info, fingerprint="f00d")
+    source = SimpleNamespace(
+        failures=failures, suit=lambda _: None, check=lambda fps: done.append("check") or [f"{fps}"],
+        findings=lambda: ["a finding"], changed=lambda path: [f"changed since {path.name}"],
+        failure_lines=lambda: failures,
+    )  # fmt: skip
+    data = SimpleNamespace(
+        folder=tmp_path, source=source, open=lambda: store, counts=lambda _: ["the counts"]
+    )
+    if is_prepared:
+        (tmp_path / "store.json").touch()
+    monkeypatch.setattr(
+        prepare, "instantiate",
+        lambda node, **keywords: data if keywords else SimpleNamespace(fps=12.5),
+    )  # fmt: skip
+    monkeypatch.setattr(
+        "flame_mdm.data.store.write_store", lambda *_: done.append("write") or store
+    )
+    monkeypatch.setattr("flame_mdm.data.verify.report", lambda _: done.append("verify"))
+    monkeypatch.setattr("flame_mdm.data.verify.lines", lambda _: ["a line"])
+    monkeypatch.setattr("flame_mdm.data.verify.deviations", lambda _: ["12 clips, published 13"])
+    assert main(["prepare", "synthetic", *words]) == code
+    assert done == calls
+    shown = capsys.readouterr().out.splitlines()
+    if words == ["verify=true"]:
+        assert shown[:3] == [
+            "a line", "DIFFERS from the published numbers:", "  12 clips, published 13",
+        ]  # fmt: skip
+    elif words == ["check=true"]:
+        assert shown == ["12.5"]
+    else:
+        assert shown[0] == "a finding" if calls else "already prepared (force=true" in shown[0]
+        assert ("changed since store.json" in shown) == (not calls)
+        assert shown[-4 - len(failures) :] == [
+            "mine as raw at 12.5 fps; 1.25 hours", "the counts", "excluded: 3 short, 1 long",
+            f"900 frames with 263 features, fingerprint f00d: {tmp_path}", *failures,
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("code", "exists", "starts", "remains"), [
+    (0, False, True, True), (1, False, False, False), (1, False, True, True), (3, True, False, True),
+])  # fmt: skip
+def test_the_folder_of_a_student_is_removed_only_if_it_is_new_and_no_training_started(
+    code, exists, starts, remains, tmp_path, monkeypatch
+):
+    folder = tmp_path / "student"
+    if exists:
+        folder.mkdir()
+    passed: list[list[str]] = []
+
+    def run_recipe(function: Any, usage: str, words: list[str]) -> int:
+        passed.append(words)
+        if starts:
+            (folder / "config.yaml").touch()
+        return code
+
+    monkeypatch.setattr(distill, "student_recipe", lambda _: {"run": {"dir": str(folder)}})
+    monkeypatch.setattr(distill, "run_recipe", run_recipe)
+    settings = distill.DistillSettings(ckpt="x", composed=("seed=1,2", "--multirun"))
+    with nullcontext() if code == 0 else pytest.raises(SystemExit) as error:
+        distill.main(settings)
+    assert error is None or error.value.code == code
+    assert passed == [[str(folder / "student.yaml"), "seed=1,2", "--multirun"]]
+    assert folder.exists() == remains

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from support.runs import TINY, inputs_of, untrained
 import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Edit
+from flame_mdm.commands import edit as edit_command
 from flame_mdm.commands.edit import EditSettings, origin
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
@@ -580,3 +582,50 @@ def test_features_are_kept_at_the_rate_of_the_model_and_computed_again_at_anothe
     infinite[3, 7] = np.inf
     with one_line_error("a: features contain NaN or infinite values"):
         with_features(at_30, replace(motion, features=infinite))
+
+
+@pytest.mark.parametrize(("errors", "lines"), [
+    ([(0.0, 0.0), (2e-7, 0.004)],
+     ["75% of the features are kept. Largest change in the kept part: 2e-07 in normalized features, "
+      "0.004 m in world joint positions"]),
+    ([(0.5, 0.0101), (0.25, 0.0)],
+     ["75% of the features are kept. Largest change in the kept part: 0.5 in normalized features, "
+      "0.0101 m in world joint positions",
+      "a kept part that follows a generated part begins where the generated part ends, so its position in the world "
+      "may differ from the original"]),
+])  # fmt: skip
+def test_the_command_states_the_largest_changes_of_all_edits(errors, lines, monkeypatch, capsys):
+    keep, original = np.ones((8, 4), bool), Motion(np.zeros((8, 22, 3)), 20.0, id="take", text="")
+    keep[:, 0] = False
+    edits = [
+        SimpleNamespace(text="jumps", keep=keep, feature_error=change, joint_error=moved)
+        for change, moved in errors
+    ]
+    written: list[tuple[Any, ...]] = []
+    readings: list[dict[str, Any]] = []
+    output = "flame_mdm.sampling.output."
+    loaded = SimpleNamespace(model=SimpleNamespace(sha256="c", representation=None), body=None)
+    resolved = SimpleNamespace(resolved=SimpleNamespace(warnings=["careful"]))
+    monkeypatch.setattr(EditSettings, "load", lambda _: loaded)
+    monkeypatch.setattr(
+        "flame_mdm.sampling.reading.read_motion",
+        lambda *values, **keywords: readings.append(keywords) or original,
+    )
+    monkeypatch.setattr("flame_mdm.sampling.editing.resolve_edit", lambda *_: resolved)
+    monkeypatch.setattr("flame_mdm.sampling.editing.sample_edit", lambda *_, stages: edits)
+    monkeypatch.setattr(output + "degenerate_notes", lambda _: [])
+    monkeypatch.setattr(output + "write_motions", lambda *values, **_: written.append(values))
+    monkeypatch.setattr(output + "summary", lambda *_, mp4: "the summary")
+    settings = EditSettings(
+        ckpt="x", motion="take.bvh", text="jumps", joints="arms", seed=3, out="folder", fps=10.0, unit=0.5,
+        up="z", animation="Walk", cut=[1, 2], data_root="/d",
+    )  # fmt: skip
+    edit_command.main(settings)
+    assert capsys.readouterr().out.splitlines() == ["warning: careful", "the summary", *lines]
+    ((folder, motions, facts, stages, mp4, body),) = written
+    assert (folder, stages, mp4, body) == (Path("folder"), None, False, None)
+    assert [motion.text for motion in motions] == ["original: take", "jumps", "jumps"]
+    assert (facts["seed"], facts["checkpoint"]) == (3, "c")
+    assert readings == [
+        {"fps": 10, "unit": 0.5, "up": "z", "animation": "Walk", "cut": [1, 2], "data_root": "/d"}
+    ]

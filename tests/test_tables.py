@@ -1481,3 +1481,29 @@ def test_lengths_are_counted_in_the_chosen_folder_with_what_was_excluded(
         "fingerprint": "f00d", "fps": 12.5, "excluded": {"short": 3},
     }  # fmt: skip
     assert roots == [root]
+
+
+def test_the_best_value_is_bold_and_the_second_best_is_underlined_in_each_format():
+    ranked = [Cell("1.5", 1.5, None, 1), Cell("2.5", 2.5, None, 2), Cell("9.5", 9.5), None]
+    lines = [
+        Line("Real", "real", [Cell("0.5", 0.5), None, None, None], "a"),
+        Line("MDM_1", "measured", ranked, "a", "QUICK"),
+    ]
+    columns = {"FID": "lower", "Top 3": "higher", "Diversity": "real", "NFE": "none"}
+    table = Table("t", "T", [Part("P", columns, lines, [("a", "Seed 0."), ("", "More.")])])
+    md = rendered(table, "md").splitlines()
+    assert "| | FID\u00a0↓ | Top 3\u00a0↑ | Diversity\u00a0→ | NFE |" in md
+    assert "| MDM\\_1 (QUICK) <sup>a</sup> | **1.5** | <u>2.5</u> | 9.5 | – |" in md
+    assert md.index("| *Real motions, measured* | | | | |") < md.index("| *Measured* | | | | |")
+    assert "a: Seed 0.  " in md
+    tex = rendered(table, "tex").splitlines()
+    head = r" & FID $\downarrow$ & Top 3 $\uparrow$ & Diversity $\rightarrow$ & NFE \\"
+    assert head in tex
+    assert r"MDM\_1 (QUICK)\tnote{a} & \textbf{1.5} & \underline{2.5} & 9.5 & -- \\" in tex
+    assert r"\begin{tabular}{lrrrr}" in tex
+    assert r"\multicolumn{5}{l}{\emph{Measured}} \\" in tex
+    assert r"\item[a] Seed 0." in tex
+    html = rendered(table, "html")
+    cells = ("<b>1.5</b>", "<u>2.5</u>", "9.5", "–")
+    row = "".join(f'<td class="number">{cell}</td>' for cell in cells)
+    assert f'<tr class="bad"><td>MDM_1 (QUICK)<sup>a</sup></td>{row}</tr>' in html

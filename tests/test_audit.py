@@ -981,7 +981,7 @@ def test_metrics_that_are_exact_are_the_last_columns_and_facts_state_the_conditi
 
 def test_a_metric_rewards_a_perturbation_by_its_strongest_grade(card):
     def rewarded(metric_is_higher: bool, *changes: float) -> bool:
-        values = [
+        values: list[tuple[float, dict[str, list[float | None]]]] = [
             (float(grade), {"fid": [1.0 + d, 0.1, d, 0.1], "jitter": [1.0 + d, 0.1, d, 0.1]})
             for grade, d in enumerate(changes, 1)
         ]

@@ -479,7 +479,7 @@ def test_runs_are_sampled_for_texts_or_actions_of_their_lengths(
     (request,) = requests
     name, texts = shown
     assert list(getattr(request, name) or ()) == texts
-    assert (request.seconds and list(request.seconds)) == seconds
+    assert request.seconds == (seconds and tuple(seconds))
     assert (request.seed, request.split, request.samples) == (7, False, 1)
     assert capsys.readouterr().out.strip() == message
 

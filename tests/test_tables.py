@@ -1491,12 +1491,12 @@ def test_the_best_value_is_bold_and_the_second_best_is_underlined_in_each_format
     ]
     columns = {"FID": "lower", "Top 3": "higher", "Diversity": "real", "NFE": "none"}
     table = Table("t", "T", [Part("P", columns, lines, [("a", "Seed 0."), ("", "More.")])])
-    md = rendered(table, "md").splitlines()
+    md = str(rendered(table, "md")).splitlines()
     assert "| | FID\u00a0↓ | Top 3\u00a0↑ | Diversity\u00a0→ | NFE |" in md
     assert "| MDM\\_1 (QUICK) <sup>a</sup> | **1.5** | <u>2.5</u> | 9.5 | – |" in md
     assert md.index("| *Real motions, measured* | | | | |") < md.index("| *Measured* | | | | |")
     assert "a: Seed 0.  " in md
-    tex = rendered(table, "tex").splitlines()
+    tex = str(rendered(table, "tex")).splitlines()
     head = r" & FID $\downarrow$ & Top 3 $\uparrow$ & Diversity $\rightarrow$ & NFE \\"
     assert head in tex
     assert r"MDM\_1 (QUICK)\tnote{a} & \textbf{1.5} & \underline{2.5} & 9.5 & -- \\" in tex

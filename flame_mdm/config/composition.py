@@ -60,15 +60,13 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     return resolve(source, *prepare_overrides(source, overrides))
 
 
-def compose_data(
-    name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0
-) -> Config:
+def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "data") -> Config:
     """Composes the configuration of a data set in experiments/data, including its representation.
 
     The result has the keys `data` and `representation`. Raises the same errors as `compose`.
     """
     source = ConfigSource(EXPERIMENTS, None)
-    first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
+    first = [quoted(f"+data_root={data_root}")]
     config = resolve(source, *prepare_overrides(source, [f"+data={name}", *overrides], first))
     return {key: config[key] for key in ("data", "representation")}
 

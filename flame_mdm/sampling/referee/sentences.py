@@ -188,7 +188,7 @@ def _lasting(text: str, claims: Sequence[Claim]) -> list[Claim]:
     if match is None:
         return []
     seconds = numbers[match[1]] if match[1] in numbers else int(match[1])
-    lasting = [claim for claim in claims if claim.kind in LASTING and not claim.direction]
+    lasting = [claim for claim in claims if claim.kind in LASTING]
     return [replace(claim, seconds=seconds) for claim in lasting] if seconds else []
 
 

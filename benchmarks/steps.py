@@ -10,7 +10,7 @@ the quickstart in the complete framework. All measurements alternate in one run.
 import statistics
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -35,7 +35,9 @@ WIDTH, LONGEST = 263, 196
 TOKENS = 30  # tokens per caption
 # On each batch of the full-size step, all implementations take turns.
 BATCHES = 10
-BACKBONES = {
+# Rounds in which both speeds of a network take turns, and clips per batch of the large networks
+ROUNDS, LARGE_CLIPS = 10, 4
+SMALL = {
     "MDM, encoder": ["synthetic/mdm"],
     "MDM, decoder": ["synthetic/mdm_decoder"],
     "MDM, decoder + token": ["synthetic/mdm_decoder", "+denoiser.input_token=condition"],
@@ -43,6 +45,15 @@ BACKBONES = {
     "MDM, U-Net": ["synthetic/mdm_unet"],
     "FLAME": ["synthetic/flame"],
     "MFM": ["synthetic/mfm"],
+}
+# The encoder of MDM at full size has a table of its own.
+LARGE = {
+    "MDM, decoder": ["humanml3d/mdm_decoder"],
+    "MDM, decoder + token": ["humanml3d/mdm_decoder_token"],
+    "MDM, GRU": ["humanml3d/mdm_gru"],
+    "MDM, U-Net": ["humanml3d/mdm_unet"],
+    "FLAME": ["humanml3d/flame"],
+    "MFM": ["humanml3d/mfm"],
 }
 SPEEDS = ("reference", "fast")
 
@@ -118,10 +129,10 @@ def recipe_step(
     return step, data.pad_multiple
 
 
-def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
-    """Returns a random batch of motions with the given lengths, padded to `frames`."""
+def batch_of(lengths: np.ndarray, frames: int, device: str, features: int = WIDTH) -> MotionBatch:
+    """Returns a random batch of motions with these lengths, padded to `frames`."""
     mask = torch.arange(frames) < torch.from_numpy(lengths)[:, None]
-    x = torch.randn(len(lengths), frames, WIDTH) * mask[..., None]
+    x = torch.randn(len(lengths), frames, features) * mask[..., None]
     return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])
 
 
@@ -179,14 +190,24 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
     return table, text
 
 
-def backbones(names: Sequence[str], rounds: int, device: str) -> list[Row]:
-    """Times a training step for the small version of each named network in `BACKBONES`. Returns one row per network."""
+def backbones(
+    recipes: Mapping[str, Sequence[str]], lengths: np.ndarray, rounds: int, device: str
+) -> list[Row]:
+    """Times a training step of several networks at both speeds. Returns one row per network.
+
+    Args:
+        recipes: name of each network -> its recipe, followed by changes of the recipe.
+        lengths: (rows,), the length of each clip in the batch.
+        rounds: number of rounds in which the two speeds take turns.
+        device: the device.
+    """
     rows: list[Row] = []
-    lengths = np.random.default_rng(1).integers(36, 61, 32)
-    for name in names:
-        config = compose(BACKBONES[name][0], ["condition=none", *BACKBONES[name][1:]])
-        batch = batch_of(lengths, int(lengths.max()), device)
-        parameters = sum(p.numel() for p in build_task(config).parameters() if p.requires_grad)
+    for name, (recipe, *changes) in recipes.items():
+        config = compose(recipe, ["condition=none", *changes])
+        task = build_task(config)
+        features = task.generator.representation.features
+        batch = batch_of(lengths, int(lengths.max()), device, features)
+        parameters = sum(p.numel() for p in task.parameters() if p.requires_grad)
 
         steps = {speed: recipe_step(config, speed, device)[0] for speed in SPEEDS}
         times = take_turns(
@@ -259,8 +280,14 @@ def measure(settings: Settings) -> Section:
     if device == "cuda":
         memory = torch.cuda.max_memory_allocated() / 2**30
         batches += f"; at most {memory:.1f} GiB of memory for all models together"
-    names = ["FLAME", "MFM"] if quick else list(BACKBONES)
-    tables["small networks"] = backbones(names, 1 if quick else 15, device)
+    rng = np.random.default_rng(1)
+    small = {name: SMALL[name] for name in ("FLAME", "MFM")} if quick else SMALL
+    tables["small networks"] = backbones(
+        small, rng.integers(36, 61, 32), 1 if quick else ROUNDS, device
+    )
+    if not quick:
+        lengths = rng.integers(40, 197, LARGE_CLIPS)
+        tables["other networks at full size"] = backbones(LARGE, lengths, ROUNDS, device)
     if device == "cpu":
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 100, 2)
 
@@ -275,9 +302,9 @@ def measure(settings: Settings) -> Section:
         are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
         the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips in
         float32, padded to 196 frames as in the published code. On each of {BATCHES} batches, all implementations
-        take turns in a warm-up round and a timed round. The small networks are trained on 32 clips per batch
-        without a text encoder, and the two speeds take turns for 15 rounds. The quickstart is trained by the complete
-        framework, with its text encoder.""",
+        take turns in a warm-up round and a timed round. The small networks are trained on 32 clips per batch, the
+        other networks at full size on {LARGE_CLIPS} clips, both without a text encoder, and the two speeds take turns
+        for {ROUNDS} rounds. The quickstart is trained by the complete framework, with its text encoder.""",
         summary(full),
         tables,
     )

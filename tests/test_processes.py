@@ -205,6 +205,30 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
     torch.testing.assert_close(other["loss"], terms["loss"])
 
 
+@pytest.mark.parametrize("average_padding", [False, True])
+def test_auxiliary_losses_are_averaged_over_real_frames_in_every_process(average_padding):
+    process = GaussianDiffusion(50)
+    process.average_padding = average_padding
+    lengths = torch.tensor([7, 4, 1])
+    received = []
+
+    def auxiliary(x0_hat, clean, mask):
+        received.append(mask)
+        return {}
+
+    x = torch.randn(3, 7, 5) * length_mask(lengths)[..., None]
+    process.loss(
+        lambda x_t, time, mask, cond: x_t,
+        x,
+        length_mask(lengths),
+        NO_CONDITION,
+        t=torch.tensor([3, 20, 40]),
+        noise=torch.randn(3, 7, 5),
+        auxiliary=auxiliary,
+    )
+    assert [mask.sum(1).tolist() for mask in received] == [[7, 4, 1]]
+
+
 @pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
 def test_min_snr_weighs_an_error_of_the_clean_motion_alike_in_every_prediction(prediction):
     """Hang et al. 2023, arXiv:2303.09556: the weight of the squared error of the clean motion is min(SNR, 5)."""

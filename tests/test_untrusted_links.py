@@ -103,6 +103,10 @@ def any_file(out: Path) -> None:
         np.savez(temporary, a=np.zeros(1))
 
 
+def any_json_file(out: Path) -> None:
+    write_json(out / "lengths" / "any.json", {}, within=out)
+
+
 def tables(out: Path) -> None:
     write_table(Table("mdm", "Table 1", []), out)
 
@@ -235,6 +239,7 @@ WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "sample": (sample, SAMPLES),
     "page": (page, ["player.html"]),
     "any": (any_file, ["part/any.npz"]),
+    "any json": (any_json_file, ["lengths/any.json"]),
     "tables": (tables, ["mdm.md", "mdm.tex", "mdm.csv", "mdm.html"]),
     "audit": (audit, ["synthetic-none.html", "synthetic-none.md"]),
     "audit cache": (audit_cache, ["real.npz"]),

@@ -689,6 +689,15 @@ def test_the_margin_between_limbs_decides_whether_a_side_is_clear():
     assert of_side([left, right], "both", 9) == replace(right, joint="both wrists")
 
 
+def test_both_limbs_do_something_while_the_one_that_does_it_less_does_it():
+    left = existence(np.array([1.0, 0.0, 3.0, 2.0]), "m", "left wrist")
+    right = existence(np.array([0.0, 4.0, 3.0, 1.0]), "m", "right wrist")
+    both = of_side([left, right], "both", 0.0)
+    assert both.signal is not None
+    assert both.signal.tolist() == [0.0, 0.0, 3.0, 1.0]
+    assert of_side([replace(left, signal=None), right], "both", 0.0).joint == "both wrists"
+
+
 def measuring(monkeypatch: pytest.MonkeyPatch, **readings: Reading) -> Body:
     """A body of 4 seconds, on which these kinds, true from 0.7 on and false up to 0.3, have these readings."""
     for name, reading in readings.items():

@@ -450,6 +450,9 @@ def test_jumping_jacks_spread_the_feet_while_the_hands_rise(apart: float, high: 
     hands: dict[str, Any] = {f"{side}_wrist": (0.2, 1.4 + high, 0.0) for side in ("left", "right")}
     shown = check("jumping jacks", standing_view(**feet, **hands))
     assert shown.get("count", 0) == count
+    for side in ("left", "right"):
+        one_hand_hangs = {**feet, **hands, f"{side}_wrist": (0.2, 0.8, 0.0)}
+        assert check("jumping jacks", standing_view(**one_hand_hangs)) == {}
 
 
 @pytest.mark.parametrize(

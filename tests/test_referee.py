@@ -47,6 +47,7 @@ from flame_mdm.sampling.referee.readings import (
     Reading,
     counted,
     cycles,
+    existence,
     held,
     of_side,
     spans_of,

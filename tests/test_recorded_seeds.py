@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 import torch
+from support.recorded import Case, check, combinations, record
 
 from flame_mdm.seeds import key, seed_generator
-from support.recorded import Case, check, combinations, record
 
 NAME = "seeds"
 

@@ -375,6 +375,24 @@ def test_abilities_are_read_from_the_facts_of_a_model():
     assert not abilities.is_simultaneous
 
 
+@pytest.mark.parametrize("names", [("side", "direction"), ("direction", "side")])
+def test_a_side_and_a_direction_with_the_same_word_are_known_separately(names):
+    captions = ["a person reaches to the left", "a person reaches with the right hand"]
+    words = sorted({word for text in captions for word in text.split()} | {"left", "right"})
+    abilities = Abilities({"actions": ["reach"], "vocabulary": words, "captions": captions})
+    supported = {
+        (name, value): abilities.supports("reach", name, value)
+        for name in names
+        for value in ("left", "right")
+    }
+    assert supported == {
+        ("direction", "left"): True,
+        ("direction", "right"): False,
+        ("side", "left"): False,
+        ("side", "right"): True,
+    }
+
+
 PARTS = [
     ("kicks twice with the left leg", 1.5),
     ("a person walks <b>", None),

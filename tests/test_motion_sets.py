@@ -282,9 +282,12 @@ def test_toes_are_not_below_the_floor(walk: GroundedMotion):
     assert planted(motion).world()[:, toes, 1].min() > -0.001
 
 
-def test_a_planted_foot_that_turns_and_a_foot_that_jerks_are_measured(walk: GroundedMotion):
+@pytest.mark.parametrize("start", [0, 100, 165, 180, -170])
+def test_a_planted_foot_that_turns_and_a_foot_that_jerks_are_measured(
+    walk: GroundedMotion, start: float
+):
     standing = walk.cut(0, 10)
-    angles = np.radians(np.linspace(0, 30, len(standing)))
+    angles = np.radians(start + np.linspace(0, 30, len(standing)))
     turning = GroundedMotion(
         np.tile(standing.local[:1], (len(standing), 1, 1)),
         0 * standing.path,

@@ -96,7 +96,7 @@ def every_process() -> dict[str, Process]:
     flows: dict[str, dict[str, Any]] = {
         "flow": {}, "flow to x0": {"prediction": "x0", "sigma_min": 0.1},
         "flow in the middle": {"time_distribution": "logit_normal", "sigma_min": 0.3},
-        "quantized flow": {"quantize_time": True, "odeint_grid": True, "sigma_min": 0.0},
+        "quantized flow": {"quantize_time": True, "odeint_grid": True, "sigma_min": 0.05},
     }  # fmt: skip
     return {
         **{name: GaussianDiffusion(STEPS, **chosen) for name, chosen in options.items()},
@@ -311,6 +311,7 @@ def flow_samples() -> Any:
     plain = edit_of({"mode": "trajectory"})
     settings = SamplerOptions(sampler="euler", num_inference_steps=5)
     results.append(sampled(processes["flow"], settings, plain))
+    results.append(sampled(FlowMatching(sigma_min=0.0, odeint_grid=True), settings))
     return results
 
 
@@ -564,10 +565,11 @@ def attempts(kind: type[Any], chosen: list[dict[str, Any]]) -> Any:
 
 def outputs_of_encoders() -> Any:
     choices = combinations(
-        4, 18, width=(0, 3, 8), project_condition=(True, True, False), max_tokens=(0, 4, 7, 3),
+        4, 24, width=(0, 3, 8), project_condition=(True, True, False), max_tokens=(0, 4, 7, 3),
         mask_padding=(True, False), condition_frames=(False, True),
     )  # fmt: skip
-    return attempts(MDMEncoder, [BASE | {"width": 3}, *(BASE | choice for choice in choices)])
+    able = [choice for choice in choices if choice["width"] or choice["max_tokens"] < 4]
+    return attempts(MDMEncoder, [BASE | {"width": 3}, *(BASE | choice for choice in able)])
 
 
 def outputs_of_decoders() -> Any:
@@ -865,6 +867,7 @@ def generated_blocks() -> Any:
     split, rest = model.split_prefix(batch)
     results += [split, rest, model.split_prefix(rest)[1].mask, generator().split_prefix(batch)[0]]
     cover = windows.cover([(0, 0, 5)], [5], 2, 5, CPU)
+    cover.batch.text = ["walks"]
     refused = [
         {"prefix": None}, {"prefix": prefix[:2]}, {"prefix": prefix[:, :1]}, {"prefix": prefix[..., 1:]},
         {"prefix": prefix, "trajectory": []}, {"prefix": prefix, "windows": cover},

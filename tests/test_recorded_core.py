@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -64,7 +64,8 @@ def smooth(seed: int, frames: int, *shape: int) -> Tensor:
     rng = np.random.default_rng(seed)
     time = np.arange(frames).reshape(-1, *[1] * len(shape))
     waves = [
-        rng.normal(size=shape) * np.sin(rng.uniform(0.05, 0.5, shape) * time + rng.uniform(0, 6, shape))
+        rng.normal(size=shape) * np.sin(rng.uniform(0.05, 0.5, shape) * time + rng.uniform(0, 6,
+        shape))
         for _ in range(3)
     ]  # fmt: skip
     return torch.from_numpy(sum(waves))
@@ -107,7 +108,8 @@ def axis_angles_and_quaternions() -> Any:
     vectors = numbers(0, 8, 3) * torch.tensor([0.0, 1e-10, 1e-4, 0.5, 1.0, 2.0, 3.0, 6.0])[:, None]
     both_signs = torch.cat([quaternions(1, 6), -quaternions(2, 6)])
     near_identity = torch.tensor(
-        [[1.0, 0.0, 0.0, 0.0], [-1.0, 1e-9, 0.0, 2e-9], [1.0, 1e-7, -3e-7, 0.0], [0.0, 0.6, 0.0, 0.8]]
+        [[1.0, 0.0, 0.0, 0.0], [-1.0, 1e-9, 0.0, 2e-9], [1.0, 1e-7, -3e-7, 0.0], [0.0, 0.6, 0.0,
+        0.8]]
     ).double()  # fmt: skip
     return {
         "to quaternion": list(rotation.axis_angle_to_quaternion(vectors)),
@@ -198,7 +200,8 @@ def shortest_arcs() -> Any:
     x, zero = torch.tensor([0.3, -2.0, 1.1]).double(), torch.zeros(3).double()
     special = {
         "opposite": (x, -3 * x), "same": (x, 2 * x), "no first": (zero, x), "no second": (x, zero),
-        "none": (zero, zero), "tiny": (x * 1e-200, a[0] * 1e-200), "huge": (x * 1e200, a[0] * 1e200),
+        "none": (zero, zero), "tiny": (x * 1e-200, a[0] * 1e-200), "huge": (x * 1e200,
+        a[0] * 1e200),
         "nearly opposite": (x, -x + 1e-4 * a[0]), "opposite y": (a[1], -a[1]),
     }  # fmt: skip
     pairs = [torch.stack(column) for column in zip(*special.values(), strict=True)]
@@ -246,7 +249,8 @@ def positions_of_skeletons() -> Any:
         offsets, root = numbers(23 + number, len(tree), 3), numbers(26 + number, 2, 3)
         results.append(
             [
-                tree.mirror(joints), tree.bones(joints), tree.assemble(tree.bones(joints), root[:1]),
+                tree.mirror(joints), tree.bones(joints), tree.assemble(tree.bones(joints),
+                root[:1]),
                 skeleton.forward_kinematics(tree, turns, offsets, root),
                 skeleton.global_rotations(turns, tree.parents),
                 *skeleton.forward_kinematics(tree, turns, offsets, root)[1],
@@ -374,7 +378,8 @@ def humanml_defaults() -> Any:
         "rows": [*alone[::9]],
         "lying": [HumanML().encode(lying), legacy.encode(lying)],
         "still": HumanML().encode(straight),
-        "canonical": [HumanML()._canonical([motion, motion[4:9] + 3.0]), scaled._canonical([motion])],
+        "canonical": [HumanML()._canonical([motion, motion[4:9] + 3.0]),
+        scaled._canonical([motion])],
         "retargeted": scaled._retarget(joints, first, clip),
         "facing": [HumanML()._facing(motion), HumanML()._facing(motion, hips=-1.0)],
         "headings": [kind._heading(motion) for kind in (HumanML(), legacy, HumanML(fps=12.5))],
@@ -400,7 +405,8 @@ def humanml_refusals() -> Any:
         lambda: HumanML(skeleton="smpl23"), lambda: HumanML(bone_lengths=[1.0] * 21),
         lambda: HumanML("kit21", bone_lengths=[1.0] * 22), lambda: HumanML(fps=0.5),
         lambda: HumanML(fps=1000.0).fps, lambda: HumanML(fps=1), lambda: HumanML(fps=1000.1),
-        lambda: HumanML(fps="20"), lambda: representation.encode(motion[:2]),  # type: ignore[arg-type]
+        lambda: HumanML(fps=cast(Any, "20")), lambda: representation.encode(motion[:2]),
+         # type: ignore[arg-type]
         lambda: representation.encode(motion[:3]), lambda: representation.encode(motion[:, :21]),
         lambda: representation.encode(motion[0]), lambda: representation.encode(motion[..., :2]),
         lambda: representation.encode(broken),
@@ -459,7 +465,9 @@ def motion272_parts() -> Any:
         "poses": [
             representation.poses(x) for x in (features, noisy, noisy[:1], noisy[:6], noisy[None])
         ],
-        "root": [representation._root(x) for x in (noisy, noisy[:2], torch.stack([noisy, features]))],
+        "root": [
+            representation._root(x) for x in (noisy, noisy[:2], torch.stack([noisy, features]))
+        ],
         "forward": face_forward(translation, turns),
         "rotations": representation.rotations6d(noisy)[3],
     }
@@ -493,7 +501,10 @@ def upsampled_motions() -> Any:
 
 
 def statistics_of_frames() -> Any:
-    arrays = [numbers(96 + number, frames, 5).numpy() * 3 + 1 for number, frames in enumerate((4, 1, 9, 3))]
+    arrays = [
+        numbers(96 + number, frames, 5).numpy() * 3 + 1
+        for number, frames in enumerate((4, 1, 9, 3))
+    ]
     arrays = [array * [1.0, 1.0, 1e-5, 0.0, 1.0] for array in arrays]
     frames = Frames(lambda: arrays, 17)
     groups = [slice(0, 2), slice(2, 4), slice(4, 5)]
@@ -655,7 +666,8 @@ def lengths_and_padding() -> Any:
     batch = MotionBatch(numbers(136, 4, 5, 2), length_mask(lengths), ["a", "b", "c", "d"])
     with_action = MotionBatch(batch.x, batch.mask, batch.ids, ["w"] * 4, torch.arange(4))
     return {
-        "padded": [pad_to(numbers(135, 2, 3, *rest), size) for rest in ((), (2,)) for size in (3, 6)],
+        "padded": [pad_to(numbers(135, 2, 3, *rest), size) for rest in ((), (2,)) for size in (3,
+        6)],
         "padded mask": pad_to(length_mask(torch.tensor([2, 1])), 4),
         "masks": [length_mask(lengths, frames) for frames in (None, 5, 7, 2)],
         "groups": [ceil_div(count, size) for count in (0, 1, 7, 8, 9) for size in (1, 4, 8)],
@@ -665,7 +677,8 @@ def lengths_and_padding() -> Any:
         ],
         "sent": sent(numbers(137, 3), CPU),
         "constants": [table.on(CPU), table.on(CPU) is table.on(CPU), len(table.tensors)],
-        "batches": [batch.to(CPU), with_action.to(CPU), batch.lengths, len(batch), len(with_action)],
+        "batches": [batch.to(CPU), with_action.to(CPU), batch.lengths, len(batch),
+        len(with_action)],
         "numbers": str(Constant([1, 2]).on(CPU).dtype),
     }  # fmt: skip
 
@@ -673,7 +686,8 @@ def lengths_and_padding() -> Any:
 def collated_samples() -> Any:
     sets: list[Sequence[tuple[str, Tensor, str | None, int | None]]] = [
         [("a", numbers(140, 4, 3), "walks", 2), ("b", numbers(141, 7, 3), "sits", 0)],
-        [("a", numbers(142, 5, 2), None, 3), ("b", numbers(143, 3, 2), "runs", 1), ("c", numbers(144, 1, 2), "", 0)],
+        [("a", numbers(142, 5, 2), None, 3), ("b", numbers(143, 3, 2), "runs", 1), ("c",
+        numbers(144, 1, 2), "", 0)],
         [("a", numbers(145, 2, 2), "walks", None), ("b", numbers(146, 6, 2), "jumps", 4)],
     ]  # fmt: skip
     options = ({}, {"multiple": 4}, {"multiple": 5, "most": 8}, {"multiple": 5, "most": 3})

@@ -406,7 +406,6 @@ def humanml_refusals() -> Any:
         lambda: HumanML("kit21", bone_lengths=[1.0] * 22), lambda: HumanML(fps=0.5),
         lambda: HumanML(fps=1000.0).fps, lambda: HumanML(fps=1), lambda: HumanML(fps=1000.1),
         lambda: HumanML(fps=cast(Any, "20")), lambda: representation.encode(motion[:2]),
-         # type: ignore[arg-type]
         lambda: representation.encode(motion[:3]), lambda: representation.encode(motion[:, :21]),
         lambda: representation.encode(motion[0]), lambda: representation.encode(motion[..., :2]),
         lambda: representation.encode(broken),

@@ -75,13 +75,12 @@ def seen_by_denoisers(width: int, tokens: int = 4) -> tuple[Tensor, Tensor, Tens
     return motion(54), torch.tensor([0.0, 7.5, 999.0]).double(), MASK, cond
 
 
-BASE: dict[str, Any] = {
-    "latent_dim": 8,
-    "ff_size": 10,
-    "num_layers": 2,
-    "num_heads": 2,
-    "dropout": 0.1,
-}
+BASE = dict[str, Any](latent_dim=8, ff_size=10, num_layers=2, num_heads=2, dropout=0.1)
+
+
+def small(**changes: Any) -> dict[str, Any]:
+    """The sizes of a small denoiser, with other arguments."""
+    return BASE | changes
 
 
 def outputs_of(kind: type[Any], width: int, options: Mapping[str, Any]) -> Any:
@@ -161,7 +160,7 @@ def refused_networks() -> Any:
         "latent_dim": 12},
         {"num_heads": 3}, {"num_heads": 0}, {"project_condition": False}, {"num_heads": 8},
     ]  # fmt: skip
-    units = [{"length_unit": unit} for unit in (0, -2, 1.5, True, 1)]
+    units: list[dict[str, Any]] = [{"length_unit": unit} for unit in (0, -2, 1.5, True, 1)]
     x_t, t, mask, cond = seen_by_denoisers(3)
     context = MDMDecoder(FEATURES, 5, 3, **BASE, context_frames=3).double()
     reading = MDMEncoder(FEATURES, 5, 3, **BASE, max_tokens=4).double()
@@ -226,7 +225,7 @@ def outputs_in_training() -> Any:
         results.append(layer(x, mask).nan_to_num(7.0))
     for kind in (MDMEncoder, MDMDecoder):
         torch.manual_seed(0)
-        denoiser = with_weights(kind(FEATURES, 5, 3, **(BASE | {"dropout": 0.0}))).train()
+        denoiser = with_weights(kind(FEATURES, 5, 3, **small(dropout=0.0))).train()
         results.append(denoiser(*seen_by_denoisers(3)))
     return results
 
@@ -237,8 +236,9 @@ def outputs_of_target_encoders() -> Any:
         for depth in (1, 3):
             encoder = with_weights(kind(16, depth))
             cond = seen_by_denoisers(3)[3]
-            every = replace(cond, target_mask=None)
-            free = replace(every, target=every.target * torch.tensor([1.0, 1.0, 1.0, 0.0]))
+            every, seen_target = replace(cond, target_mask=None), cond.target
+            assert seen_target is not None
+            free = replace(every, target=seen_target * torch.tensor([1.0, 1.0, 1.0, 0.0]))
             results.append(
                 [
                     name, *encoder(cond), *encoder(every), encoder(free),
@@ -324,7 +324,7 @@ def encoder_of(name: str) -> ConditionEncoder:
 def denoiser_of(width: int, process: str, options: tuple[tuple[str, Any], ...]) -> Any:
     out = every_process()[process].out_features(66)
     return with_weights(
-        MDMDecoder(66, out, width, **(BASE | dict(options) | {"num_layers": 1})), 71, 0.25
+        MDMDecoder(66, out, width, **small(**dict(options), num_layers=1)), 71, 0.25
     )
 
 
@@ -525,13 +525,13 @@ def built_generators() -> Any:
     values += [{"guidance_scale": float("nan"), "sampler": "ddim", "num_inference_steps": 3}]
     values += [{"guidance_scale": 1, "sampler": 3, "num_inference_steps": 3}]
     assert isinstance(model.denoiser, FLAME)
+    linear: Any = nn.Linear(2, 2)
     return [
         model.facts, model.condition.seen, model.sampler_options.chosen(), model.describe(),
         model.denoiser.length_unit, plain.facts, plain.condition.seen, list(model.state_dict()),
         {name: list(weight.shape) for name, weight in parts.denoiser.named_parameters()},
         sizes, [attempt(lambda v=row: sampling_defaults(**v).chosen()) for row in values],
-        refusal(lambda: Parts(nn.Linear(2, 2), FlowMatching(), Words(), Points())),
-         # type: ignore[arg-type]
+        refusal(lambda: Parts(linear, FlowMatching(), Words(), Points())),
         model.config == recipe(), model.conditioned_on, generator("none").conditioned_on,
     ]  # fmt: skip
 

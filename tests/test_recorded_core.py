@@ -129,7 +129,9 @@ def axis_angles_and_quaternions() -> Any:
 def matrices() -> Any:
     vectors = torch.cat([torch.eye(3).double() * 3.0 + 0.1, numbers(3, 6, 3)])
     turns = rotation.axis_angle_to_matrix(vectors)
+    half_turns = [torch.diag(2 * row - 1) for row in torch.eye(3).double()]
     return {
+        "half turns": [rotation.matrix_to_quaternion(turn) for turn in half_turns],
         "quaternions": list(rotation.matrix_to_quaternion(turns)),
         "axis angles": list(rotation.matrix_to_axis_angle(turns)),
         "rows": list(rotation.matrix_to_rot6d(turns, "rows")),

@@ -97,7 +97,9 @@ class Lesson(MotionSource):
                 motions, so unreadable motions are not skipped.
         """
         for clip in self.folder.clips(fps):
-            yield replace(clip, captions=[styled(caption, self.name) for caption in clip.captions])
+            # Actions are left out, because the known clips have none.
+            captions = [styled(caption, self.name) for caption in clip.captions]
+            yield replace(clip, captions=captions, action=None)
         self.folder.require_all()
         encoded = self.store.info["representation"]
         for entry in self.kept():

@@ -46,13 +46,15 @@ def members(path: Path, is_wanted: Callable[[str], bool]) -> Iterator[tuple[str,
     """
     size = regular_file(path)
     with path.open("rb") as file:
-        head = file.read(6)
+        head = file.read(262)
         file.seek(0)
         unpack: Any = next(
             (opener for magic, opener in _UNPACKERS.items() if head.startswith(magic)), None
         )
         with naming(path, *_DAMAGE, prefix="damaged archive, download it again: "):
-            if head.startswith(b"PK") or zipfile.is_zipfile(path):
+            # A tar archive may end with a file that is itself a zip archive, such as an .npz file
+            is_tar = head[257:] == b"ustar"
+            if head.startswith(b"PK") or (not is_tar and zipfile.is_zipfile(path)):
                 yield from _zip_members(file, size, is_wanted)
                 return
             with unpack(file) if unpack else file as unpacked:

@@ -498,7 +498,7 @@ def recordings_of_amass() -> Any:
     root = folder("amass")
 
     def read(fps: float, **changed: Any) -> Any:
-        content = amass_file(1, 31, fps, "female") | changed
+        content: dict[str, Any] = amass_file(1, 31, fps, "female") | changed
         np.savez(root / "x.npz", **{k: v for k, v in content.items() if v is not None})
         file = root / "x.npz"
         recording = amass.read(file.read_bytes() if fps == 100 else file, "x.npz")
@@ -655,11 +655,12 @@ def clips_of_an_index() -> Any:
 
 def humanml3d_that_is_created() -> Any:
     root = write_downloads(folder("created") / "x")
-    path, options = root / "HumanML3D" / "HumanML3D", {"workers": 1}
-    folders: dict[str, Any] = {"amass": str(root / "amass"), "body_models": str(root / "bodies")}
+    path = root / "HumanML3D" / "HumanML3D"
+    options: dict[str, Any] = {"amass": str(root / "amass"), "workers": 1}
+    options["body_models"] = str(root / "bodies")
 
     def source(**more: Any) -> Any:
-        return humanml3d.HumanML3D(str(path), **(folders | options | more))
+        return humanml3d.HumanML3D(str(path), **(options | more))
 
     results: dict[str, Any] = outcomes(
         check=lambda: source().check(20),
@@ -724,8 +725,10 @@ def humanml3d_as_smpl() -> Any:
         counts=lambda: source(exclude=["000000", "M000000"]).count(),
     )
     (path / "train.txt").write_text("000000\n000001\nM000001\n000007\n")
+    (path / "texts" / "000000.txt").write_text("")
     (path / "texts" / "000001.txt").write_text("")
     results["texts"] = outcome(lambda: source().count())
+    (path / "texts" / "000000.txt").write_text(line("somebody runs.") + "\n")
     (path / "texts" / "000001.txt").write_text(line("somebody walks.") + "\n")
     return results | {"lists": clips_of(source(), 20)}
 
@@ -742,7 +745,8 @@ def starts_of_labels() -> Any:
     times += [(4, 3), (None, 2), (2, None), (-0.01, 3), (3, 3.06), (3, 3.11), (3, 3), (1.55, 9.99)]
     times += [(8.55, 9), (8.6, 9), (8.65, 9), (8.7, 9), (5, 15), (5, 15.05), (5, 15.1), (0.05, 1)]
     return {
-        str(frames): [starts("walk", *pair, frames) for pair in times] for frames in (300, 301, 130)
+        str(frames): [starts("walk", start, end, frames) for start, end in times]
+        for frames in (300, 301, 130)
     } | {"transition": starts("transition", 0, 9, 300), "short": starts("x", 0, 1, 128)}
 
 
@@ -959,6 +963,10 @@ def contents_of_archives() -> Any:
         path.write_bytes(path.read_bytes()[:size])
         return path
 
+    def reads(content: bytes, count: int) -> Any:
+        bounded = archives._Bounded(io.BytesIO(content), 9)
+        return [bounded.read(4) for _ in range(count)], bounded.total
+
     outside = {"../x.txt": b"a"}
     (root / "text.zip").write_text("no archive at all")
     return outcomes(
@@ -975,6 +983,8 @@ def contents_of_archives() -> Any:
         unwanted=lambda: unpacked(tarred(files, link=True), ".bin"),
         short=lambda: str(outcome(lambda: unpacked(cut(tarred(files, "gz"), 60))))[:60],
         text=lambda: str(outcome(lambda: unpacked(root / "text.zip")))[:70],
+        reads=lambda: reads(b"abcdefg", 4),
+        ended=lambda: reads(b"abcdefg", 5),
         folder=lambda: plain(archives.as_folder(root, temporary(), bool)),
     )
 
@@ -1024,6 +1034,7 @@ def contents_of_pickles() -> Any:
         dates=lambda: read(dates, 4),
         ends=lambda: read(pickle.dumps("abc" * 30, 4)[:20], 4),
         empty=lambda: read(b"", 4),
+        marked=lambda: read(b"(X\x01\x00\x00\x00aK\x01X\x01\x00\x00\x00bK\x02d.", 2),
         counter=lambda: read(Counter("aab"), 4),
         ordered=lambda: read(Counter("aab"), 4, ("collections.",)),
         fraction=lambda: read(complex(1, 2), 4, ("builtins.",)),
@@ -1060,6 +1071,8 @@ def mixtures() -> Any:
         more = [source.check(20), source.failures, source.changed(Path("x")), source.verbs]
         return [clips_of(source, 20), shared, more]
 
+    several = part("MIT", "walk")
+    several.licenses = lambda: ["MIT", "z", "CC-BY-NC-4.0", "CMU"]
     return outcomes(
         free=lambda: mixed((), a=part("MIT", "walk", "run"), b=part("CMU", "jump", "walk")),
         clip=lambda: mixed((), a=part("MIT", "walk", clip_license="CMU")),
@@ -1067,6 +1080,7 @@ def mixtures() -> Any:
         research=lambda: mixed((), a=part("CC-BY-NC-4.0", "walk")),
         allowed=lambda: mixed(("research",), a=part("CC-BY-NC-4.0", "run"), b=part("", "walk")),
         use=lambda: mixed(("all",), a=part("MIT")),
+        several=lambda: mixed((), a=several),
         empty=lambda: mixed(()),
         licenses=mixture.known_licenses,
     )

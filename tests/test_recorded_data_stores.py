@@ -933,6 +933,16 @@ def tokenizer(
     return Tokens(input_ids=ids, attention_mask=(ids > 0).long())
 
 
+class Loader:
+    """A loader of models that returns what it is asked for."""
+
+    @staticmethod
+    def from_pretrained(name: object, **options: Any) -> str:
+        if name == "org/y":
+            raise OSError
+        return f"{name} {sorted(options.items())}"
+
+
 class Language(nn.Module):
     """A small language model, whose outputs depend on the mask."""
 
@@ -1006,6 +1016,10 @@ def pretrained_texts() -> Any:
         revision=lambda: Pretrained("org/x", "abc", None, None).tokenizer,
         none=lambda: Pretrained("org/x", None, None, None).tokenizer,
         package=lambda: Pretrained("org/x", None, "a.b", None).tokenizer,
+        local=lambda: plain(Pretrained(str(root), None, None, None)._load(Loader)),
+        pinned=lambda: Pretrained("org/x", "0a" * 20, None, None)._load(Loader, dtype="float32"),
+        long=lambda: Pretrained("org/x", "0a" * 20 + "0", None, None)._load(Loader),
+        offline=lambda: Pretrained("org/y", "0a" * 20, None, None)._load(Loader),
         absent=lambda: Pretrained("org/x", None, "absent_package", None).tokenizer,
         folder=lambda: plain(Pretrained(str(root), None, None, None)._folder()),
         match=lambda: EncodedCaptions(
@@ -1055,7 +1069,8 @@ def target_conditions() -> Any:
     results["default"] = [default.weight, default.drop_prob, default.heading_modulo_pi]
 
     def refused(joints: Sequence[str] = SMPL22.joints, **options: Any) -> Any:
-        return target.TargetConditions(joints, SMPL22.facing, **({"choices": [["head"]]} | options))
+        defaults: dict[str, Any] = {"choices": [["head"]]}
+        return target.TargetConditions(joints, SMPL22.facing, **(defaults | options))
 
     return results | outcomes(
         skeleton=lambda: refused(KIT21.joints),
@@ -1108,6 +1123,8 @@ def words_of_captions() -> Any:
     }
     prompts_of = ["a person walks", "a persn walks", "a person wakls quickly", "someone strolls", "the of",
                   "a shelf", "zzzz qqqq", "leaps with the hand", "walking waved \\1 lefft", ""]  # fmt: skip
+    captions_of = ["a person walks", "walks left", "a person walks left and waves", "the left hand"]
+    captions_of += ["left", "he jumps twice over a left and a right box", "jumps twice", "a the of"]
     return {
         "words": [vocabulary.words(text) for text in texts],
         "hashed": [
@@ -1129,6 +1146,17 @@ def words_of_captions() -> Any:
             ]
             for text in prompts_of
         },
+        "nearest": [
+            vocabulary.nearest(text, captions_of, *count)
+            for text in (
+                "a person walks left",
+                "the left hand waves",
+                "the a",
+                "runs",
+                "jumps left twice",
+            )
+            for count in ((), (1,), (9,))
+        ],
         "plain": vocabulary.plainest(["b", "a person x y", "a person z", "aa", "a", "a persona"]),
     }
 

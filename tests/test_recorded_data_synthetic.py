@@ -275,13 +275,14 @@ def captions_of_attributes() -> Any:
 def grammar_of_the_synthetic_data() -> Any:
     grammar = synthetic.content()
     rng = np.random.default_rng
+    attributes_of: list[Any] = [{"action": "a", "x": "b"}, {"action": "a"}, {"action": "c"}]
     return {
         "keys": {name: len(part) for name, part in grammar.items()},
         "verbs": grammar["verbs"],
         "core": grammar["core_verbs"],
         "entries": [
             synthetic.entry({"a b": 1, "a": 2, "c d": 3}, attributes)
-            for attributes in ({"action": "a", "x": "b"}, {"action": "a"}, {"action": "c"})
+            for attributes in attributes_of
         ],
         "conjugated": [
             synthetic._conjugated(rng(seed), "slowly <walk> and <-jump/hop> a arm <wave>", tenses)

@@ -767,6 +767,12 @@ def rates_and_frames() -> Any:
             (500_001, 1, 1, 1),
         )
     ]
+    wide = rng.normal(size=(5, 30_000, 3))
+    results += [
+        traits(part) if not isinstance(part, str) else part
+        for fps in (130.0, 140.0, 200.0)
+        for part in [outcome(resampling.resample, wide, 20.0, fps)]
+    ]
     return results
 
 

@@ -321,6 +321,43 @@ def fbx_files() -> Any:
     return results
 
 
+def nested_fbx_records() -> Any:
+    results: list[Any] = []
+    with folder_of_files() as folder:
+        for depth in (1, 31, 32, 33, 34):
+            root = record_of_level = fbx.Record("")
+            for number in range(depth):
+                record_of_level = record_of_level.add(f"level {number}", fbx.Int(number))
+            fbx.write(folder / "a.fbx", root)
+            read = outcome(fbx.read, folder / "a.fbx")
+            results.append(without(folder, read) if isinstance(read, str) else record_traits(read))
+    return results
+
+
+def characters_with_several_skins() -> Any:
+    results: list[Any] = []
+    joints = list(range(22))
+    for skins in (
+        [joints],
+        [joints[:12], joints[9:]],
+        [joints[:5], joints[5:]],
+        [joints[:5], joints[9:], joints[3:12]],
+    ):
+        with folder_of_files() as folder:
+            path = folder / "a.glb"
+            motions()[0].save(path, rig="mixamo")
+
+            def change(document: dict[str, Any], skins: list[list[int]] = skins) -> None:
+                document["skins"] = [
+                    {"joints": [document["skins"][0]["joints"][k] for k in chosen]}
+                    for chosen in skins
+                ]
+
+            changed(path, change)
+            results.append(without(folder, message_or_map(path)))
+    return results
+
+
 def fbx_scenes() -> Any:
     """Scenes with pivots, orders, axes, units and rates."""
     rng = np.random.default_rng(11)
@@ -737,6 +774,8 @@ CASES: list[Case] = [
     numbers_of_glb_files,
     tracks_of_animations,
     fbx_files,
+    nested_fbx_records,
+    characters_with_several_skins,
     fbx_scenes,
     usd_files,
     moving_characters,

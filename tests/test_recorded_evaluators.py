@@ -52,6 +52,8 @@ def outcome(compute: Callable[[], Any]) -> Any:
         return compute()
     except (UserError, ValueError) as error:
         return f"{type(error).__name__}: {error}"
+    except torch.linalg.LinAlgError:
+        return "no result"
 
 
 @cache
@@ -647,7 +649,8 @@ def attributes_of_fast_bodies() -> Any:
 def attributes_of_no_bodies() -> Any:
     motion = bodies()["walk"]
     inputs = {
-        "short": motion[:19], "a second": motion[:20], "infinite": np.where(np.arange(60)[:, None, None] == 7, np.inf, motion),
+        "short": motion[:19], "a second": motion[:20],
+        "infinite": np.where(np.arange(60)[:, None, None] == 7, np.inf, motion),
         "large": motion * 1.9, "small": motion * 0.4, "mixed": motion[:, ::-1],
         "noise": motion + np.random.default_rng(0).normal(0, 0.03, motion.shape),
         "half noise": motion + np.random.default_rng(0).normal(0, 0.012, motion.shape),

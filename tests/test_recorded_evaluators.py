@@ -113,7 +113,7 @@ def of_features(metric: samples.SampleMetric, **changed: Any) -> Any:
         "value": outcome(metric.compute),
         "drawn": outcome(lambda: metric.drawn_value(drawn, real_drawn)),
         "per sample": outcome(lambda: metric.per_sample(rows)),
-        "weighted": outcome(lambda: metric.weighted(rows, WEIGHTS)) if counts[1] > 12 else None,
+        "weighted": outcome(lambda: metric.weighted(rows, WEIGHTS)) if min(counts) > 9 else None,
     }
 
 
@@ -841,7 +841,8 @@ def accuracies_of_claims() -> Any:
 
 CASES: list[Case] = [
     distributions, diversities, variances_of_joints, alignments, ranks_with_ties,
-    retrieval_with_equal_captions, retrieval_with_encoded_captions, physical_metrics, static_and_low_motions_beside_limits,
+    retrieval_with_equal_captions, retrieval_with_encoded_captions, physical_metrics,
+    static_and_low_motions_beside_limits,
     published_physical_metrics, floating_of_mbench, transitions, errors_of_edits,
     errors_of_positions, memorized_motions, declared_properties, refusals_of_metrics,
     attributes_of_plain_bodies, attributes_of_varied_bodies, attributes_of_fast_bodies,

@@ -21,7 +21,15 @@ from evaluators.encoding import encode
 from evaluators.evaluation import Evaluation
 from evaluators.evaluation_request import EvaluationRequest
 from evaluators.evaluator import Evaluator, Motions, _chunk, keys_of
-from evaluators.extractors import Extractor, action_gru, mardm, motion_clip, stgcn, t2m, t2m_training
+from evaluators.extractors import (
+    Extractor,
+    action_gru,
+    mardm,
+    motion_clip,
+    stgcn,
+    t2m,
+    t2m_training,
+)
 from evaluators.extractors.motion_clip_calibrated import calibration_error, noisy_copies
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import BASE, REAL, STORED
@@ -38,7 +46,14 @@ from evaluators.protocol import (
 from evaluators.metrics import make_metrics
 from evaluators.results import Outcome, Scores, _cell, _intervals, mean_ci, mean_cost
 from evaluators.scene import Scene, text_of
-from evaluators.sources import Baseline, Generator, SampleFolder, Samples, read_samples, real_motions
+from evaluators.sources import (
+    Baseline,
+    Generator,
+    SampleFolder,
+    Samples,
+    read_samples,
+    real_motions,
+)
 from flame_mdm.batch import MotionBatch
 from flame_mdm.data.crops import Fixed, Units, Whole
 from flame_mdm.data.store import Entry
@@ -140,9 +155,10 @@ def data(count: int = 24, seed: int = 3, rule: str = "units", **changed: Any) ->
     return Data(seed, count, crop, **changed)
 
 
+KID = {"subsets": 4, "subset_size": 9}
 METRICS = {
     "fid": {"_target_": "evaluators.metrics.distribution.FrechetMotionDistance"},
-    "kid": {"_target_": "evaluators.metrics.distribution.KernelMotionDistance", "subset_size": 9},
+    "kid": {"_target_": "evaluators.metrics.distribution.KernelMotionDistance", **KID},
     "texts_for_motion": {"_target_": "evaluators.metrics.alignment.TextsForMotion", "pool": 5},
     "mm_dist": {"_target_": "evaluators.metrics.alignment.MultimodalDistance"},
     "mid": {"_target_": "evaluators.metrics.alignment.MutualInformationDivergence"},
@@ -234,7 +250,9 @@ def checks_of_protocols() -> Any:
         for clips in (data(), bare, unlabeled):
             for model in (None, "text", "action", "none"):
                 used = model and SimpleNamespace(conditioned_on=model)
-                results.append(outcome(lambda a=protocol, b=clips, c=used: a.check(b, cast(Any, c))))
+                results.append(
+                    outcome(lambda a=protocol, b=clips, c=used: a.check(b, cast(Any, c)))
+                )
     for path in (None, "none"):
         for extractor in (None, {"_target_": "x.Y"}):
             chosen = protocol_of(extractor=extractor)
@@ -260,7 +278,10 @@ def released_protocols() -> Any:
 
 
 def near_misses_of_clips() -> Any:
-    clips = [replace(clip, captions=[f"{clip.captions[0]} {n % 3}"]) for n, clip in enumerate(data().clips)]
+    clips = [
+        replace(clip, captions=[f"{clip.captions[0]} {n % 3}"])
+        for n, clip in enumerate(data().clips)
+    ]
     bandai = [
         replace(clips[0], captions=[f"{content} {style}"], attributes={
             "content": content, "style": style, "dataset": number % 2, "side": side, "more": [1]})
@@ -274,7 +295,12 @@ def near_misses_of_clips() -> Any:
         )
     ]  # fmt: skip
     lone = replace(clips[1], attributes={"side": "left"})
-    return [near_misses(clips), near_misses(bandai), near_misses([lone, *clips[:5]]), near_misses([])]
+    return [
+        near_misses(clips),
+        near_misses(bandai),
+        near_misses([lone, *clips[:5]]),
+        near_misses([]),
+    ]
 
 
 def changed_joints() -> Any:
@@ -334,7 +360,9 @@ def perturbed_sets() -> Any:
         listed = perturbations.perturbations_of(used, captioned)
         results[f"names {captioned}"] = [(one.name, list(one.grades), one.unit) for one in listed]
     small = [replace(one, grades=(3, 7, 16, 40)) for one in listed if one.name == "fewer"]
-    fewer = perturbations.FewerMotions("fewer", "set", "", grades=(3, 7, 16, 40)).offered(used, True)
+    fewer = perturbations.FewerMotions("fewer", "set", "", grades=(3, 7, 16, 40)).offered(
+        used, True
+    )
     for one in [*listed, *small, *fewer]:
         functions = one.motions(used)
         for name, motions in functions.items():
@@ -373,9 +401,13 @@ def scores_of_evaluators() -> Any:
         results.append(evaluator.score(generated, paired, paired, seed))
         results.append(evaluator.resample(generated, paired, paired, seed, 3))
     results.append(evaluator.resample(generated, paired, paired, 0, 0))
-    results.append({name: evaluator.unit_of(name) for name in ("jitter", "errors/ade", "kimodo/low")})
+    results.append(
+        {name: evaluator.unit_of(name) for name in ("jitter", "errors/ade", "kimodo/low")}
+    )
     results.append([evaluator.compares_sets(name) for name in ("fid", "kid/mean", "mid", "jitter")])
-    results.append([evaluator.reads(name) for name in ("nearest", "real_joints", "contacts", "text")])
+    results.append(
+        [evaluator.reads(name) for name in ("nearest", "real_joints", "contacts", "text")]
+    )
     chunk = _chunk(generated, paired, slice(3, 8))
     results.append({name: chunk[name] for name in ("joints", "mask", "real_joints", "contacts")})
     bare = Evaluator(None, evaluator.metrics, HumanML(), skip_features=True)
@@ -399,24 +431,29 @@ def scores_of_evaluators() -> Any:
 
 def values_of_evaluations() -> Any:
     results: list[Any] = []
-    for options in (
-        {"multimodality": SEVERAL, "real_samples": 30, "samples": 26},
-        {"smoothing": 1.5, "replications": 3, "quick": True, "multimodality": SEVERAL},
-        {"edit": {"region": "in_between", "joints": None}, "replications": 1},
-        {"expected": {"own": {"jitter": [9.0, 0.5], "fid": [0.1, 0.2], "kid/mean": [0, 9]}}},
-    ):
-        protocol = protocol_of(**options)
-        for extractor, kind in ((Tiny(), "noisy"), (OwnReference(), "real"), (None, "static")):
-            used = data()
-            evaluation = Evaluation(
-                protocol, used, extractor, HumanML(), 3, 7, data(11, 5, split="train")
-            )
-            source = Baseline(kind, used, "text", 3)
-            for more in ({"resamples": 2}, {"force": True, "ground_truth": kind != "real"}):
-                if extractor is None and "force" not in more:
-                    continue
-                measured = outcome(lambda run=evaluation, a=source, b=more: run.run(a, **b))
-                results.append(measured if isinstance(measured, str) else measured.model_dump())
+    several: dict[str, Any] = {"multimodality": SEVERAL}
+    edit: dict[str, Any] = {"edit": {"region": "in_between", "joints": None}}
+    expected = {"own": {"jitter": [9.0, 0.5], "fid": [0.1, 0.2], "kid/mean": [0, 9]}}
+    cases: list[tuple[dict[str, Any], Extractor | None, str, dict[str, Any]]] = [
+        (several | {"real_samples": 30, "samples": 26}, Tiny(), "noisy", {"resamples": 2}),
+        (several | {"smoothing": 1.5, "quick": True}, OwnReference(), "real", {}),
+        (edit | {"replications": 1}, None, "static", {"ground_truth": False}),
+        ({"expected": expected, "replications": 1}, Tiny(), "shuffled", {}),
+        ({"expected": expected, "replications": 1}, Tiny(), "shuffled", {"force": True}),
+        ({"expected": expected, "resized_samples": True, "replications": 1}, None, "static", {}),
+    ]
+    for options, extractor, kind, more in cases:
+        used = data()
+        training = data(11, 5, split="train")
+        evaluation = Evaluation(protocol_of(**options), used, extractor, HumanML(), 3, 7, training)
+        source = Baseline(kind, used, "text", 3)
+        measured = outcome(lambda run=evaluation, a=source, b=more: run.run(a, **b))
+        if not isinstance(measured, str):
+            measured = measured.model_dump()
+            for part in ("values", "ground_truth"):
+                for name, value in (measured[part] or {}).items():
+                    measured[part][name] = value and [*value.values()]
+        results.append(measured)
     return results
 
 
@@ -467,7 +504,9 @@ def folders_of_samples() -> Any:
         for number in range(len(contents)):
             samples = outcome(lambda n=number: source("", rows, n))
             if isinstance(samples, Samples):
-                results.append([[row.id for row in samples.rows], samples.features, samples.captions])
+                results.append(
+                    [[row.id for row in samples.rows], samples.features, samples.captions]
+                )
             else:
                 results.append(str(samples).replace(name, ""))
         results.append(list(read_samples(folder / "part_2.npz")))
@@ -492,11 +531,21 @@ def generated_motions() -> Any:
             folder.mkdir()
             for place in (None, folder, folder):
                 source = FromNoise(
-                    cast(Any, None), protocol, data(), SamplerOptions(), {}, 0, batch_size, place, False
+                    cast(Any, None),
+                    protocol,
+                    data(),
+                    SamplerOptions(),
+                    {},
+                    0,
+                    batch_size,
+                    place,
+                    False,
                 )
                 samples = source("rep_1", rows, 1)
                 results.append([samples.features, samples.cost, source.bar.n, source.bar.total])
-            results.append(str(outcome(lambda a=source, b=rows: a("rep_1", b[::-1], 1))).replace(name, ""))
+            results.append(
+                str(outcome(lambda a=source, b=rows: a("rep_1", b[::-1], 1))).replace(name, "")
+            )
             content = read_samples(folder / "rep_1.npz")
             results.append({entry: content[entry] for entry in sorted(content)})
     return results
@@ -638,8 +687,9 @@ def features_of_motion_clips() -> Any:
         results += [network(*batch_of(7, (2, 1))), long]
     rng = np.random.default_rng(1)
     motion, text = (torch.from_numpy(rng.normal(size=(6, 4))) for _ in range(2))
-    wrong, meaning = torch.from_numpy(rng.normal(size=(6, 2, 4))), torch.tensor(
-        [[0, 1], [0, 2], [3, 2], [4, 5], [6, 7], [6, 8]]
+    wrong, meaning = (
+        torch.from_numpy(rng.normal(size=(6, 2, 4))),
+        torch.tensor([[0, 1], [0, 2], [3, 2], [4, 5], [6, 7], [6, 8]]),
     )
     for kinds in combinations(0, 4, meaning=(None, meaning), wrong_text=(None, wrong)):
         results.append(motion_clip.info_nce(motion, text, torch.tensor(0.7), **kinds))
@@ -648,7 +698,9 @@ def features_of_motion_clips() -> Any:
         pair = torch.from_numpy(rng.normal(size=(2, count, 4)))
         loss.update(*pair, torch.from_numpy(rng.permutation(count)), torch.tensor(1.7))
         results.append(loss.compute())
-    results.append(calibration_error(motion, text, torch.rand(6, generator=torch.Generator().manual_seed(1))))
+    results.append(
+        calibration_error(motion, text, torch.rand(6, generator=torch.Generator().manual_seed(1)))
+    )
     return results
 
 
@@ -658,7 +710,9 @@ def noisy_copies_of_motions() -> Any:
     representation.mean.copy_(torch.linspace(-0.3, 0.4, 263))
     representation.std.copy_(torch.linspace(0.6, 1.7, 263))
     for count in (1, 4, 5):
-        motions = [torch.from_numpy(x) for x in real_motions(data(), protocol_of().rows(data(), 0, 0))]
+        motions = [
+            torch.from_numpy(x) for x in real_motions(data(), protocol_of().rows(data(), 0, 0))
+        ]
         lengths = torch.tensor([min(30 - 3 * n, len(motions[n])) for n in range(count)])
         x = torch.zeros(count, 34, 263)
         for row, length in enumerate(lengths.tolist()):
@@ -707,7 +761,9 @@ def features_of_t2m() -> Any:
         results += [t2m_training.matching_loss(motion, text, margin, one) for one in (None, fits)]
         for count in (1, 7):
             loss = t2m_training.MatchingLoss(margin)
-            loss.update(generated=motion[:count], text=text[:count], keys=torch.arange(count).flip(0))
+            loss.update(
+                generated=motion[:count], text=text[:count], keys=torch.arange(count).flip(0)
+            )
             results.append(loss.compute())
     return results
 

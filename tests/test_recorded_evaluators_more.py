@@ -15,8 +15,15 @@ from support.recorded import Case, check, combinations, record, some_bodies
 from torch import Tensor, nn
 
 from evaluators import perturbations
-from evaluators.audit import _agreement, _differences, _inputs, _interval, _Measure, _measured
-from evaluators.audit import audited_metrics
+from evaluators.audit import (
+    _agreement,
+    _differences,
+    _inputs,
+    _interval,
+    _Measure,
+    _measured,
+    audited_metrics,
+)
 from evaluators.encoding import encode
 from evaluators.evaluation import Evaluation
 from evaluators.evaluation_request import EvaluationRequest
@@ -31,6 +38,7 @@ from evaluators.extractors import (
     t2m_training,
 )
 from evaluators.extractors.motion_clip_calibrated import calibration_error, noisy_copies
+from evaluators.metrics import make_metrics
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import BASE, REAL, STORED
 from evaluators.plan import set_bones
@@ -43,7 +51,6 @@ from evaluators.protocol import (
     protocol_config,
     protocol_names,
 )
-from evaluators.metrics import make_metrics
 from evaluators.results import Outcome, Scores, _cell, _intervals, mean_ci, mean_cost
 from evaluators.scene import Scene, text_of
 from evaluators.sources import (
@@ -329,7 +336,7 @@ def changed_joints() -> Any:
                 perturbations.continue_with(joints, other, fps),
                 perturbations.continue_with(other, joints, fps),
             ]  # fmt: skip
-            results += encode(HumanML(fps=fps), [joints[:9] + [0, 0.3, 0], other])
+            results += encode(HumanML(fps=fps), [joints[:9] + np.array([0, 0.3, 0]), other])
     return results
 
 
@@ -661,7 +668,7 @@ def seeded(create: Callable[[], nn.Module]) -> Any:
     torch.manual_seed(3)
     network = create().double().eval()
     for parameter in network.parameters():
-        if parameter.detach().std().isnan() or not parameter.detach().std():
+        if parameter.numel() == 1 or not parameter.detach().std():
             nn.init.normal_(parameter, 0.3, 0.5)
     for name, buffer in network.named_buffers():
         if name.endswith("running_var"):
@@ -696,7 +703,7 @@ def features_of_motion_clips() -> Any:
     for count in (5, 32, 40, 70):
         loss = motion_clip.PooledLoss()
         pair = torch.from_numpy(rng.normal(size=(2, count, 4)))
-        loss.update(*pair, torch.from_numpy(rng.permutation(count)), torch.tensor(1.7))
+        loss.update(pair[0], pair[1], torch.from_numpy(rng.permutation(count)), torch.tensor(1.7))
         results.append(loss.compute())
     results.append(
         calibration_error(motion, text, torch.rand(6, generator=torch.Generator().manual_seed(1)))

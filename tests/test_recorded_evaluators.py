@@ -202,6 +202,9 @@ def alignments() -> Any:
     for eps in (5e-4, 0.0, 0.3):
         results.append(of_features(alignment.MutualInformationDivergence(eps), **paired))
     results.append(of_features(alignment.MutualInformationDivergence(), **paired))
+    x = features()
+    fitted = [x["real"], x["real"].roll(1, 1).square(), x["generated"], x["text"]]
+    results.append(alignment.pointwise_mutual_information(*fitted, 1e-3))
     for few in (10, 11, 12):
         inputs = {name: features()[name][:few] for name in ("generated", "text", "keys", "real")}
         results.append(of_features(alignment.MutualInformationDivergence(), **inputs))
@@ -674,6 +677,18 @@ def attributes_of_fast_bodies() -> Any:
     return {name: brief(seen) for name, seen in seen_in("fast").items()}
 
 
+def attributes_of_growing_movements() -> Any:
+    """Actions with amplitudes that pass the limits of their rules."""
+    results = {}
+    for name in ("slash", "squat", "raise", "turn", "kick", "punch", "lean", "limp"):
+        motion = bodies().get(name, bodies()["wave"])
+        middle = motion[:1]
+        for amplitude in np.linspace(0.4, 1.5, 12):
+            moved = middle + amplitude * (motion - middle)
+            results[f"{name} {amplitude:.1f}"] = brief(attribute_rules.read_all(moved, 20.0))
+    return results
+
+
 def attributes_of_no_bodies() -> Any:
     motion = bodies()["walk"]
     inputs = {
@@ -835,6 +850,8 @@ def accuracies_of_claims() -> Any:
         results += [readings, metric.per_sample(rows), metric.weighted(rows, WEIGHTS[:, :24])]
     other = claims.ClaimAccuracy(20.0)
     results.append(other.judged(np.zeros((40, 21, 3)), CAPTIONS[0]))
+    walk = bodies()["walk"]
+    results.append([len(other.judged(walk[:frames], CAPTIONS[0])) for frames in range(8, 16)])
     results.append([claims.claims_of(caption) for caption in CAPTIONS])
     return results
 
@@ -846,7 +863,7 @@ CASES: list[Case] = [
     published_physical_metrics, floating_of_mbench, transitions, errors_of_edits,
     errors_of_positions, memorized_motions, declared_properties, refusals_of_metrics,
     attributes_of_plain_bodies, attributes_of_varied_bodies, attributes_of_fast_bodies,
-    attributes_of_no_bodies, bodies_of_changing_length, views_of_bodies, rises_of_signals,
+    attributes_of_growing_movements, attributes_of_no_bodies, bodies_of_changing_length, views_of_bodies, rises_of_signals,
     requested_attributes, accuracies_of_attributes, sides_of_bodies, accuracies_of_claims,
 ]  # fmt: skip
 

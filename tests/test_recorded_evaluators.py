@@ -863,7 +863,8 @@ CASES: list[Case] = [
     published_physical_metrics, floating_of_mbench, transitions, errors_of_edits,
     errors_of_positions, memorized_motions, declared_properties, refusals_of_metrics,
     attributes_of_plain_bodies, attributes_of_varied_bodies, attributes_of_fast_bodies,
-    attributes_of_growing_movements, attributes_of_no_bodies, bodies_of_changing_length, views_of_bodies, rises_of_signals,
+    attributes_of_growing_movements, attributes_of_no_bodies, bodies_of_changing_length,
+    views_of_bodies, rises_of_signals,
     requested_attributes, accuracies_of_attributes, sides_of_bodies, accuracies_of_claims,
 ]  # fmt: skip
 

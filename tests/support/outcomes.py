@@ -1,0 +1,46 @@
+"""Results of calls that may be refused, and what they print, without the path of a temporary folder."""
+
+import io
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+
+def outcome(action: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """The result of a call, or its error with the class."""
+    try:
+        return action(*arguments, **options)
+    except (Exception, SystemExit) as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def printed(action: Callable[..., Any], *arguments: Any, **options: Any) -> list[Any]:
+    """The outcome of a call, followed by the lines on standard output and standard error."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        result = outcome(action, *arguments, **options)
+    return [result, out.getvalue(), err.getvalue()]
+
+
+@contextmanager
+def workspace() -> Iterator[Path]:
+    """Runs the block in an empty folder, so that relative paths lead to it. Yields its full path."""
+    before = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            yield Path(folder).resolve()
+        finally:
+            os.chdir(before)
+
+
+def without(folder: Path, value: Any) -> Any:
+    """A result in which the path of a folder is replaced in all texts."""
+    if isinstance(value, str | Path):
+        return str(value).replace(str(folder), "FOLDER")
+    if isinstance(value, Mapping):
+        return {without(folder, key): without(folder, entry) for key, entry in value.items()}
+    return [without(folder, entry) for entry in value] if isinstance(value, list | tuple) else value

@@ -276,7 +276,7 @@ def histories_of_resumed_runs() -> Any:
 def measured_values() -> Any:
     rows: list[Any] = []
     for options in combinations(
-        2, 12, first=(0, 3), every=(1, 2), world=(1, 3), accumulate=(1, 4), validates=(None, 4)
+        2, 12, first=(0, 3), every=(1, 2), world=(1, 3), accumulate=(1, 4), validates=(None, 5)
     ):
         trainer: Any = Trainer(
             global_step=options["first"], log_every_n_steps=options["every"], world_size=options["world"],
@@ -639,7 +639,7 @@ def newest_checkpoints() -> Any:
 
 
 def states_of_optimizers() -> Any:
-    weights = [nn.Parameter(drawn(3, 2)), nn.Parameter(drawn(4))]
+    weights = [nn.Parameter(drawn(3, 2)), nn.Parameter(drawn(4)), nn.Parameter(drawn(2))]
     rows: list[Any] = []
     for optimizer in (
         torch.optim.AdamW(weights, lr=0.1, fused=True),
@@ -665,7 +665,7 @@ def states_of_optimizers() -> Any:
             )
         for state in (
             {0: {"m": torch.zeros(3, 2), "step": torch.tensor(1.0)}}, {0: {"m": torch.zeros(7)}}, {1: {"m": torch.zeros(5)}}, {1: {"m": torch.zeros(4)}},
-            {2: {"m": 1}}, {0: {"m": "x"}}, {0: {"m": torch.zeros(2, dtype=torch.complex64)}}, {0: {"m": None}}, {0: {"m": 2.5}}, {0: 3},
+            {3: {"m": 1}}, {2: {"m": torch.zeros(3)}}, {2: {"m": torch.zeros(2)}}, {0: {"m": "x"}}, {0: {"m": torch.zeros(2, dtype=torch.complex64)}}, {0: {"m": None}}, {0: {"m": 2.5}}, {0: 3},
         ):  # fmt: skip
             content = {"optimizer_states": [{"param_groups": [], "state": state}]}
             text = str(

@@ -66,10 +66,21 @@ class Trainer(SimpleNamespace):
 
     def __init__(self, **changes: Any):
         usual: dict[str, Any] = {
-            "global_step": 0, "world_size": 1, "global_rank": 0, "is_global_zero": True, "log_every_n_steps": 2,
-            "max_steps": 10, "should_stop": False, "accumulate_grad_batches": 1, "current_epoch": 0, "loggers": [],
-            "callback_metrics": {}, "logged_metrics": {}, "precision": "32-true", "saved": [],
-        }  # fmt: skip
+            "global_step": 0,
+            "world_size": 1,
+            "global_rank": 0,
+            "is_global_zero": True,
+            "log_every_n_steps": 2,
+            "max_steps": 10,
+            "should_stop": False,
+            "accumulate_grad_batches": 1,
+            "current_epoch": 0,
+            "loggers": [],
+            "callback_metrics": {},
+            "logged_metrics": {},
+            "precision": "32-true",
+            "saved": [],
+        }
         super().__init__(**usual | changes)
 
     def save_checkpoint(self, path: Path) -> None:
@@ -82,9 +93,15 @@ class Trainer(SimpleNamespace):
 def averages_of_weights() -> Any:
     rows: list[Any] = []
     for options in combinations(
-        0, 22, decay=(0.0, 0.75, 0.9, 1.0), every=(None, 1, 2, 3), starting=(None, 0, 1, 4), initial=(None, False, True),
-        first=(0, 6), updates=(0, 2),
-    ):  # fmt: skip
+        0,
+        22,
+        decay=(0.0, 0.75, 0.9, 1.0),
+        every=(None, 1, 2, 3),
+        starting=(None, 0, 1, 4),
+        initial=(None, False, True),
+        first=(0, 6),
+        updates=(0, 2),
+    ):
         names = {
             "every": "update_every_n_steps",
             "starting": "update_starting_at_step",
@@ -120,8 +137,15 @@ def averages_of_weights() -> Any:
 def schedules_of_checkpoints() -> Any:
     rows: list[Any] = [outcome(callbacks.Checkpoints, "f", every) for every in (0, -1)]
     for options in combinations(
-        1, 24, every=(1, 2, 3), keep=(None, 2, 4), most=(-1, 5, 6), signal=(None, 3), stop=(None, 4), first=(0, 2),
-    ):  # fmt: skip
+        1,
+        24,
+        every=(1, 2, 3),
+        keep=(None, 2, 4),
+        most=(-1, 5, 6),
+        signal=(None, 3),
+        stop=(None, 4),
+        first=(0, 2),
+    ):
         callback = callbacks.Checkpoints(
             "f", options["every"], *([options["keep"]] if options["keep"] else [])
         )
@@ -147,10 +171,16 @@ def checks_of_losses() -> Any:
     rows: list[Any] = []
     with workspace() as folder:
         streams = {
-            "usual": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], "nan": [1.0, 2.0, math.nan, 1.0], "jump": [1.0, 3.0, 2.0, 2000.0, 2.0],
-            "below": [1.0, 3.0, 0.5, 999.0, 2.0], "inf": [math.inf], "first": [5000.0, 1.0, 2.0, 3.0], "negative": [-1.0, -2.0, 5.0],
-            "two": [1.0, 2.0, math.inf, math.nan], "edge": [1.0, 1.0, 1000.0, 1001.0],
-        }  # fmt: skip
+            "usual": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+            "nan": [1.0, 2.0, math.nan, 1.0],
+            "jump": [1.0, 3.0, 2.0, 2000.0, 2.0],
+            "below": [1.0, 3.0, 0.5, 999.0, 2.0],
+            "inf": [math.inf],
+            "first": [5000.0, 1.0, 2.0, 3.0],
+            "negative": [-1.0, -2.0, 5.0],
+            "two": [1.0, 2.0, math.inf, math.nan],
+            "edge": [1.0, 1.0, 1000.0, 1001.0],
+        }
         for (name, values), factor in ((n, f) for n in streams.items() for f in (None, 2.0)):
             Path(name).mkdir(exist_ok=True)
             bad = guards.BadLoss(name, *([factor] if factor else []))
@@ -187,10 +217,16 @@ def explained_failures() -> Any:
     rows = [
         str(guards.lost_worker(error))
         for error in (
-            RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed."), caused, RuntimeError("x"), EOFError(),
-            ConnectionResetError("x"), OSError("x"), BrokenPipeError(), RuntimeError("DataLoader worker (pid 7) is alive"),
+            RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed."),
+            caused,
+            RuntimeError("x"),
+            EOFError(),
+            ConnectionResetError("x"),
+            OSError("x"),
+            BrokenPipeError(),
+            RuntimeError("DataLoader worker (pid 7) is alive"),
         )
-    ]  # fmt: skip
+    ]
     for error in (
         torch.OutOfMemoryError("x"),
         RuntimeError("can't allocate memory: y"),
@@ -220,9 +256,15 @@ def single_runs() -> Any:
         Path("links").mkdir()
         Path("links/x").symlink_to("/usr")
         for name, config, fault in (
-            ("new", False, None), ("new", True, None), ("new", False, None), ("failed", False, ValueError("x")), ("failed2", True, ValueError("x")),
-            ("old", False, None), ("links", False, None), ("deep/er", False, None),
-        ):  # fmt: skip
+            ("new", False, None),
+            ("new", True, None),
+            ("new", False, None),
+            ("failed", False, ValueError("x")),
+            ("failed2", True, ValueError("x")),
+            ("old", False, None),
+            ("links", False, None),
+            ("deep/er", False, None),
+        ):
             rows.append(
                 [name, printed(run, name, config, fault), sorted(str(p) for p in Path().rglob("*"))]
             )
@@ -279,9 +321,12 @@ def measured_values() -> Any:
         2, 12, first=(0, 3), every=(1, 2), world=(1, 3), accumulate=(1, 4), validates=(None, 5)
     ):
         trainer: Any = Trainer(
-            global_step=options["first"], log_every_n_steps=options["every"], world_size=options["world"],
-            accumulate_grad_batches=options["accumulate"], datamodule=SimpleNamespace(batch_size=8, train=range(48)),
-        )  # fmt: skip
+            global_step=options["first"],
+            log_every_n_steps=options["every"],
+            world_size=options["world"],
+            accumulate_grad_batches=options["accumulate"],
+            datamodule=SimpleNamespace(batch_size=8, train=range(48)),
+        )
         task: Any = mock.Mock(spec=callbacks.Task)
         task.device, task.reported, task.config, task.facts = torch.device("cpu"), {}, {}, {}
         weight = nn.Parameter(torch.ones(3))
@@ -478,8 +523,12 @@ def replaced_prompts() -> Any:
     rows: list[Any] = []
     action = torch.nn.Module.__new__(callbacks.ActionLabels)
     for prompts, actions, condition in (
-        (["a", "b"], ["x", "y", "z"], action), (["a", "x"], ["x", "y"], action), (["a"], ["x"], None), ([], ["x"], action), (["a"] * 3, ["x"], action),
-    ):  # fmt: skip
+        (["a", "b"], ["x", "y", "z"], action),
+        (["a", "x"], ["x", "y"], action),
+        (["a"], ["x"], None),
+        ([], ["x"], action),
+        (["a"] * 3, ["x"], action),
+    ):
         samples = callbacks.SampleMotions("s", 5, prompts, 1.0)
         task: Any = mock.Mock(spec=callbacks.GeneratorTask)
         task.facts, task.generator = {"actions": actions}, SimpleNamespace(condition=condition)
@@ -492,10 +541,20 @@ def replaced_prompts() -> Any:
 def last_lines_of_training() -> Any:
     rows: list[Any] = []
     for kind, facts, metrics, zero in (
-        ("text", {"captions": ["a person runs", "b"]}, {"train/loss": 1.23456, "val/loss": 0.5}, True), ("text", {}, {}, True),
-        ("action", {"actions": ["jump it", "x"]}, {"val/loss": 2.0}, True), ("action", {"actions": []}, {"x": 1.0}, True), ("none", {}, {}, True), ("none", {}, {}, False),
-        ("text", {"captions": ["c"], "dataset": "synthetic"}, {}, True), ("none", {"dataset": "synthetic"}, {}, True),
-    ):  # fmt: skip
+        (
+            "text",
+            {"captions": ["a person runs", "b"]},
+            {"train/loss": 1.23456, "val/loss": 0.5},
+            True,
+        ),
+        ("text", {}, {}, True),
+        ("action", {"actions": ["jump it", "x"]}, {"val/loss": 2.0}, True),
+        ("action", {"actions": []}, {"x": 1.0}, True),
+        ("none", {}, {}, True),
+        ("none", {}, {}, False),
+        ("text", {"captions": ["c"], "dataset": "synthetic"}, {}, True),
+        ("none", {"dataset": "synthetic"}, {}, True),
+    ):
         task: Any = mock.Mock(spec=callbacks.GeneratorTask)
         task.facts, task.config, task.generator = facts, {}, SimpleNamespace(conditioned_on=kind)
         trainer: Any = Trainer(callback_metrics=metrics, is_global_zero=zero, global_step=7)
@@ -511,9 +570,12 @@ def last_lines_of_training() -> Any:
     ]
     extractor = callbacks.__dict__["_extractor_in_package"]
     for config, facts in (
-        ({"representation": trained}, {"dataset": "synthetic", "captions": []}), ({"representation": trained}, {"dataset": "synthetic"}),
-        ({"representation": {}}, {"dataset": "synthetic", "captions": []}), ({"representation": trained}, {"dataset": "bandai", "captions": []}), ({}, {}),
-    ):  # fmt: skip
+        ({"representation": trained}, {"dataset": "synthetic", "captions": []}),
+        ({"representation": trained}, {"dataset": "synthetic"}),
+        ({"representation": {}}, {"dataset": "synthetic", "captions": []}),
+        ({"representation": trained}, {"dataset": "bandai", "captions": []}),
+        ({}, {}),
+    ):
         rows.append(extractor(config, facts))
     return rows
 
@@ -570,9 +632,16 @@ def skipped_hooks() -> Any:
 
 def _checkpoint(step: Any = 3, **changes: Any) -> dict[str, Any]:
     usual = {
-        "config": {"experiment": "e", "task": {"_target_": "t"}, "representation": {"_target_": "r"}}, "facts": {"actions": [], "max_frames": 5},
-        "state_dict": {"w": torch.arange(6.0).reshape(2, 3)}, "global_step": step, "pytorch-lightning_version": "2.6.0",
-    }  # fmt: skip
+        "config": {
+            "experiment": "e",
+            "task": {"_target_": "t"},
+            "representation": {"_target_": "r"},
+        },
+        "facts": {"actions": [], "max_frames": 5},
+        "state_dict": {"w": torch.arange(6.0).reshape(2, 3)},
+        "global_step": step,
+        "pytorch-lightning_version": "2.6.0",
+    }
     return {k: v for k, v in (usual | changes).items() if v is not ...}
 
 
@@ -646,9 +715,23 @@ def states_of_optimizers() -> Any:
         torch.optim.SGD(weights, lr=0.1, momentum=0.5),
     ):
         for changes in (
-            {}, {"lr": "x"}, {"lr": True}, {"lr": 1}, {"lr": math.inf}, {"betas": (0.5,)}, {"betas": [0.5, "x"]}, {"betas": [0.5, 1]}, {"amsgrad": 1},
-            {"amsgrad": None}, {"foreach": 3}, {"nesterov": True}, {"new": 3}, {"new": "s"}, {"params": "x"}, {"maximize": "no"},
-        ):  # fmt: skip
+            {},
+            {"lr": "x"},
+            {"lr": True},
+            {"lr": 1},
+            {"lr": math.inf},
+            {"betas": (0.5,)},
+            {"betas": [0.5, "x"]},
+            {"betas": [0.5, 1]},
+            {"amsgrad": 1},
+            {"amsgrad": None},
+            {"foreach": 3},
+            {"nesterov": True},
+            {"new": 3},
+            {"new": "s"},
+            {"params": "x"},
+            {"maximize": "no"},
+        ):
             group = {k: v for k, v in optimizer.param_groups[0].items() if k != "params"}
             content: dict[str, Any] = {
                 "optimizer_states": [{"param_groups": [group | changes], "state": {}}]
@@ -664,9 +747,19 @@ def states_of_optimizers() -> Any:
                 ]
             )
         for state in (
-            {0: {"m": torch.zeros(3, 2), "step": torch.tensor(1.0)}}, {0: {"m": torch.zeros(7)}}, {1: {"m": torch.zeros(5)}}, {1: {"m": torch.zeros(4)}},
-            {3: {"m": 1}}, {2: {"m": torch.zeros(3)}}, {2: {"m": torch.zeros(2)}}, {0: {"m": "x"}}, {0: {"m": torch.zeros(2, dtype=torch.complex64)}}, {0: {"m": None}}, {0: {"m": 2.5}}, {0: 3},
-        ):  # fmt: skip
+            {0: {"m": torch.zeros(3, 2), "step": torch.tensor(1.0)}},
+            {0: {"m": torch.zeros(7)}},
+            {1: {"m": torch.zeros(5)}},
+            {1: {"m": torch.zeros(4)}},
+            {3: {"m": 1}},
+            {2: {"m": torch.zeros(3)}},
+            {2: {"m": torch.zeros(2)}},
+            {0: {"m": "x"}},
+            {0: {"m": torch.zeros(2, dtype=torch.complex64)}},
+            {0: {"m": None}},
+            {0: {"m": 2.5}},
+            {0: 3},
+        ):
             content = {"optimizer_states": [{"param_groups": [], "state": state}]}
             text = str(
                 outcome(
@@ -717,14 +810,23 @@ def states_of_optimizers() -> Any:
 def devices_of_trainers() -> Any:
     rows: list[Any] = []
     for gpus, mps, options in (
-        (g, m, o) for g in (0, 1, 4) for m in (False, True)
-        for o in combinations(g + 3, 14, accelerator=(None, "auto", "cpu", "gpu", "cuda", "mps"), devices=(None, 1, 2, 5, 7, "auto", [0, 1]))
-    ):  # fmt: skip
+        (g, m, o)
+        for g in (0, 1, 4)
+        for m in (False, True)
+        for o in combinations(
+            g + 3,
+            14,
+            accelerator=(None, "auto", "cpu", "gpu", "cuda", "mps"),
+            devices=(None, 1, 2, 5, 7, "auto", [0, 1]),
+        )
+    ):
         chosen = {k: v for k, v in options.items() if v is not None}
         with (
-            mock.patch("torch.cuda.device_count", return_value=gpus), mock.patch("os.cpu_count", return_value=5),
-            mock.patch("torch.backends.mps.is_available", return_value=mps), mock.patch.object(fit, "NO_GPU", "no GPU"),
-        ):  # fmt: skip
+            mock.patch("torch.cuda.device_count", return_value=gpus),
+            mock.patch("os.cpu_count", return_value=5),
+            mock.patch("torch.backends.mps.is_available", return_value=mps),
+            mock.patch.object(fit, "NO_GPU", "no GPU"),
+        ):
             rows.append([gpus, mps, chosen, outcome(fit.check_devices, chosen)])
     for strategy in (
         "ddp",
@@ -779,9 +881,19 @@ def precision_of_fast_training() -> Any:
             self.gru = nn.GRU(2, 2)
 
     for options in combinations(
-        4, 40, accelerator=("cpu", "auto", "gpu", "cuda", "mps"), precision=("32-true", "16-mixed"), bf16=({}, {"avx512_bf16": True}, {"amx_bf16": True}),
-        cuda=(False, True), mps=(False, True), steps=(4999, 5000), masks=(True, False), multiple=(4, 64), generator=(True, False), recurs=(False, True),
-    ):  # fmt: skip
+        4,
+        40,
+        accelerator=("cpu", "auto", "gpu", "cuda", "mps"),
+        precision=("32-true", "16-mixed"),
+        bf16=({}, {"avx512_bf16": True}, {"amx_bf16": True}),
+        cuda=(False, True),
+        mps=(False, True),
+        steps=(4999, 5000),
+        masks=(True, False),
+        multiple=(4, 64),
+        generator=(True, False),
+        recurs=(False, True),
+    ):
         task: Any = mock.Mock(spec=speed.GeneratorTask if options["generator"] else speed.Task)
         net = nn.Sequential(nn.Dropout(0.5), Recurrent() if options["recurs"] else nn.Linear(1, 1))
         task.modules, task.generator = net.modules, mock.Mock()
@@ -793,10 +905,12 @@ def precision_of_fast_training() -> Any:
             "max_steps": options["steps"],
         }
         with (
-            mock.patch("torch.cuda.is_available", return_value=options["cuda"]), mock.patch("torch.backends.mps.is_available", return_value=options["mps"]),
-            mock.patch("torch.cuda.is_bf16_supported", return_value=options["masks"]), mock.patch("torch.cpu.get_capabilities", return_value=options["bf16"]),
+            mock.patch("torch.cuda.is_available", return_value=options["cuda"]),
+            mock.patch("torch.backends.mps.is_available", return_value=options["mps"]),
+            mock.patch("torch.cuda.is_bf16_supported", return_value=options["masks"]),
+            mock.patch("torch.cpu.get_capabilities", return_value=options["bf16"]),
             mock.patch.object(torch._dynamo.config, "recompile_limit", 8),
-        ):  # fmt: skip
+        ):
             result = printed(speed.accelerate, task, data, {"trainer": trainer})
             limit = torch._dynamo.config.recompile_limit
         calls = [str(call) for call in task.generator.denoiser.mock_calls]
@@ -823,9 +937,10 @@ def facts_about_machines() -> Any:
             strategy=SimpleNamespace(root_device=torch.device("cpu")), world_size=world
         )
         with (
-            mock.patch("torch.get_num_threads", return_value=threads), mock.patch("platform.machine", return_value="box"),
+            mock.patch("torch.get_num_threads", return_value=threads),
+            mock.patch("platform.machine", return_value="box"),
             mock.patch("torch.cpu.get_capabilities", return_value=capabilities),
-        ):  # fmt: skip
+        ):
             rows.append(provenance.device_name(trainer))
     git = provenance.__dict__["_git"]
     for code in (0, 1):
@@ -849,13 +964,23 @@ def provenance_of_runs() -> Any:
         "packages": {"torch": "2"},
     }
     with workspace(), mock.patch.object(provenance, "device_name", return_value="1 x box"):
-        for number, (before, now, step) in enumerate((
-            ({}, {}, 0), ({}, {}, 4), ({"commit": "c0"}, {}, 4), ({"commit": "c0", "changed": "M", "packages": {}}, {}, 4), ({"commit": "c0"}, {}, 0), (None, {}, 4),
-        )):  # fmt: skip
+        for number, (before, now, step) in enumerate(
+            (
+                ({}, {}, 0),
+                ({}, {}, 4),
+                ({"commit": "c0"}, {}, 4),
+                ({"commit": "c0", "changed": "M", "packages": {}}, {}, 4),
+                ({"commit": "c0"}, {}, 0),
+                (None, {}, 4),
+            )
+        ):
             config = {
-                "run": {"dir": f"r{number}", **({"speed": "fast"} if number % 2 else {})}, "experiment": "e", "path": f"r{number}/x",
-                "data": {"batch_size": 8}, "optimizer": {"lr": 0.5} if number < 3 else {},
-            }  # fmt: skip
+                "run": {"dir": f"r{number}", **({"speed": "fast"} if number % 2 else {})},
+                "experiment": "e",
+                "path": f"r{number}/x",
+                "data": {"batch_size": 8},
+                "optimizer": {"lr": 0.5} if number < 3 else {},
+            }
             Path(f"r{number}").mkdir()
             task: Any = mock.Mock(spec=provenance.Task)
             task.facts = {
@@ -906,10 +1031,20 @@ def changes_of_recipes() -> Any:
     rows: list[Any] = []
     base = recipe("quickstart")
     for changes in (
-        {}, {"seed": 3}, {"experiment": "mine"}, {"lr_decay": 0.5, "lr_warmup": 7}, {"data_root": "/x"}, {"optimizer": base["optimizer"] | {"lr": 0.5}},
-        {"denoiser": {"_target_": "flame_mdm.denoisers.gru.MDMGRU", "latent_dim": 1}}, {"trainer": base["trainer"] | {"max_steps": 3, "precision": "bf16-mixed"}},
-        {"callbacks": {}}, {"logger": None}, {"losses": {"joints": 2.0}}, {"my": "y" * 99}, {"data": base["data"] | {"num_workers": 9, "batch_size": 9}},
-    ):  # fmt: skip
+        {},
+        {"seed": 3},
+        {"experiment": "mine"},
+        {"lr_decay": 0.5, "lr_warmup": 7},
+        {"data_root": "/x"},
+        {"optimizer": base["optimizer"] | {"lr": 0.5}},
+        {"denoiser": {"_target_": "flame_mdm.denoisers.gru.MDMGRU", "latent_dim": 1}},
+        {"trainer": base["trainer"] | {"max_steps": 3, "precision": "bf16-mixed"}},
+        {"callbacks": {}},
+        {"logger": None},
+        {"losses": {"joints": 2.0}},
+        {"my": "y" * 99},
+        {"data": base["data"] | {"num_workers": 9, "batch_size": 9}},
+    ):
         rows.append(start.recipe_changes(base | changes))
         with workspace() as folder:
             saved = start.movable(base)
@@ -972,16 +1107,37 @@ def checked_weights_and_content() -> Any:
         Path("w").write_bytes(b"0" * 50)
         rows: list[Any] = []
         for value in (
-            torch.ones(3), torch.ones(25), torch.ones(26), torch.ones(3, dtype=torch.complex64), "x", 3, torch.ones(2).to_sparse(), torch.ones(3, dtype=torch.bool),
-            torch.ones(3, dtype=torch.float16), torch.ones(1, device="meta"), torch.ones(3, dtype=torch.uint8), torch.ones(2, dtype=torch.float8_e4m3fn), None,
-        ):  # fmt: skip
+            torch.ones(3),
+            torch.ones(25),
+            torch.ones(26),
+            torch.ones(3, dtype=torch.complex64),
+            "x",
+            3,
+            torch.ones(2).to_sparse(),
+            torch.ones(3, dtype=torch.bool),
+            torch.ones(3, dtype=torch.float16),
+            torch.ones(1, device="meta"),
+            torch.ones(3, dtype=torch.uint8),
+            torch.ones(2, dtype=torch.float8_e4m3fn),
+            None,
+        ):
             rows.append(outcome(model_files.check_weights, {"a": value}, Path("w")))
         rows.append(outcome(model_files.check_weights, {3: torch.ones(1)}, Path("w")))
         for changes in (
-            {}, {"config": ...}, {"state_dict": [1]}, {"global_step": "x"}, {"facts": {"actions": []}}, {"facts": {"actions": [], "max_frames": 0}},
-            {"facts": {"actions": [], "max_frames": 100_001}}, {"facts": _facts(licenses=[{"license": "x"}])}, {"origin": {"a": [1]}}, {"origin": {"a": 1.5, "b": None}},
-            {"config": {"experiment": "${x}"}}, {"facts": _facts(training={"hours": "x"})}, {"facts": _facts(vocabulary=[1])},
-        ):  # fmt: skip
+            {},
+            {"config": ...},
+            {"state_dict": [1]},
+            {"global_step": "x"},
+            {"facts": {"actions": []}},
+            {"facts": {"actions": [], "max_frames": 0}},
+            {"facts": {"actions": [], "max_frames": 100_001}},
+            {"facts": _facts(licenses=[{"license": "x"}])},
+            {"origin": {"a": [1]}},
+            {"origin": {"a": 1.5, "b": None}},
+            {"config": {"experiment": "${x}"}},
+            {"facts": _facts(training={"hours": "x"})},
+            {"facts": _facts(vocabulary=[1])},
+        ):
             content = outcome(model_files.checked, Path("w"), _checkpoint(**changes))
             rows.append(content if isinstance(content, str) else sorted(content))
         rows += [outcome(model_files.checked, Path("w"), [1])]
@@ -1033,8 +1189,15 @@ def written_model_files() -> Any:
         rows.append(model_files.content_sha256("u", state))
         from safetensors.torch import save_file
 
-        for metadata in (None, {"flame_mdm": "{"}, {"flame_mdm": '{"format": 2}'}, {"flame_mdm": "[1]"}, {"flame_mdm_adapter": "{}"},
-                         {"flame_mdm": '{"format": 1, "config": {}, "facts": {}, "origin": {}}'}, {"flame_mdm": '{"format": 2, "config": {}, "facts": {}, "origin": {}}', "sha256": "x"}):  # fmt: skip
+        for metadata in (
+            None,
+            {"flame_mdm": "{"},
+            {"flame_mdm": '{"format": 2}'},
+            {"flame_mdm": "[1]"},
+            {"flame_mdm_adapter": "{}"},
+            {"flame_mdm": '{"format": 1, "config": {}, "facts": {}, "origin": {}}'},
+            {"flame_mdm": '{"format": 2, "config": {}, "facts": {}, "origin": {}}', "sha256": "x"},
+        ):
             save_file({"a": torch.ones(2)}, "m.safetensors", metadata)
             rows.append(outcome(model_files.read_model_file, Path("m.safetensors")))
         Path("m.safetensors").write_text("x")
@@ -1083,16 +1246,54 @@ def located_models() -> Any:
             "quickstart_run",
         ):
             Path(name).mkdir(parents=True)
-        for name in ("run/checkpoints/last.ckpt", "run/checkpoints/step=3.ckpt", "run/config.yaml", "many/a.safetensors", "many/b.safetensors", "one/m.safetensors", "one/.t.safetensors",
-                     "fresh/config.yaml", "mixed/config.yaml", "mixed/m.safetensors", "plain.ckpt", "runs/file"):  # fmt: skip
+        for name in (
+            "run/checkpoints/last.ckpt",
+            "run/checkpoints/step=3.ckpt",
+            "run/config.yaml",
+            "many/a.safetensors",
+            "many/b.safetensors",
+            "one/m.safetensors",
+            "one/.t.safetensors",
+            "fresh/config.yaml",
+            "mixed/config.yaml",
+            "mixed/m.safetensors",
+            "plain.ckpt",
+            "runs/file",
+        ):
             Path(name).write_text("")
         os.mkfifo("pipe.ckpt")
         hf = mock.Mock(side_effect=lambda *args, **options: f"hub {args} {options}")
         with mock.patch("huggingface_hub.hf_hub_download", hf):
             for name in (
-                "run", "run/", "many", "one", "none", "runs", "fresh", "mixed", "plain.ckpt", "plan.ckpt", "pipe.ckpt", "quickstart", "quickstrt", "package_dip", "a/b", "a/b@v1", "a/b@x/y",
-                "a/b/c", "a/b.ckpt", "user/x", "gone/x.safetensors", "a b/c", "run/checkpoints", Path("one"), "xyz", "a/b@", "a/b.pt", "none/x",
-            ):  # fmt: skip
+                "run",
+                "run/",
+                "many",
+                "one",
+                "none",
+                "runs",
+                "fresh",
+                "mixed",
+                "plain.ckpt",
+                "plan.ckpt",
+                "pipe.ckpt",
+                "quickstart",
+                "quickstrt",
+                "package_dip",
+                "a/b",
+                "a/b@v1",
+                "a/b@x/y",
+                "a/b/c",
+                "a/b.ckpt",
+                "user/x",
+                "gone/x.safetensors",
+                "a b/c",
+                "run/checkpoints",
+                Path("one"),
+                "xyz",
+                "a/b@",
+                "a/b.pt",
+                "none/x",
+            ):
                 for which in ((), ("best",)):
                     path = outcome(locating.find, name, *which)
                     rows.append(
@@ -1209,7 +1410,16 @@ def merged_adapters() -> Any:
                     "adapter" in merged["config"],
                 ]
             )
-        for adapter, strength in ((files[0], ()), (files[0], (0.5,)), (files[1], (0.0,)), (files, (0.25,)), (files, ([0.5, -1.0],)), (files[::-1], ([0, 1.5],)), ((), ()), (Path(files[1]), ([2.0],))):  # fmt: skip
+        for adapter, strength in (
+            (files[0], ()),
+            (files[0], (0.5,)),
+            (files[1], (0.0,)),
+            (files, (0.25,)),
+            (files, ([0.5, -1.0],)),
+            (files[::-1], ([0, 1.5],)),
+            ((), ()),
+            (Path(files[1]), ([2.0],)),
+        ):
             merged = adapters.read_merged(file, adapter, *strength)
             rows.append(
                 [
@@ -1333,9 +1543,20 @@ def exported_and_pushed_models() -> Any:
                     ]
                 )
         for condition, changes in (
-            ("LearnedTokens", {}), ("ActionLabels", {"actions": ["run", "jump"]}), ("Unconditional", {"dataset": "kit"}), (None, {"fingerprint": None, "dataset": "humanml3d"}),
-            ("LearnedTokens", {"licenses": [{"license": "CC-BY-4.0", "clips": 3, "minutes": 1.5, "actions": ["a|b"]}, {"license": "own", "clips": 1, "minutes": 2, "actions": []}]}),
-        ):  # fmt: skip
+            ("LearnedTokens", {}),
+            ("ActionLabels", {"actions": ["run", "jump"]}),
+            ("Unconditional", {"dataset": "kit"}),
+            (None, {"fingerprint": None, "dataset": "humanml3d"}),
+            (
+                "LearnedTokens",
+                {
+                    "licenses": [
+                        {"license": "CC-BY-4.0", "clips": 3, "minutes": 1.5, "actions": ["a|b"]},
+                        {"license": "own", "clips": 1, "minutes": 2, "actions": []},
+                    ]
+                },
+            ),
+        ):
             config = {
                 "experiment": "e_x",
                 "denoiser": {"_target_": "m.Net"},
@@ -1372,10 +1593,21 @@ def loaded_models() -> Any:
         )
         content = model_files.read_model_file(file)
         for changes in (
-            {"global_step": 9}, {"config": content["config"] | {"task": {"_target_": "mine.Task"}}}, {"config": content["config"] | {"denoiser": content["config"]["denoiser"] | {"num_layers": 2}}},
-            {"config": content["config"] | {"denoiser": content["config"]["denoiser"] | {"num_layers": 9000}}}, {"state_dict": {k: v for k, v in content["state_dict"].items() if "output" not in k}},
-            {"config": content["config"] | {"task": {"_target_": "flame_mdm.task.ClassifierTask"}}}, {"config": content["config"] | {"denoiser": {"_target_": "os.system"}}}, {"origin": None},
-        ):  # fmt: skip
+            {"global_step": 9},
+            {"config": content["config"] | {"task": {"_target_": "mine.Task"}}},
+            {
+                "config": content["config"]
+                | {"denoiser": content["config"]["denoiser"] | {"num_layers": 2}}
+            },
+            {
+                "config": content["config"]
+                | {"denoiser": content["config"]["denoiser"] | {"num_layers": 9000}}
+            },
+            {"state_dict": {k: v for k, v in content["state_dict"].items() if "output" not in k}},
+            {"config": content["config"] | {"task": {"_target_": "flame_mdm.task.ClassifierTask"}}},
+            {"config": content["config"] | {"denoiser": {"_target_": "os.system"}}},
+            {"origin": None},
+        ):
             torch.save(
                 {**content, "flame_mdm_format": 2, "origin": {"steps": 3}, **changes}, "m.ckpt"
             )
@@ -1408,9 +1640,31 @@ def files_of_torch() -> Any:
         "s": {1, 2},
     }
     contents: list[Any] = [
-        good, {2**60: 1}, {2**60 - 1: 1}, {-(2**60): 1}, {1 - 2**60: 1}, {(1, 2): 3}, {1.5: 2}, {None: 1}, {True: 1}, {b"x": 1}, {2**60}, {1.5}, {"x"}, OrderedDict([(2**61, 1)]),
-        OrderedDict([("k", 2**61)]), Counter({2**61: 1}), Counter("aab"), Unsafe(), bytearray(b"xy"), 1 + 2j, {"x": {2**70: 1}}, [{0.5: 1}], (), {1: Unsafe(), 2**61: 1},
-    ]  # fmt: skip
+        good,
+        {2**60: 1},
+        {2**60 - 1: 1},
+        {-(2**60): 1},
+        {1 - 2**60: 1},
+        {(1, 2): 3},
+        {1.5: 2},
+        {None: 1},
+        {True: 1},
+        {b"x": 1},
+        {2**60},
+        {1.5},
+        {"x"},
+        OrderedDict([(2**61, 1)]),
+        OrderedDict([("k", 2**61)]),
+        Counter({2**61: 1}),
+        Counter("aab"),
+        Unsafe(),
+        bytearray(b"xy"),
+        1 + 2j,
+        {"x": {2**70: 1}},
+        [{0.5: 1}],
+        (),
+        {1: Unsafe(), 2**61: 1},
+    ]
     with workspace() as folder:
         for content in contents:
             for options in ({}, {"_use_new_zipfile_serialization": False}):
@@ -1467,7 +1721,19 @@ def states_of_released_files() -> Any:
     rows: list[Any] = []
     a, b, c = ({"w": torch.full((2,), value)} for value in (1.0, 2.0, 3.0))
     named = {"ema_model.model.w": torch.ones(1), "net.w": torch.zeros(1), "z": torch.ones(2)}
-    for content in (a, {"model": a, "model_avg": b}, {"state_dict": c}, {"state_dict": named}, {"state_dict": {"net.w": torch.ones(3)}}, {"model": a}, {}, {"state_dict": 3}, {1: torch.ones(1)}, {"model_avg": b}, named):  # fmt: skip
+    for content in (
+        a,
+        {"model": a, "model_avg": b},
+        {"state_dict": c},
+        {"state_dict": named},
+        {"state_dict": {"net.w": torch.ones(3)}},
+        {"model": a},
+        {},
+        {"state_dict": 3},
+        {1: torch.ones(1)},
+        {"model_avg": b},
+        named,
+    ):
         for options in ({}, {"ema": True}, {"ema": False}):
             rows.append(outcome(released_weights.released_state, content, **options))
     for key, ndim in (("w", ()), ("w", (1,)), ("q", ())):
@@ -1493,11 +1759,20 @@ def _released_state(arch: str, **extra: tuple[int, ...]) -> dict[str, Tensor]:
     d, ff, f = 8, 12, 263
     stack = {"trans_enc": "seqTransEncoder", "trans_dec": "seqTransDecoder", "gru": ""}[arch]
     shapes: dict[str, tuple[int, ...]] = {
-        "input_process.poseEmbedding.weight": (d, f + (d if arch == "gru" else 0)), "input_process.poseEmbedding.bias": (d,),
-        "output_process.poseFinal.weight": (f, d), "output_process.poseFinal.bias": (f,),
-        "embed_timestep.time_embed.0.weight": (d, d), "embed_timestep.time_embed.0.bias": (d,), "embed_timestep.time_embed.2.weight": (d, d), "embed_timestep.time_embed.2.bias": (d,),
-        "embed_text.weight": (d, 5), "embed_text.bias": (d,), "clip_model.x": (3,), "sequence_pos_encoder.pe": (9, 1, d), **extra,
-    }  # fmt: skip
+        "input_process.poseEmbedding.weight": (d, f + (d if arch == "gru" else 0)),
+        "input_process.poseEmbedding.bias": (d,),
+        "output_process.poseFinal.weight": (f, d),
+        "output_process.poseFinal.bias": (f,),
+        "embed_timestep.time_embed.0.weight": (d, d),
+        "embed_timestep.time_embed.0.bias": (d,),
+        "embed_timestep.time_embed.2.weight": (d, d),
+        "embed_timestep.time_embed.2.bias": (d,),
+        "embed_text.weight": (d, 5),
+        "embed_text.bias": (d,),
+        "clip_model.x": (3,),
+        "sequence_pos_encoder.pe": (9, 1, d),
+        **extra,
+    }
     state = {
         name: drawn(*shape, seed=k, dtype=torch.float32)
         for k, (name, shape) in enumerate(shapes.items())
@@ -1521,10 +1796,22 @@ def imported_networks() -> Any:
         "embed_target_cond.mlp.2.bias": (8,),
     }
     for arch, options, extra in (
-        ("trans_enc", {}, {}), ("trans_enc", {"mask_frames": True}, {}), ("trans_dec", {}, {}), ("trans_dec", {"emb_trans_dec": True}, {}), ("gru", {}, {}),
-        ("trans_dec", {"text_encoder_type": "bert", "context_len": 5, "pred_len": 7, "emb_policy": "concat"}, {}), ("trans_dec", {"text_encoder_type": "bert", "emb_trans_dec": True}, {}),
-        ("trans_enc", {}, {"embed_action.action_embedding": (4, 8)}), ("trans_enc", {"lambda_target_loc": 1.0}, {}), ("trans_enc", {"multi_target_cond": True}, {}), ("trans_dec", {"lambda_target_loc": 1.0}, targets),
-    ):  # fmt: skip
+        ("trans_enc", {}, {}),
+        ("trans_enc", {"mask_frames": True}, {}),
+        ("trans_dec", {}, {}),
+        ("trans_dec", {"emb_trans_dec": True}, {}),
+        ("gru", {}, {}),
+        (
+            "trans_dec",
+            {"text_encoder_type": "bert", "context_len": 5, "pred_len": 7, "emb_policy": "concat"},
+            {},
+        ),
+        ("trans_dec", {"text_encoder_type": "bert", "emb_trans_dec": True}, {}),
+        ("trans_enc", {}, {"embed_action.action_embedding": (4, 8)}),
+        ("trans_enc", {"lambda_target_loc": 1.0}, {}),
+        ("trans_enc", {"multi_target_cond": True}, {}),
+        ("trans_dec", {"lambda_target_loc": 1.0}, targets),
+    ):
         for token in ({}, {"time_token": True}):
             state = _released_state(arch, **extra)
             if "embed_action.action_embedding" in state:
@@ -1552,7 +1839,17 @@ def imported_networks() -> Any:
             if not token and (
                 arch == "trans_dec" or result.action_embedding is not None or not options
             ):
-                for kind, dataset, changes in (("mdm", "humanml", {}), ("mfm", "kit", {"ode_kwargs": {"method": "dopri5", "step_size": 0.3}}), ("mdm", "uestc", {"num_frames": 50, "cond_mask_prob": 0.0, "sigma_small": False}), ("mfm", "humanact12", {"ode_kwargs": {"method": "midpoint"}}), ("mfm", "humanml", {"lambda_vel": 2.0, "lambda_rcxyz": 3.0, "lambda_fc": 4.0})):  # fmt: skip
+                for kind, dataset, changes in (
+                    ("mdm", "humanml", {}),
+                    ("mfm", "kit", {"ode_kwargs": {"method": "dopri5", "step_size": 0.3}}),
+                    (
+                        "mdm",
+                        "uestc",
+                        {"num_frames": 50, "cond_mask_prob": 0.0, "sigma_small": False},
+                    ),
+                    ("mfm", "humanact12", {"ode_kwargs": {"method": "midpoint"}}),
+                    ("mfm", "humanml", {"lambda_vel": 2.0, "lambda_rcxyz": 3.0, "lambda_fc": 4.0}),
+                ):
                     chosen = released_options.Options.model_validate(
                         {"arch": arch, "dataset": dataset, **options, **changes}, strict=False
                     )
@@ -1657,11 +1954,39 @@ def imported_files() -> Any:
 
 def options_of_released_models() -> Any:
     texts: list[Any] = [
-        {}, {"arch": "gru"}, {"arch": "x"}, {"arch": None}, {"layers": 3}, {"unknown": 1}, {"unknown": None}, {"emb_before_mask": True}, {"emb_before_mask": False}, {"hml_type": None}, {"hml_type": "x"},
-        {"emb_policy": "CONCAT"}, {"emb_policy": "concat", "arch": "trans_dec", "text_encoder_type": "bert"}, {"context_len": 5, "pred_len": 0, "arch": "trans_dec", "text_encoder_type": "bert"},
-        {"context_len": 5, "pred_len": 2}, {"pred_len": 2}, {"model": {"arch": "gru"}, "training": {"diffusion_steps": 7, "arch": "trans_enc"}, "num_frames": 9}, {"model": {"arch": "gru"}, "arch": "trans_dec"},
-        {"model": 3}, {"ode_kwargs": {"step_size": "2e-2"}}, {"ode_kwargs": {"step_size": 2}}, {"ode_kwargs": {"method": "rk4", "x": 1}}, {"ode_kwargs": 3}, {"diffusion_steps": 0}, {"cond_mask_prob": 1.5}, {"num_heads": 0}, [1], {"lambda_vel": "x"},
-    ]  # fmt: skip
+        {},
+        {"arch": "gru"},
+        {"arch": "x"},
+        {"arch": None},
+        {"layers": 3},
+        {"unknown": 1},
+        {"unknown": None},
+        {"emb_before_mask": True},
+        {"emb_before_mask": False},
+        {"hml_type": None},
+        {"hml_type": "x"},
+        {"emb_policy": "CONCAT"},
+        {"emb_policy": "concat", "arch": "trans_dec", "text_encoder_type": "bert"},
+        {"context_len": 5, "pred_len": 0, "arch": "trans_dec", "text_encoder_type": "bert"},
+        {"context_len": 5, "pred_len": 2},
+        {"pred_len": 2},
+        {
+            "model": {"arch": "gru"},
+            "training": {"diffusion_steps": 7, "arch": "trans_enc"},
+            "num_frames": 9,
+        },
+        {"model": {"arch": "gru"}, "arch": "trans_dec"},
+        {"model": 3},
+        {"ode_kwargs": {"step_size": "2e-2"}},
+        {"ode_kwargs": {"step_size": 2}},
+        {"ode_kwargs": {"method": "rk4", "x": 1}},
+        {"ode_kwargs": 3},
+        {"diffusion_steps": 0},
+        {"cond_mask_prob": 1.5},
+        {"num_heads": 0},
+        [1],
+        {"lambda_vel": "x"},
+    ]
     rows: list[Any] = [
         released_options.read_options(None, {}),
         outcome(released_options.read_options, None, {"num_heads": 3, "x": 1}),
@@ -1778,10 +2103,28 @@ def parts_of_runner() -> Any:
 
 def _description(**changes: Any) -> dict[str, Any]:
     usual = {
-        "format": 1, "experiment": "e", "reads": "text", "buckets": 50, "max_words": 4, "actions": ["run", "jump"], "vocabulary": ["walk", "person", "jumps"], "captions": ["x"], "function_words": ["a"],
-        "features": 3, "fps": 20, "max_frames": 40, "padded_frames": 0, "skeleton": {"joints": ["p"], "parents": [-1], "feet": []}, "clip_x0": False,
-        "steps": [[5.0, 0.5, 0.25, 0.75, 0.5, 0.125, 0.25], [2.0, 0.25, 0.5, 0.5, 0.25, 0.0, 0.0], [0.0, 1.0, 0.25, 0.0, 1.0, -0.25, 0.5]], "sha256": dict.fromkeys(runner.GRAPHS[:2], "0" * 64),
-    }  # fmt: skip
+        "format": 1,
+        "experiment": "e",
+        "reads": "text",
+        "buckets": 50,
+        "max_words": 4,
+        "actions": ["run", "jump"],
+        "vocabulary": ["walk", "person", "jumps"],
+        "captions": ["x"],
+        "function_words": ["a"],
+        "features": 3,
+        "fps": 20,
+        "max_frames": 40,
+        "padded_frames": 0,
+        "skeleton": {"joints": ["p"], "parents": [-1], "feet": []},
+        "clip_x0": False,
+        "steps": [
+            [5.0, 0.5, 0.25, 0.75, 0.5, 0.125, 0.25],
+            [2.0, 0.25, 0.5, 0.5, 0.25, 0.0, 0.0],
+            [0.0, 1.0, 0.25, 0.0, 1.0, -0.25, 0.5],
+        ],
+        "sha256": dict.fromkeys(runner.GRAPHS[:2], "0" * 64),
+    }
     content = {k: v for k, v in (usual | changes).items() if v is not ...}
     return content | {"digest": runner.digest(content)}
 
@@ -1799,11 +2142,34 @@ def descriptions_of_exported_models() -> Any:
         )
     ]
     values: dict[str, list[Any]] = {
-        "experiment": ["", "a\n", "x" * 1000, "x" * 1001, 3], "reads": ["none", "other", "texts"], "buckets": [..., 0, 10_000_001, True, 1.0], "max_words": [..., 1001], "actions": [[""], [3], "x"],
-        "features": [0, 2000, 2001], "fps": [0.5, 1, 1000, 1001, 12.5], "max_frames": [1, 2, 10_001], "padded_frames": [40, 39, -1], "start": [[[0.0] * 3], [[0.0] * 2], [[0.0] * 3] * 38, [[0.0] * 3] * 39, []],
-        "fade": [{"frames": 3, "begin": 0}, {"frames": 0, "begin": 0, "end": 1}, {"frames": 3, "begin": 0, "end": 2}], "root": [[[0, 1]] * 3, [[0, 1]] * 2, [[0, 1, 2]] * 3], "clip_x0": [1, True], "skeleton": [{}, {"joints": [], "parents": [-2], "feet": 3}],
-        "steps": [[], [[0.0] * 6], [[2e9] * 7], [["x"] * 7]], "sha256": [{}, {"denoiser.onnx": "x", "joints.onnx": "0" * 64}, dict.fromkeys(runner.GRAPHS, "a" * 64)], "vocabulary": [3, ["\n"]], "captions": [...], "extra": [1],
-    }  # fmt: skip
+        "experiment": ["", "a\n", "x" * 1000, "x" * 1001, 3],
+        "reads": ["none", "other", "texts"],
+        "buckets": [..., 0, 10_000_001, True, 1.0],
+        "max_words": [..., 1001],
+        "actions": [[""], [3], "x"],
+        "features": [0, 2000, 2001],
+        "fps": [0.5, 1, 1000, 1001, 12.5],
+        "max_frames": [1, 2, 10_001],
+        "padded_frames": [40, 39, -1],
+        "start": [[[0.0] * 3], [[0.0] * 2], [[0.0] * 3] * 38, [[0.0] * 3] * 39, []],
+        "fade": [
+            {"frames": 3, "begin": 0},
+            {"frames": 0, "begin": 0, "end": 1},
+            {"frames": 3, "begin": 0, "end": 2},
+        ],
+        "root": [[[0, 1]] * 3, [[0, 1]] * 2, [[0, 1, 2]] * 3],
+        "clip_x0": [1, True],
+        "skeleton": [{}, {"joints": [], "parents": [-2], "feet": 3}],
+        "steps": [[], [[0.0] * 6], [[2e9] * 7], [["x"] * 7]],
+        "sha256": [
+            {},
+            {"denoiser.onnx": "x", "joints.onnx": "0" * 64},
+            dict.fromkeys(runner.GRAPHS, "a" * 64),
+        ],
+        "vocabulary": [3, ["\n"]],
+        "captions": [...],
+        "extra": [1],
+    }
     for name, options in values.items():
         rows += [
             [name, str(value)[:30], outcome(runner.check, _description(**{name: value}))]
@@ -1837,8 +2203,17 @@ def motions_of_runner() -> Any:
     rows: list[Any] = []
     start_frames = drawn(4, 3).tolist()
     variants: list[dict[str, Any]] = [
-        {}, {"padded_frames": 40}, {"clip_x0": True}, {"reads": "action"}, {"reads": "none"}, {"vocabulary": []}, {"start": start_frames}, {"start": start_frames, "fade": {"frames": 3, "begin": 1, "end": 3}}, {"fps": 12.5}, {"max_frames": 90},
-    ]  # fmt: skip
+        {},
+        {"padded_frames": 40},
+        {"clip_x0": True},
+        {"reads": "action"},
+        {"reads": "none"},
+        {"vocabulary": []},
+        {"start": start_frames},
+        {"start": start_frames, "fade": {"frames": 3, "begin": 1, "end": 3}},
+        {"fps": 12.5},
+        {"max_frames": 90},
+    ]
     for number, changes in enumerate(variants):
         sampler = runner.Sampler.__new__(runner.Sampler)
         sampler.content, sampler.denoiser, sampler.joints, sampler.poses = (
@@ -1848,8 +2223,18 @@ def motions_of_runner() -> Any:
             None,
         )
         for options in (
-            {}, {"seconds": 1.0}, {"seconds": 0.1}, {"seconds": 0.05}, {"seconds": 4.5, "seed": 3}, {"seconds": 0}, {"seconds": -1}, {"seconds": 700.0}, {"seconds": 1.03, "sample": 2}, {"seconds": 1.0, "text": "other"}, {"seconds": math.nan},
-        ):  # fmt: skip
+            {},
+            {"seconds": 1.0},
+            {"seconds": 0.1},
+            {"seconds": 0.05},
+            {"seconds": 4.5, "seed": 3},
+            {"seconds": 0},
+            {"seconds": -1},
+            {"seconds": 700.0},
+            {"seconds": 1.03, "sample": 2},
+            {"seconds": 1.0, "text": "other"},
+            {"seconds": math.nan},
+        ):
             prompt = {"action": "jump", "none": ""}.get(
                 sampler.content["reads"], "a person walks and jumping far away"
             )
@@ -1901,8 +2286,14 @@ def plans_of_samplers() -> Any:
         (FlowMatching, ("euler", "midpoint", "heun", "dopri5")),
     ):
         for options in combinations(
-            6, 14, sampler=samplers, num_inference_steps=(4, 3), eta=(None, 0.5), spacing=(None, "stride"), variance=("fixed_small", "fixed_large", "learned_range"),
-        ):  # fmt: skip
+            6,
+            14,
+            sampler=samplers,
+            num_inference_steps=(4, 3),
+            eta=(None, 0.5),
+            spacing=(None, "stride"),
+            variance=("fixed_small", "fixed_large", "learned_range"),
+        ):
             variance = options.pop("variance")
             process: Any = outcome(
                 kind,
@@ -2029,10 +2420,14 @@ def recipes_of_adaptations() -> Any:
 
 
 CASES: list[Case] = [
-    value for name, value in list(globals().items())
-    if callable(value) and getattr(value, "__module__", "") == __name__ and not name.startswith("_") and not isinstance(value, type)
+    value
+    for name, value in list(globals().items())
+    if callable(value)
+    and getattr(value, "__module__", "") == __name__
+    and not name.startswith("_")
+    and not isinstance(value, type)
     and name not in ("drawn", "hub_file", "re_first")
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -117,12 +117,23 @@ def sampler_options_and_refusals() -> Any:
         "guidance_scale": [None, 0, 1, 2.5, -1.0, float("nan"), float("inf"), "2", True],
         "sampler": [None, "ddim", 3],
         "num_inference_steps": [
-            None, 1, 0, 100_000, 100_001, [0, 2, 5], (0, 100_000), [0, 100_001], [-1, 2], [], True, 2.0,
+            None,
+            1,
+            0,
+            100_000,
+            100_001,
+            [0, 2, 5],
+            (0, 100_000),
+            [0, 100_001],
+            [-1, 2],
+            [],
+            True,
+            2.0,
             [1, 2.5],
         ],
         "eta": [None, 0, 0.25, 1, 1.01, -0.01, float("inf")],
         "spacing": [None, "linspace", "stride", "cosine"],
-    }  # fmt: skip
+    }
     rows = []
     for name, values in choices.items():
         rows += [
@@ -134,10 +145,12 @@ def sampler_options_and_refusals() -> Any:
 
 def sampler_options_over_defaults() -> Any:
     choices: dict[str, Any] = {
-        "guidance_scale": (None, 0.0, 2.5), "sampler": (None, "ddim"),
-        "num_inference_steps": (None, 10, [0, 3, 7]), "eta": (None, 0.0, 0.5),
+        "guidance_scale": (None, 0.0, 2.5),
+        "sampler": (None, "ddim"),
+        "num_inference_steps": (None, 10, [0, 3, 7]),
+        "eta": (None, 0.0, 0.5),
         "spacing": (None, "stride"),
-    }  # fmt: skip
+    }
     first = combinations(1, 12, **choices)
     second = combinations(2, 12, **choices)
     return [
@@ -202,9 +215,17 @@ SHAPES: list[Any] = [
 def contents_of_schemas() -> Any:
     rows = [outcome(lambda c: schemas.check_shape(c, Small).model_dump(), c) for c in SHAPES]
     closed = [
-        {}, {"latent_dims": 2}, {"xyz": 2}, {"data.crop": 1}, {"latent_dim": "x"},
-        {"inner": {"name": 3}}, {"inner": {"name": "n", "rows": [1]}}, {1: 2}, {"inner": {}}, 3,
-    ]  # fmt: skip
+        {},
+        {"latent_dims": 2},
+        {"xyz": 2},
+        {"data.crop": 1},
+        {"latent_dim": "x"},
+        {"inner": {"name": 3}},
+        {"inner": {"name": "n", "rows": [1]}},
+        {1: 2},
+        {"inner": {}},
+        3,
+    ]
     rows += [outcome(lambda c: schemas.check_shape(c, Closed).model_dump(), c) for c in closed]
     for kind, content in itertools.product(
         (int, float, bool, list[str], dict[str, float | int], str | None),
@@ -220,9 +241,14 @@ def plain_contents_of_files() -> Any:
     for _ in range(60):
         deep = [deep]
     contents: list[dict[str, Any]] = [
-        {"name": "n"}, {"name": "${a}"}, {"name": "n", "rows": deep}, {"name": 1},
-        {"name": "n", "x": {1.5: 2}}, {"name": "n", "x": {3: (1, 2)}}, {"name": "n", "x": {1, 2}},
-    ]  # fmt: skip
+        {"name": "n"},
+        {"name": "${a}"},
+        {"name": "n", "rows": deep},
+        {"name": 1},
+        {"name": "n", "x": {1.5: 2}},
+        {"name": "n", "x": {3: (1, 2)}},
+        {"name": "n", "x": {1, 2}},
+    ]
     return [
         outcome(lambda c: schemas.check_plain(c, Small, Path("m.json")).model_dump(), content)
         for content in contents
@@ -260,10 +286,15 @@ def halves_and_counts_of_values() -> Any:
     drawn = rng.gamma(2.0, 3.0, 41).tolist()
     rows = []
     for row in combinations(
-        5, 60, mean=(None, 5.5, -2.0), ci=(None, 0.25), replications=(None, 0, 1, 2, 3),
-        n=(None, 64), n_per_replication=([], [64], [64, 64], [64, 5, 64]),
+        5,
+        60,
+        mean=(None, 5.5, -2.0),
+        ci=(None, 0.25),
+        replications=(None, 0, 1, 2, 3),
+        n=(None, 64),
+        n_per_replication=([], [64], [64, 64], [64, 5, 64]),
         resampled=([], drawn, [*drawn, None], [None], drawn[:3]),
-    ):  # fmt: skip
+    ):
         value = Value(**row)
         rows.append([value.half, value.counts])
     return rows, [percentiles(drawn[:n], v) for n, v in ((41, 5.5), (7, -1.25), (1, 0.0))]
@@ -302,11 +333,14 @@ def results_of_evaluations() -> Any:
 
 def refused_results() -> Any:
     wrong: list[dict[str, Any]] = [
-        {"seed": 1.5}, {"data": {"dataset": "x", "fingerprint": "y", "frames": [1]}},
+        {"seed": 1.5},
+        {"data": {"dataset": "x", "fingerprint": "y", "frames": [1]}},
         {"data": {"dataset": "x", "fingerprint": "y", "frames": [1, 2, 3]}},
         {"values": {"fid": {"mean": "x", "ci": 1, "replications": 1, "n": 1}}},
-        {"checkpoint": {"path": "x"}}, {"split": None}, {"changed": {"a": [1]}},
-    ]  # fmt: skip
+        {"checkpoint": {"path": "x"}},
+        {"split": None},
+        {"changed": {"a": [1]}},
+    ]
     with workspace():
         rows = []
         for change in wrong:
@@ -317,22 +351,42 @@ def refused_results() -> Any:
 
 def audit_cards() -> Any:
     card: dict[str, Any] = {
-        "format": 1, "extractor": {"sha256": "e", "name": "n"}, "protocol": {"name": "p", "version": 1},
-        "data": {"dataset": "d", "fingerprint": "f"}, "split": "test", "motions": 5, "seed": 0,
-        "resamples": 10, "packages": {}, "metrics": {"fid": False, "x": None},
-        "real": {"fid": [1.0, None]}, "not_computed": {}, "truth": {},
-        "perturbations": [{
-            "name": "noise", "group": "g", "about": "a", "unit": "m",
-            "grades": [{"grade": 1.0, "values": {"fid": [1.0, 2.0, 3.0, None]}}],
-        }],
-    }  # fmt: skip
+        "format": 1,
+        "extractor": {"sha256": "e", "name": "n"},
+        "protocol": {"name": "p", "version": 1},
+        "data": {"dataset": "d", "fingerprint": "f"},
+        "split": "test",
+        "motions": 5,
+        "seed": 0,
+        "resamples": 10,
+        "packages": {},
+        "metrics": {"fid": False, "x": None},
+        "real": {"fid": [1.0, None]},
+        "not_computed": {},
+        "truth": {},
+        "perturbations": [
+            {
+                "name": "noise",
+                "group": "g",
+                "about": "a",
+                "unit": "m",
+                "grades": [{"grade": 1.0, "values": {"fid": [1.0, 2.0, 3.0, None]}}],
+            }
+        ],
+    }
     changes: list[dict[str, Any]] = [
-        {}, {"facts": {"fid": {}}}, {"facts": {"fid": {"exact": True, "unit": "m"}}}, {"real": {"fid": [1.0]}},
-        {"real": {"fid": [1.0, 2.0, 3.0]}}, {"perturbations": []}, {"extra": 1}, {"extractor": None},
+        {},
+        {"facts": {"fid": {}}},
+        {"facts": {"fid": {"exact": True, "unit": "m"}}},
+        {"real": {"fid": [1.0]}},
+        {"real": {"fid": [1.0, 2.0, 3.0]}},
+        {"perturbations": []},
+        {"extra": 1},
+        {"extractor": None},
         {"perturbations": [card["perturbations"][0] | {"grades": []}]},
         {"perturbations": [card["perturbations"][0] | {"grade": 1}]},
         {"facts": {"fid": {"units": "m"}}},
-    ]  # fmt: skip
+    ]
     return [
         outcome(lambda c: schemas.check_shape(c, AuditCard).model_dump(), card | change)
         for change in changes
@@ -344,10 +398,14 @@ def audit_cards() -> Any:
 
 def hints_for_missing_files() -> Any:
     names = (
-        "runs/synthetic/mdm/default/checkpoints/last.ckpt", "runs/mdm/other/checkpoints/last.ckpt",
-        "assets/t2m.pt", "x/assets/y.pt", "runs/a/default/checkpoints", "runs/default/checkpoints/x",
+        "runs/synthetic/mdm/default/checkpoints/last.ckpt",
+        "runs/mdm/other/checkpoints/last.ckpt",
+        "assets/t2m.pt",
+        "x/assets/y.pt",
+        "runs/a/default/checkpoints",
+        "runs/default/checkpoints/x",
         Path("runs/q/default/checkpoints/deep/x.ckpt"),
-    )  # fmt: skip
+    )
     return [runs.made_by(name) for name in names]
 
 
@@ -355,9 +413,13 @@ def contents_of_runs() -> Any:
     with workspace() as folder:
         rows: list[Any] = []
         provenance: dict[str, Any] = {
-            "command": ["x"], "commit": None, "python": "3", "machine": "m", "packages": {},
+            "command": ["x"],
+            "commit": None,
+            "python": "3",
+            "machine": "m",
+            "packages": {},
             "data": {"hours": 2.5, "fingerprint": "f"},
-        }  # fmt: skip
+        }
         variants: list[tuple[dict[str, Any], dict[str, Any] | None]] = [
             ({}, None),
             ({"experiment": None}, provenance),
@@ -386,9 +448,15 @@ def contents_of_runs() -> Any:
             rows.append(run)
             if isinstance(run, runs.Run):
                 rows[-1] = [
-                    run.label, run.samples, run.steps, run.provenance and run.provenance.model_dump(),
-                    list(run.results), [r.seed for r in run.results.values()], run.curves, run.config,
-                ]  # fmt: skip
+                    run.label,
+                    run.samples,
+                    run.steps,
+                    run.provenance and run.provenance.model_dump(),
+                    list(run.results),
+                    [r.seed for r in run.results.values()],
+                    run.curves,
+                    run.config,
+                ]
         Path("empty").mkdir()
         rows += [outcome(runs.read_run, Path("empty")), outcome(runs.check_run, Path("none"))]
         rows += [
@@ -406,13 +474,24 @@ def contents_of_runs() -> Any:
 
 def histories() -> Any:
     good = [
-        {"step": 5, "a": 1.5, "epoch": 0}, {"step": 3, "b": 2, "a": 2.0}, {"step": 5, "a": 3.5},
+        {"step": 5, "a": 1.5, "epoch": 0},
+        {"step": 3, "b": 2, "a": 2.0},
+        {"step": 5, "a": 3.5},
         {"step": 0, "c/d": -1.0},
-    ]  # fmt: skip
+    ]
     bad = (
-        '{"step": 1.0}', '{"step": -1}', '{"a": 1}', '{"step": true}', '{"step": 1, "a": "x"}', "[]",
-        '{"step": 1, "\\ud800": 1}', '{"step": 2', "", '{"step": 1, "a": null}', '{"step": 0, "a": NaN}',
-    )  # fmt: skip
+        '{"step": 1.0}',
+        '{"step": -1}',
+        '{"a": 1}',
+        '{"step": true}',
+        '{"step": 1, "a": "x"}',
+        "[]",
+        '{"step": 1, "\\ud800": 1}',
+        '{"step": 2',
+        "",
+        '{"step": 1, "a": null}',
+        '{"step": 0, "a": NaN}',
+    )
     with workspace():
         rows: list[Any] = [runs.read_history(Path())]
         lines = "".join(json.dumps(line) + "\n" for line in good)
@@ -516,10 +595,15 @@ def written_texts() -> Any:
 def reasons_of_failed_writes() -> Any:
     rows: list[Any] = []
     cases: list[BaseException] = [
-        OSError(errno.EACCES, "denied"), ValueError("a\nb"), OSError(), OSError(errno.ENOSPC, "full"),
-        OSError(errno.EDQUOT, "quota"), OSError(errno.EFBIG, "big"), OSError(errno.EIO, "io"),
+        OSError(errno.EACCES, "denied"),
+        ValueError("a\nb"),
+        OSError(),
+        OSError(errno.ENOSPC, "full"),
+        OSError(errno.EDQUOT, "quota"),
+        OSError(errno.EFBIG, "big"),
+        OSError(errno.EIO, "io"),
         OSError(errno.EROFS, "ro"),
-    ]  # fmt: skip
+    ]
     with workspace() as folder, mock.patch("shutil.disk_usage") as usage:
         usage.return_value.free = 3_456_789
         rows += [safe_io.write_failure(error, Path("gone/x/y")) for error in cases]
@@ -634,9 +718,21 @@ def regular_files() -> Any:
 
 def texts_and_json_of_files() -> Any:
     texts: list[bytes] = [
-        b'{"a": [1, 2.5]}', "ü€".encode(), b"\xff\xfe", b"[NaN]", b"[Infinity]", b"[-Infinity]", b"",
-        rb'["\ud800"]', rb'["\ud83d\ude00"]', b"[" * 99999, b'{"a": 1', b'"\xc3\xbc"', b"12345", b"123456",
-    ]  # fmt: skip
+        b'{"a": [1, 2.5]}',
+        "ü€".encode(),
+        b"\xff\xfe",
+        b"[NaN]",
+        b"[Infinity]",
+        b"[-Infinity]",
+        b"",
+        rb'["\ud800"]',
+        rb'["\ud83d\ude00"]',
+        b"[" * 99999,
+        b'{"a": 1',
+        b'"\xc3\xbc"',
+        b"12345",
+        b"123456",
+    ]
     with workspace():
         rows = []
         for text in texts:
@@ -655,11 +751,27 @@ def texts_and_json_of_files() -> Any:
 
 def yaml_files() -> Any:
     texts = [
-        "a: 1e-4\nb: [1, two, null, true]\nc: ${a}", "", "  \n", "- 1\n- {x: y}", "a: &x [1, 2]\nb: *x",
-        f"a: {'1' * 20}", f"a: {'1' * 21}", f"{'1' * 21}: 2", f"a: x{'1' * 30}", "a: [1", "a: !!python/name:os.system x",
-        "&x [*x]", "a: &a [" + "1," * 400 + "]\nb: &b [" + "*a," * 300 + "]", "a: 2020-01-01", "3",
-        "# c\nx: {y: {z: '1'}}", "a: 'x\\ud800'", 'a: "\\ud800"', "b: .nan", "a: 0x1F\nb: 1_000\nc: on",
-    ]  # fmt: skip
+        "a: 1e-4\nb: [1, two, null, true]\nc: ${a}",
+        "",
+        "  \n",
+        "- 1\n- {x: y}",
+        "a: &x [1, 2]\nb: *x",
+        f"a: {'1' * 20}",
+        f"a: {'1' * 21}",
+        f"{'1' * 21}: 2",
+        f"a: x{'1' * 30}",
+        "a: [1",
+        "a: !!python/name:os.system x",
+        "&x [*x]",
+        "a: &a [" + "1," * 400 + "]\nb: &b [" + "*a," * 300 + "]",
+        "a: 2020-01-01",
+        "3",
+        "# c\nx: {y: {z: '1'}}",
+        "a: 'x\\ud800'",
+        'a: "\\ud800"',
+        "b: .nan",
+        "a: 0x1F\nb: 1_000\nc: on",
+    ]
     with workspace():
         rows = []
         for text in texts:
@@ -684,9 +796,13 @@ def yaml_files() -> Any:
 def _arrays() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     return {
-        "x": rng.normal(size=(3, 2)), "n": np.arange(5, dtype=np.int32), "s": np.array("text"),
-        "e": np.zeros((0, 4)), "f": np.asfortranarray(rng.normal(size=(2, 3))), "scalar": np.array(2.5),
-    }  # fmt: skip
+        "x": rng.normal(size=(3, 2)),
+        "n": np.arange(5, dtype=np.int32),
+        "s": np.array("text"),
+        "e": np.zeros((0, 4)),
+        "f": np.asfortranarray(rng.normal(size=(2, 3))),
+        "scalar": np.array(2.5),
+    }
 
 
 def archives_of_arrays() -> Any:
@@ -734,9 +850,16 @@ def arrays_of_files() -> Any:
                 rows.append(safe_io.read_npy(file))
         good = Path("x.npy").read_bytes()
         for number, content in enumerate(
-            (good + b"0", good[:-1], good[:5], b"", good.replace(b"(3, 2)", b"(3,-2)"), b"\x93NUMPY\x03\x00" + good[8:],
-             good.replace(b"'<f8'", b"'|V0'"))
-        ):  # fmt: skip
+            (
+                good + b"0",
+                good[:-1],
+                good[:5],
+                b"",
+                good.replace(b"(3, 2)", b"(3,-2)"),
+                b"\x93NUMPY\x03\x00" + good[8:],
+                good.replace(b"'<f8'", b"'|V0'"),
+            )
+        ):
             Path("w.npy").write_bytes(content)
             rows.append([number, str(outcome(safe_io.read_npy, Path("w.npy")))[:110]])
         np.save("o.npy", np.array([{}], dtype=object))
@@ -772,11 +895,16 @@ def checked_paths() -> Any:
             outcome(paths.check_tree, Path("none")),
         ]
         links = {
-            "run/wandb/latest-run": "../../other", "run/wandb/debug.log": "../../other/f",
-            "run/wandb/debug-internal.log": "../../other/f", "run/wandb/offline-1/logs/debug-core.log": "/etc/passwd",
-            "run/wandb/offline-1/logs/x.log": "/etc/passwd", "run/sub/in": "..", "run/sub/out": "../../other",
-            "run/wandb/offline-1/debug.log": "/etc/passwd", "run/latest-run": "/etc",
-        }  # fmt: skip
+            "run/wandb/latest-run": "../../other",
+            "run/wandb/debug.log": "../../other/f",
+            "run/wandb/debug-internal.log": "../../other/f",
+            "run/wandb/offline-1/logs/debug-core.log": "/etc/passwd",
+            "run/wandb/offline-1/logs/x.log": "/etc/passwd",
+            "run/sub/in": "..",
+            "run/sub/out": "../../other",
+            "run/wandb/offline-1/debug.log": "/etc/passwd",
+            "run/latest-run": "/etc",
+        }
         for name, target in links.items():
             Path(name).symlink_to(target)
             rows.append([name, outcome(paths.check_tree, Path("run"))])
@@ -821,14 +949,22 @@ def abandoned_files() -> Any:
     machine, other, dead, token = paths.__dict__["_machine"](), "0" * 8, 2**22 + 77, "a" * 16
     tokens: set[str] = paths.__dict__["_tokens"]
     names = {
-        "dead": f".out.{machine}-{dead}-{token}.npz", "self": f".out.{machine}-{os.getpid()}-{token}.npz",
-        "writing": f".out.{machine}-{os.getpid()}-{'b' * 16}.npz", "init": f".out.{machine}-1-{token}.npz",
-        "elsewhere": f".out.{other}-{dead}-{token}.npz", "plain": "out.npz", "short": f".out.{machine}-{dead}-aa.npz",
-        "other": f".else.{machine}-{dead}-{token}.npz", "suffix": f".out.{machine}-{dead}-{token}.txt",
-        "bare": f".out.{machine}-{dead}-{token}", "huge": f".out.{machine}-9999999999-{token}.npz",
-        "two": f".a.b.{machine}-{dead}-{token}.x.y", "upper": f".out.{machine}-{dead}-{'A' * 16}.npz",
-        "parent": f".out.{machine}-{os.getppid()}-{token}.npz", "long": f".{'l' * 80}.{machine}-{dead}-{token}.npz",
-    }  # fmt: skip
+        "dead": f".out.{machine}-{dead}-{token}.npz",
+        "self": f".out.{machine}-{os.getpid()}-{token}.npz",
+        "writing": f".out.{machine}-{os.getpid()}-{'b' * 16}.npz",
+        "init": f".out.{machine}-1-{token}.npz",
+        "elsewhere": f".out.{other}-{dead}-{token}.npz",
+        "plain": "out.npz",
+        "short": f".out.{machine}-{dead}-aa.npz",
+        "other": f".else.{machine}-{dead}-{token}.npz",
+        "suffix": f".out.{machine}-{dead}-{token}.txt",
+        "bare": f".out.{machine}-{dead}-{token}",
+        "huge": f".out.{machine}-9999999999-{token}.npz",
+        "two": f".a.b.{machine}-{dead}-{token}.x.y",
+        "upper": f".out.{machine}-{dead}-{'A' * 16}.npz",
+        "parent": f".out.{machine}-{os.getppid()}-{token}.npz",
+        "long": f".{'l' * 80}.{machine}-{dead}-{token}.npz",
+    }
     rows: list[Any] = []
     for path, is_locked in itertools.product(
         (None, "out.npz", "out", "l" * 99 + ".npz", "a.b.y"), (None, False, True)
@@ -883,9 +1019,13 @@ def names_of_temporary_files() -> Any:
 
 
 CASES: list[Case] = [
-    value for name, value in list(globals().items())
-    if callable(value) and getattr(value, "__module__", "") == __name__ and not name.startswith("_") and not isinstance(value, type)
-]  # fmt: skip
+    value
+    for name, value in list(globals().items())
+    if callable(value)
+    and getattr(value, "__module__", "") == __name__
+    and not name.startswith("_")
+    and not isinstance(value, type)
+]
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -34,11 +34,26 @@ def plain_configurations() -> Any:
         return value
 
     values: list[Any] = [
-        {"a": [1, 2.5, None, True, "x"]}, {"a": "${b}"}, {"a": "${run.dir}/x"}, {"a": "x${run.dir}"},
-        {"a": "${run.dir}${c}"}, "${x}", {"${k}": 1}, {1.5: 2}, {"a": {None: 1}}, {2: (1, "s")}, {1, 2},
-        {"a": {"b": np.float64(1)}}, {"a": {"b": b"x"}}, {"a": [[object]]}, cyclic,
-        nested(49), nested(50), nested(51), "${" + "x" * 99,
-    ]  # fmt: skip
+        {"a": [1, 2.5, None, True, "x"]},
+        {"a": "${b}"},
+        {"a": "${run.dir}/x"},
+        {"a": "x${run.dir}"},
+        {"a": "${run.dir}${c}"},
+        "${x}",
+        {"${k}": 1},
+        {1.5: 2},
+        {"a": {None: 1}},
+        {2: (1, "s")},
+        {1, 2},
+        {"a": {"b": np.float64(1)}},
+        {"a": {"b": b"x"}},
+        {"a": [[object]]},
+        cyclic,
+        nested(49),
+        nested(50),
+        nested(51),
+        "${" + "x" * 99,
+    ]
     rows: list[Any] = [building.MOST_VALUES, building.MOST_LEVELS]
     with mock.patch.object(building, "MOST_VALUES", 21):
         rows += [outcome(building.plain, [0] * size, "f.yaml") for size in (9, 10, 11)]
@@ -66,9 +81,14 @@ def renamed_classes() -> Any:
 
 def saved_configurations() -> Any:
     texts = [
-        "run: {dir: r, name: 3}\na: ${run.dir}/x", "run: {}\na: x${run.dir}", "a: 1", "run: 3", "- 1", "",
+        "run: {dir: r, name: 3}\na: ${run.dir}/x",
+        "run: {}\na: x${run.dir}",
+        "a: 1",
+        "run: 3",
+        "- 1",
+        "",
         "run: {}\ntask: {_target_: flame_mdm.task.MotionGeneration}\nbase: x",
-    ]  # fmt: skip
+    ]
     with workspace():
         rows = []
         for text in texts:
@@ -101,9 +121,12 @@ def moved_paths() -> Any:
         {"/a": "/a/b/q"},
     ]
     config = {
-        "run": {"dir": "/runs/q", "name": "/runs/q"}, "x": "/runs/q/y", "z": {"w": "/runs/q", "v": "/runs/qq"},
-        "l": ["/runs/q"], "n": 3,
-    }  # fmt: skip
+        "run": {"dir": "/runs/q", "name": "/runs/q"},
+        "x": "/runs/q/y",
+        "z": {"w": "/runs/q", "v": "/runs/qq"},
+        "l": ["/runs/q"],
+        "n": 3,
+    }
     flat = [{}, {"a": {}}, {"a": {"b": {"c": 1, "d": [1, {"x": 2}]}, "e": None}, "f": 2}, 3]
     return [
         [building.moved(value, folders) for value in values],
@@ -117,13 +140,30 @@ def instances() -> Any:
     rows: list[Any] = []
     nodes: list[Any] = [
         {"_target_": "collections.Counter", "a": 2, "b": [1, (2,)]},
-        {"_target_": "builtins.dict", "x": {"_target_": "builtins.dict", "y": 1}, "l": [{"_target_": "builtins.list"}]},
-        {"_target_": "builtins.dict", "_recursive_": False, "x": {"_target_": "builtins.list", "y": [1]}},
-        {"_target_": "builtins.dict", "_recursive_": True, "m": {"q": ({"_target_": "builtins.list"},)}},
-        {"a": 1}, {"_target_": 3}, [1], {"_target_": "fractions.Fraction", "numerator": 3, "denominator": 0},
-        {"_target_": "fractions.Fraction", "nume": 3}, {"_target_": "flame_mdm.none.X"}, {"_target_": "plain"},
+        {
+            "_target_": "builtins.dict",
+            "x": {"_target_": "builtins.dict", "y": 1},
+            "l": [{"_target_": "builtins.list"}],
+        },
+        {
+            "_target_": "builtins.dict",
+            "_recursive_": False,
+            "x": {"_target_": "builtins.list", "y": [1]},
+        },
+        {
+            "_target_": "builtins.dict",
+            "_recursive_": True,
+            "m": {"q": ({"_target_": "builtins.list"},)},
+        },
+        {"a": 1},
+        {"_target_": 3},
+        [1],
+        {"_target_": "fractions.Fraction", "numerator": 3, "denominator": 0},
+        {"_target_": "fractions.Fraction", "nume": 3},
+        {"_target_": "flame_mdm.none.X"},
+        {"_target_": "plain"},
         {"_target_": "flame_mdm.sampler_options.SamplerOptions", "eta": 3},
-    ]  # fmt: skip
+    ]
     for node in nodes:
         rows.append(outcome(building.instantiate, node))
     crop = {"_target_": "flame_mdm.sampler_options.SamplerOptions", "eta": 0.5, "sampler": "ddim"}
@@ -150,12 +190,26 @@ def instances() -> Any:
 def trusted_configurations() -> Any:
     rows: list[Any] = []
     targets = (
-        "flame_mdm.task.GeneratorTask", "flame_mdm.training.adaptation.AdaptationTask", "torch.optim.AdamW",
-        "torch.optim.adamw.AdamW", "flame_mdm.denoisers.mdm.MDMEncoder", "flame_mdm.denoisers.MDMEncoder",
-        "flame_mdm.denoisers.mdm.ceil_div", "os.system", "mine.Net", "flame_mdm.safe_io.write_text", "",
-        "flame_mdm.processes.diffusion.Diffusion", "flame_mdm.processes.Diffusion", "flame_mdm.denoisersx.X", 3, None,
-        "flame_mdm.conditions.clip.CLIPTokens", "flame_mdm.representations.smpl.SMPL", "flame_mdm.task.Tensor",
-    )  # fmt: skip
+        "flame_mdm.task.GeneratorTask",
+        "flame_mdm.training.adaptation.AdaptationTask",
+        "torch.optim.AdamW",
+        "torch.optim.adamw.AdamW",
+        "flame_mdm.denoisers.mdm.MDMEncoder",
+        "flame_mdm.denoisers.MDMEncoder",
+        "flame_mdm.denoisers.mdm.ceil_div",
+        "os.system",
+        "mine.Net",
+        "flame_mdm.safe_io.write_text",
+        "",
+        "flame_mdm.processes.diffusion.Diffusion",
+        "flame_mdm.processes.Diffusion",
+        "flame_mdm.denoisersx.X",
+        3,
+        None,
+        "flame_mdm.conditions.clip.CLIPTokens",
+        "flame_mdm.representations.smpl.SMPL",
+        "flame_mdm.task.Tensor",
+    )
     for part, target in itertools.product(
         ("task", "denoiser", "optimizer", "process", "other"), targets
     ):
@@ -179,16 +233,65 @@ def trusted_configurations() -> Any:
 
 
 KINDS = (
-    "int", "float", "bool", "str", "None", "int | None", "str | int | float", "list[str]", "Sequence[int | None]",
-    "tuple[float, float]", "tuple[int, ...]", "Literal['a', 'b', 1]", "Literal['a']", "dict[str, Any]",
-    "Mapping[str, int]", "Optional[int]", "Union[str, list[int]]", "Tensor | float", "Tensor", "Any", "",
-    "'int | str'", "torch.Tensor", "Tuple[int, str]", "List[list[int]]", "Metric", "nn.Module | None", "int | Sequence[int]",
-    "tuple[Tensor | int, bool]", "Callable[[int], int]", "lowercase", "typing.Literal['x']", "tuple[int]", "T | bool",
-)  # fmt: skip
+    "int",
+    "float",
+    "bool",
+    "str",
+    "None",
+    "int | None",
+    "str | int | float",
+    "list[str]",
+    "Sequence[int | None]",
+    "tuple[float, float]",
+    "tuple[int, ...]",
+    "Literal['a', 'b', 1]",
+    "Literal['a']",
+    "dict[str, Any]",
+    "Mapping[str, int]",
+    "Optional[int]",
+    "Union[str, list[int]]",
+    "Tensor | float",
+    "Tensor",
+    "Any",
+    "",
+    "'int | str'",
+    "torch.Tensor",
+    "Tuple[int, str]",
+    "List[list[int]]",
+    "Metric",
+    "nn.Module | None",
+    "int | Sequence[int]",
+    "tuple[Tensor | int, bool]",
+    "Callable[[int], int]",
+    "lowercase",
+    "typing.Literal['x']",
+    "tuple[int]",
+    "T | bool",
+)
 VALUES: tuple[Any, ...] = (
-    1, 1.5, True, "a", "x", None, [1, 2], ["a"], [1.5, 2.5], [1, None], [], [1, "a"], {"a": 1},
-    {"_target_": "x"}, float("nan"), float("inf"), [[1], [2, "b"]], (1, 2.5, 3), [1, True], [float("nan"), 1.0], 0, "",
-)  # fmt: skip
+    1,
+    1.5,
+    True,
+    "a",
+    "x",
+    None,
+    [1, 2],
+    ["a"],
+    [1.5, 2.5],
+    [1, None],
+    [],
+    [1, "a"],
+    {"a": 1},
+    {"_target_": "x"},
+    float("nan"),
+    float("inf"),
+    [[1], [2, "b"]],
+    (1, 2.5, 3),
+    [1, True],
+    [float("nan"), 1.0],
+    0,
+    "",
+)
 
 
 def kinds_of_values() -> Any:
@@ -250,9 +353,26 @@ def signatures_of_sources() -> Any:
         Path("recorded_broken.py").write_text("def x(:")
         rows: list[Any] = []
         for name in (
-            "inside", "InTry", "InExcept", "in_with", "Base", "Passing", "Plain", "Closed", "Generic", "Two", "Loop",
-            "Data", "NotData", "nested", "outer", "waits", "Ratio", "Path", "none",
-        ):  # fmt: skip
+            "inside",
+            "InTry",
+            "InExcept",
+            "in_with",
+            "Base",
+            "Passing",
+            "Plain",
+            "Closed",
+            "Generic",
+            "Two",
+            "Loop",
+            "Data",
+            "NotData",
+            "nested",
+            "outer",
+            "waits",
+            "Ratio",
+            "Path",
+            "none",
+        ):
             rows.append([name, outcome(signatures.parameters, f"recorded_own.deep.{name}")])
             rows.append(outcome(signatures.__dict__["_signature"], f"recorded_own.deep.{name}"))
         for name in ("Again", "R", "deep"):
@@ -286,39 +406,98 @@ def signatures_of_sources() -> Any:
 def checked_configurations() -> Any:
     net = {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"}
     configs: list[Any] = [
-        {"denoiser": net}, {"denoiser": net | {"latent_dim": 8}}, {"denoiser": net | {"latent_dim": "8"}},
-        {"denoiser": net | {"latnt_dim": 8}}, {"denoiser": net | {"_x": 8}}, {"denoiser": {"_target_": None}},
-        {"a": {"b": [net, net | {"layers": 1}]}}, {"denoiser": {"_target_": "flame_mdm.none.X"}},
-        {"d": {"_target_": "gone_package.X"}}, {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "q": 1}, net | {"dropout": None},
-    ]  # fmt: skip
+        {"denoiser": net},
+        {"denoiser": net | {"latent_dim": 8}},
+        {"denoiser": net | {"latent_dim": "8"}},
+        {"denoiser": net | {"latnt_dim": 8}},
+        {"denoiser": net | {"_x": 8}},
+        {"denoiser": {"_target_": None}},
+        {"a": {"b": [net, net | {"layers": 1}]}},
+        {"denoiser": {"_target_": "flame_mdm.none.X"}},
+        {"d": {"_target_": "gone_package.X"}},
+        {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "q": 1},
+        net | {"dropout": None},
+    ]
     return [outcome(signatures.check, config) for config in configs]
 
 
 def checked_top_levels() -> Any:
     generation = {"_target_": "flame_mdm.task.GeneratorTask"}
     configs: list[dict[str, Any]] = [
-        {}, {"seed": 1.5}, {"seed": True}, {"run": {"name": 3, "dir": 4}}, {"run": {"speed": None}}, {"run": 3},
-        {"callbacks": None}, {"losses": None}, {"losses": None, "task": generation}, {"losses": None, "task": None},
-        {"losses": {"joints": 1.0}}, {"losses": {"joint": 1.0}}, {"losses": {"feet": [1]}}, {"losses": {"joints": "x"}},
-        {"ema": {"decay": 0.5}}, {"ema": {"decays": 1}}, {"ema": {"decay": None}}, {"ema": 3}, {"lr_warmup": 1.5},
-        {"lr_decay": 1}, {"logger": None, "experiment": None}, {"sed": 1}, {"callback": {}}, {"my_own": 1},
-        {"initial_weight": 1}, {"losses": None, "task": {"_target_": "flame_mdm.metrics.x"}}, {"data_root": 3}, {"ema": {}},
-    ]  # fmt: skip
+        {},
+        {"seed": 1.5},
+        {"seed": True},
+        {"run": {"name": 3, "dir": 4}},
+        {"run": {"speed": None}},
+        {"run": 3},
+        {"callbacks": None},
+        {"losses": None},
+        {"losses": None, "task": generation},
+        {"losses": None, "task": None},
+        {"losses": {"joints": 1.0}},
+        {"losses": {"joint": 1.0}},
+        {"losses": {"feet": [1]}},
+        {"losses": {"joints": "x"}},
+        {"ema": {"decay": 0.5}},
+        {"ema": {"decays": 1}},
+        {"ema": {"decay": None}},
+        {"ema": 3},
+        {"lr_warmup": 1.5},
+        {"lr_decay": 1},
+        {"logger": None, "experiment": None},
+        {"sed": 1},
+        {"callback": {}},
+        {"my_own": 1},
+        {"initial_weight": 1},
+        {"losses": None, "task": {"_target_": "flame_mdm.metrics.x"}},
+        {"data_root": 3},
+        {"ema": {}},
+    ]
     return [outcome(signatures.check_top_level, config) for config in configs]
 
 
 def kinds_that_stay_the_same() -> Any:
     base: dict[str, Any] = {
-        "a": 1, "b": "x", "c": {"d": 1.5, "e": None}, "part": {"_target_": "x", "k": 1, "deep": {"z": 1}},
-        "callbacks": {"s": {"_target_": "y"}, "n": 3}, "l": [1], "flag": True, "run": {"q": 1}, "losses": {"j": 0.5},
+        "a": 1,
+        "b": "x",
+        "c": {"d": 1.5, "e": None},
+        "part": {"_target_": "x", "k": 1, "deep": {"z": 1}},
+        "callbacks": {"s": {"_target_": "y"}, "n": 3},
+        "l": [1],
+        "flag": True,
+        "run": {"q": 1},
+        "losses": {"j": 0.5},
         "outer": {"inner": {"v": 2, "_target_": "p"}},
-    }  # fmt: skip
+    }
     changes: list[dict[str, Any]] = [
-        {}, {"a": 1.5}, {"a": "1"}, {"a": True}, {"b": 3}, {"b": 2.5}, {"b": True}, {"b": None}, {"c": None}, {"c": 3},
-        {"c": {"d": 1}}, {"c": {"d": 1, "e": [1]}}, {"c": {"e": 1}}, {"part": {"_target_": "x"}}, {"part": None}, {"part": {"k": "s"}},
-        {"callbacks": None}, {"callbacks": {"n": 3}}, {"callbacks": {"s": None}}, {"l": 3}, {"flag": 1}, {"run": None},
-        {"losses": None}, {"losses": 3}, {"outer": {"inner": {"v": "x"}}}, {"outer": {}}, {"outer": {"inner": 2}},
-    ]  # fmt: skip
+        {},
+        {"a": 1.5},
+        {"a": "1"},
+        {"a": True},
+        {"b": 3},
+        {"b": 2.5},
+        {"b": True},
+        {"b": None},
+        {"c": None},
+        {"c": 3},
+        {"c": {"d": 1}},
+        {"c": {"d": 1, "e": [1]}},
+        {"c": {"e": 1}},
+        {"part": {"_target_": "x"}},
+        {"part": None},
+        {"part": {"k": "s"}},
+        {"callbacks": None},
+        {"callbacks": {"n": 3}},
+        {"callbacks": {"s": None}},
+        {"l": 3},
+        {"flag": 1},
+        {"run": None},
+        {"losses": None},
+        {"losses": 3},
+        {"outer": {"inner": {"v": "x"}}},
+        {"outer": {}},
+        {"outer": {"inner": 2}},
+    ]
     rows = [outcome(signatures.check_same_kinds, base, base | change) for change in changes]
     for name in base:
         lacking = {key: value for key, value in base.items() if key != name}
@@ -339,14 +518,32 @@ def kinds_that_stay_the_same() -> Any:
 
 def unknown_keys() -> Any:
     config = {
-        "denoiser": {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "latent_dim": 1, "num_heads": 1},
-        "optimizer": {"lr": 1.0}, "trainer": {"max_steps": 1, "limit": 2}, "list": [{"depth": 1}],
-    }  # fmt: skip
+        "denoiser": {
+            "_target_": "flame_mdm.denoisers.mdm.MDMEncoder",
+            "latent_dim": 1,
+            "num_heads": 1,
+        },
+        "optimizer": {"lr": 1.0},
+        "trainer": {"max_steps": 1, "limit": 2},
+        "list": [{"depth": 1}],
+    }
     rows = []
     for key in (
-        "data.x", "datas.x", "denoiser.latent", "denoiser.dropot", "max_steps", "lr", "optimizer.lrr", "xyzzy", "list.0.dept",
-        "trainer.max_step.x", "a.depth", "data", "denoiser.latent_dim", "num_head",
-    ):  # fmt: skip
+        "data.x",
+        "datas.x",
+        "denoiser.latent",
+        "denoiser.dropot",
+        "max_steps",
+        "lr",
+        "optimizer.lrr",
+        "xyzzy",
+        "list.0.dept",
+        "trainer.max_step.x",
+        "a.depth",
+        "data",
+        "denoiser.latent_dim",
+        "num_head",
+    ):
         parts = key.split(".")
         for depth in range(len(parts)):
             node: Any = config
@@ -379,8 +576,20 @@ def quoted_and_parsed_words() -> Any:
     ]
     quoted = [composition.quoted(word) for word in words]
     rows: list[Any] = [quoted, [composition.parse([word])[0].value() for word in quoted]]
-    for line in ("a=1,2", "a=1", "seed=range(1,4)", "denoiser=glob(mdm_*_small)", "denoiser=glob(zz*)", "a=[1,2]", "~a", "+b=2,3",
-                 "denoiser=glob(*,exclude=[m*,d*])", "++c=x", "a=choice(x,y)", "a=null"):  # fmt: skip
+    for line in (
+        "a=1,2",
+        "a=1",
+        "seed=range(1,4)",
+        "denoiser=glob(mdm_*_small)",
+        "denoiser=glob(zz*)",
+        "a=[1,2]",
+        "~a",
+        "+b=2,3",
+        "denoiser=glob(*,exclude=[m*,d*])",
+        "++c=x",
+        "a=choice(x,y)",
+        "a=null",
+    ):
         override = composition.parse([line])[0]
         rows.append([line, composition.choices(override), composition.first_choice(override)])
     for line in (["a b"], ["=x"], ["a=[1"], ["a=1", "b={"], []):
@@ -391,22 +600,48 @@ def quoted_and_parsed_words() -> Any:
 def composed_recipes() -> Any:
     rows: list[Any] = []
     for name, *words in (
-        ("quickstart",), ("humanml3d/mfm", "optimizer.lr=1e-3", "seed=3"), ("synthetic/dip", "denoiser=dip", "ema=null"),
-        ("quickstart", "condition=none", "denoiser.latent_dim=8", "denoiser.dropout=0.5", "~callbacks.best"),
-        ("quickstart_distilled", "++losses.joints=1.5", "lr_decay=0.25", "data.num_workers=0", "run.name=a"),
-    ):  # fmt: skip
+        ("quickstart",),
+        ("humanml3d/mfm", "optimizer.lr=1e-3", "seed=3"),
+        ("synthetic/dip", "denoiser=dip", "ema=null"),
+        (
+            "quickstart",
+            "condition=none",
+            "denoiser.latent_dim=8",
+            "denoiser.dropout=0.5",
+            "~callbacks.best",
+        ),
+        (
+            "quickstart_distilled",
+            "++losses.joints=1.5",
+            "lr_decay=0.25",
+            "data.num_workers=0",
+            "run.name=a",
+        ),
+    ):
         with mock.patch.dict(os.environ, {}):
             os.environ.pop("FLAME_MDM_DATA", None)
             rows.append(
                 outcome(lambda n, w: building.flatten(composition.compose(n, w)), name, words)
             )
     for name, words in (
-        ("quickstat", []), ("gone.yaml", []), ("quickstart", ["denoiser=mdm"]), ("quickstart", ["denoiser.latnt_dim=3"]),
-        ("quickstart", ["seed=x"]), ("quickstart", ["optimizer.lr=x"]), ("quickstart", ["launch=slurmy"]),
-        ("quickstart", ["callbacks.samples.prompts.0=x"]), ("quickstart", ["callbacks.samples.prompts.99=x"]), ("quickstart", ["a"]),
-        ("quickstart", ["run.nam=x"]), ("quickstart", ["~seed"]), ("quickstart", ["xyz=1"]), ("quickstart", ["callbacks=null"]),
-        ("quickstart", ["data.sourc.clips=3"]), ("quickstart", ["denoiser.latent_dim=1.5"]), ("quickstart", ["~denoiser"]),
-    ):  # fmt: skip
+        ("quickstat", []),
+        ("gone.yaml", []),
+        ("quickstart", ["denoiser=mdm"]),
+        ("quickstart", ["denoiser.latnt_dim=3"]),
+        ("quickstart", ["seed=x"]),
+        ("quickstart", ["optimizer.lr=x"]),
+        ("quickstart", ["launch=slurmy"]),
+        ("quickstart", ["callbacks.samples.prompts.0=x"]),
+        ("quickstart", ["callbacks.samples.prompts.99=x"]),
+        ("quickstart", ["a"]),
+        ("quickstart", ["run.nam=x"]),
+        ("quickstart", ["~seed"]),
+        ("quickstart", ["xyz=1"]),
+        ("quickstart", ["callbacks=null"]),
+        ("quickstart", ["data.sourc.clips=3"]),
+        ("quickstart", ["denoiser.latent_dim=1.5"]),
+        ("quickstart", ["~denoiser"]),
+    ):
         config = outcome(composition.compose, name, words)
         rows.append(config if isinstance(config, str) else len(building.flatten(config)))
     rows.append(composition.compose_data("synthetic"))
@@ -418,8 +653,15 @@ def composed_recipes() -> Any:
 def prepared_overrides() -> Any:
     source = composition.find_recipe("quickstart")
     rows: list[Any] = [list(source)[1:]]
-    for words in ([], ["seed=3"], ["denoiser=mdm_encoder,mdm_gru", "denoiser.latent_dim=1,2"], ["denoiser.dropout=0.5"], ["hydra.x=1"],
-                  ["++a.b=1", "~ema", "+c=2"], ["trainer.limit_val_batches=2", "callbacks.samples.prompts.0=x"]):  # fmt: skip
+    for words in (
+        [],
+        ["seed=3"],
+        ["denoiser=mdm_encoder,mdm_gru", "denoiser.latent_dim=1,2"],
+        ["denoiser.dropout=0.5"],
+        ["hydra.x=1"],
+        ["++a.b=1", "~ema", "+c=2"],
+        ["trainer.limit_val_batches=2", "callbacks.samples.prompts.0=x"],
+    ):
         prepared = outcome(composition.prepare_overrides, source, words)
         rows.append(prepared if isinstance(prepared, str) else [prepared[0], len(prepared[1])])
     rows.append(composition.prepare_overrides(source, [], ["first=1"])[0])
@@ -429,8 +671,11 @@ def prepared_overrides() -> Any:
 def own_recipes() -> Any:
     texts = {
         "saved.yaml": "run: {dir: r}\nseed: 0\na: ${run.dir}/x\ntask: {_target_: flame_mdm.task.MotionGeneration}",
-        "bad.yml": "a: ${oc.env:HOME}", "list.yaml": "- 1", "missing.yaml": "a: ???\nrun: {}", "ring.yaml": "a: ${b}\nb: ${a}\ndefaults: []",
-    }  # fmt: skip
+        "bad.yml": "a: ${oc.env:HOME}",
+        "list.yaml": "- 1",
+        "missing.yaml": "a: ???\nrun: {}",
+        "ring.yaml": "a: ${b}\nb: ${a}\ndefaults: []",
+    }
     with workspace() as folder:
         rows: list[Any] = []
         for name, text in texts.items():
@@ -489,12 +734,45 @@ class Simple:
 
 
 LINES = [
-    ["x"], [], ["x", "a", "b c"], ["x", "names=a 'b c'"], ["source=x"], ["x", "source=y"], ["x", "a", "names=b"], ["x", "size=2.5"],
-    ["x", "size=0"], ["x", "size=null"], ["x", "size=abc"], ["x", "steps=[1,2]"], ["x", "steps=1,2"], ["x", "steps=x"], ["x", "text=null"],
-    ["x", "text=it's, [a"], ["x", "names="], ["x", "names='a"], ["x", "names=a ''"], ["x", "-v"], ["x", "--flag"], ["x", "=3"], ["x", "seed=1", "late"],
-    ["x", "sed=1"], ["x", "hidden=1"], ["x", "a.b=1"], ["x", "denoiser=mdm_gru"], ["x", "shared=false"], ["x", "shared=1"], ["x", "seed=null"],
-    ["x", "seed=1.5"], ["x", "composed=1"], ["x=1"], ["here/a=b", "n"], ["source=null"], ["x", "size=nan"], ["x", "text="], ["x", "names=[a,b]"],
-]  # fmt: skip
+    ["x"],
+    [],
+    ["x", "a", "b c"],
+    ["x", "names=a 'b c'"],
+    ["source=x"],
+    ["x", "source=y"],
+    ["x", "a", "names=b"],
+    ["x", "size=2.5"],
+    ["x", "size=0"],
+    ["x", "size=null"],
+    ["x", "size=abc"],
+    ["x", "steps=[1,2]"],
+    ["x", "steps=1,2"],
+    ["x", "steps=x"],
+    ["x", "text=null"],
+    ["x", "text=it's, [a"],
+    ["x", "names="],
+    ["x", "names='a"],
+    ["x", "names=a ''"],
+    ["x", "-v"],
+    ["x", "--flag"],
+    ["x", "=3"],
+    ["x", "seed=1", "late"],
+    ["x", "sed=1"],
+    ["x", "hidden=1"],
+    ["x", "a.b=1"],
+    ["x", "denoiser=mdm_gru"],
+    ["x", "shared=false"],
+    ["x", "shared=1"],
+    ["x", "seed=null"],
+    ["x", "seed=1.5"],
+    ["x", "composed=1"],
+    ["x=1"],
+    ["here/a=b", "n"],
+    ["source=null"],
+    ["x", "size=nan"],
+    ["x", "text="],
+    ["x", "names=[a,b]"],
+]
 
 
 def settings_of_command_lines() -> Any:
@@ -526,10 +804,18 @@ def settings_of_command_lines() -> Any:
 def runs_of_commands() -> Any:
     def act(settings: Any) -> None:
         actions: dict[str, BaseException] = {
-            "user": errors.UserError("x:\ny\nz"), "bug": ValueError("bug"), "exit": SystemExit(7), "none": SystemExit(),
-            "stop": KeyboardInterrupt(), "memory": MemoryError(), "torch": RuntimeError("DefaultCPUAllocator: can't allocate memory"),
-            "gone": FileNotFoundError("no file"), "os": OSError(2, "No such", "f"), "full": OSError(errno.ENOSPC, "full"), "bare": OSError("odd"),
-        }  # fmt: skip
+            "user": errors.UserError("x:\ny\nz"),
+            "bug": ValueError("bug"),
+            "exit": SystemExit(7),
+            "none": SystemExit(),
+            "stop": KeyboardInterrupt(),
+            "memory": MemoryError(),
+            "torch": RuntimeError("DefaultCPUAllocator: can't allocate memory"),
+            "gone": FileNotFoundError("no file"),
+            "os": OSError(2, "No such", "f"),
+            "full": OSError(errno.ENOSPC, "full"),
+            "bare": OSError("odd"),
+        }
         errors.say(f"acts on {settings.source}")
         if settings.source in actions:
             raise actions[settings.source]
@@ -571,9 +857,15 @@ def runs_of_commands() -> Any:
 
 def variables_of_make() -> Any:
     flags = [
-        "", "k", "k -- EXP=q SEED=3", " -- out=a\\ b EXP=x", "k -- B=1 A=2 EXP=e", " -- P=$$HOME Mixed=3 PYTHON=p VENV=v", "-- X=1",
+        "",
+        "k",
+        "k -- EXP=q SEED=3",
+        " -- out=a\\ b EXP=x",
+        "k -- B=1 A=2 EXP=e",
+        " -- P=$$HOME Mixed=3 PYTHON=p VENV=v",
+        "-- X=1",
         "w -- a=x\\\\y -- b=2",
-    ]  # fmt: skip
+    ]
     rows = []
     for value in flags:
         with mock.patch.dict(os.environ, {"MAKEFLAGS": value}):
@@ -592,11 +884,22 @@ def sweeps_of_commands() -> Any:
             raise SystemExit(143)
 
     lines = [
-        ["x", "seed=1"], ["x", "seed=1,2", "-m"], ["x", "seed=1,2"], ["x,y", "seed=1,5,3", "--multirun"], ["x", "seed=1,9,3", "-m"],
-        ["x", "seed=1,2", "steps=3,4", "text=a,b", "-m"], ["x", "seed=1,2", "out=o", "-m"], ["x", "seed=1", "out=o", "-m"], ["x", "seed=1,z", "-m"],
-        ["x", "denoiser=glob(mdm_gru*)", "-m"], ["-h", "-m"], ["x", "late", "word", "-m"], ["x", "seed=range(1,4)", "a.b=1,2", "-m"],
-        ["x", "launch=none"], ["x", "seed=1,2", "hydra.x=1", "launch=slurmy"],
-    ]  # fmt: skip
+        ["x", "seed=1"],
+        ["x", "seed=1,2", "-m"],
+        ["x", "seed=1,2"],
+        ["x,y", "seed=1,5,3", "--multirun"],
+        ["x", "seed=1,9,3", "-m"],
+        ["x", "seed=1,2", "steps=3,4", "text=a,b", "-m"],
+        ["x", "seed=1,2", "out=o", "-m"],
+        ["x", "seed=1", "out=o", "-m"],
+        ["x", "seed=1,z", "-m"],
+        ["x", "denoiser=glob(mdm_gru*)", "-m"],
+        ["-h", "-m"],
+        ["x", "late", "word", "-m"],
+        ["x", "seed=range(1,4)", "a.b=1,2", "-m"],
+        ["x", "launch=none"],
+        ["x", "seed=1,2", "hydra.x=1", "launch=slurmy"],
+    ]
     with workspace():
         return [printed(jobs.run_jobs, act, Command, line) for line in lines]
 
@@ -617,12 +920,26 @@ def command_lines_of_training() -> Any:
             raise errors.UserError("five")
 
     lines = [
-        [], ["-h"], ["quickstart"], ["quickstart", "seed=3"], ["quickstart", "seed=1,2"], ["seed=3"], ["-m"], ["quickstart", "-x"],
-        ["quickstart", "seed=5"], ["quickstart", "seed=-1"], ["quickstart", "seed=4294967296"], ["quickstart", "denoiser.latent_dim=-8"],
-        ["quickstart", "trainer.log_every_n_steps=0"], ["quickstart", "trainer.val_check_interval=0.5"], ["quickstart", "trainer.accumulate_grad_batches=-1"],
-        ["quickstart", "launch=local", "trainer.devices=2"], ["quickstart", "run.dir="], ["quickstart", "seed=7", "denoiser=mdm_gru", "run.name=z"],
+        [],
+        ["-h"],
+        ["quickstart"],
+        ["quickstart", "seed=3"],
+        ["quickstart", "seed=1,2"],
+        ["seed=3"],
+        ["-m"],
+        ["quickstart", "-x"],
+        ["quickstart", "seed=5"],
+        ["quickstart", "seed=-1"],
+        ["quickstart", "seed=4294967296"],
+        ["quickstart", "denoiser.latent_dim=-8"],
+        ["quickstart", "trainer.log_every_n_steps=0"],
+        ["quickstart", "trainer.val_check_interval=0.5"],
+        ["quickstart", "trainer.accumulate_grad_batches=-1"],
+        ["quickstart", "launch=local", "trainer.devices=2"],
+        ["quickstart", "run.dir="],
+        ["quickstart", "seed=7", "denoiser=mdm_gru", "run.name=z"],
         ["quickstart", "launch=slurm"],
-    ]  # fmt: skip
+    ]
     rows: list[Any] = []
     with (
         workspace() as folder,
@@ -639,18 +956,38 @@ def command_lines_of_training() -> Any:
 
 def incomplete_recipes() -> Any:
     whole: dict[str, Any] = {
-        "experiment": "e", "seed": 0, "ema": None, "logger": None, "run": {"dir": "r"}, "callbacks": {}, "trainer": {"_target_": "t", "max_steps": 1},
+        "experiment": "e",
+        "seed": 0,
+        "ema": None,
+        "logger": None,
+        "run": {"dir": "r"},
+        "callbacks": {},
+        "trainer": {"_target_": "t", "max_steps": 1},
         **{part: {"_target_": "t"} for part in ("data", "representation", "task", "optimizer")},
-    }  # fmt: skip
+    }
     check_whole = sweeps.__dict__["_check_whole"]
     rows = [
         outcome(check_whole, {k: v for k, v in whole.items() if k != name}, "n") for name in whole
     ]
     changes: list[dict[str, Any]] = [
-        {}, {"run": {}}, {"run": {"dir": ""}}, {"trainer": {"_target_": "t"}}, {"trainer": {"max_steps": 1}}, {"task": {}}, {"denoiser": None}, {"process": {}},
-        {"condition": 3}, {"denoiser": {"_target_": "t", "a": -1}}, {"denoiser": {"_target_": "t", "a": -0.5, "b": 0}}, {"seed": -1}, {"seed": 2**32},
-        {"seed": 2**32 - 1}, {"seed": "x"}, {"x": "${y}"}, {"callbacks": None},
-    ]  # fmt: skip
+        {},
+        {"run": {}},
+        {"run": {"dir": ""}},
+        {"trainer": {"_target_": "t"}},
+        {"trainer": {"max_steps": 1}},
+        {"task": {}},
+        {"denoiser": None},
+        {"process": {}},
+        {"condition": 3},
+        {"denoiser": {"_target_": "t", "a": -1}},
+        {"denoiser": {"_target_": "t", "a": -0.5, "b": 0}},
+        {"seed": -1},
+        {"seed": 2**32},
+        {"seed": 2**32 - 1},
+        {"seed": "x"},
+        {"x": "${y}"},
+        {"callbacks": None},
+    ]
     for key, value in itertools.product(sweeps.LATE, (0, -1, 0.5, 1, None, "x")):
         changes.append({"trainer": {**whole["trainer"], key: value}})
     return rows + [outcome(check_whole, whole | change, "n") for change in changes]
@@ -679,9 +1016,13 @@ def fields_of_options() -> Any:
 
 
 CASES: list[Case] = [
-    value for name, value in list(globals().items())
-    if callable(value) and getattr(value, "__module__", "") == __name__ and not name.startswith("_") and not isinstance(value, type)
-]  # fmt: skip
+    value
+    for name, value in list(globals().items())
+    if callable(value)
+    and getattr(value, "__module__", "") == __name__
+    and not name.startswith("_")
+    and not isinstance(value, type)
+]
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -2009,7 +2009,7 @@ def options_of_released_models() -> Any:
             {},
             {"x": 1},
             3,
-            {k: v for k, v in list(released_weights.NAMES["options"][kind]["neutral"].items())[:3]},
+            dict(list(released_weights.NAMES["options"][kind]["neutral"].items())[:3]),
             dict.fromkeys(list(released_weights.NAMES["options"][kind]["neutral"])[:1], "other"),
         ):
             rows.append(

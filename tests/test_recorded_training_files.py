@@ -17,6 +17,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import yaml
+from pydantic import Field
 from support.outcomes import outcome, printed, without, workspace
 from support.pages import a_run, result
 from support.recorded import Case, check, combinations, record
@@ -85,7 +86,7 @@ def said_lines() -> Any:
 
 def lines_to_a_closed_pipe() -> Any:
     with workspace():
-        with open("out", "w") as file:
+        with Path("out").open("w") as file:
 
             class Closed(io.StringIO):
                 def write(self, text: str) -> int:
@@ -169,8 +170,8 @@ class Small(schemas.Schema):
     count: schemas.Int = 3
     share: schemas.Number | None = None
     kind: Literal["a", "b"] = "a"
-    rows: list[list[schemas.Int]] = []
-    by_name: dict[str, schemas.Plain] = {}
+    rows: list[list[schemas.Int]] = Field([])
+    by_name: dict[str, schemas.Plain] = Field({})
     on: bool = False
 
 
@@ -819,7 +820,7 @@ def archives_of_arrays() -> Any:
                 {"only": []},
             ):
                 rows.append(safe_io.read_npz(Path(name), **options))
-        with open("a.npz", "rb") as file:
+        with Path("a.npz").open("rb") as file:
             file.seek(7)
             rows.append(list(safe_io.read_npz(file)))
         np.savez("o.npz", o=np.array([{}, 1], dtype=object), x=np.ones(3))
@@ -832,7 +833,7 @@ def archives_of_arrays() -> Any:
         for name in ("o.npz", "cut.npz", "bad.npz", "bz.npz", "text.npz", "none.npz"):
             rows.append(str(outcome(safe_io.read_npz, Path(name)))[:120])
         rows.append(outcome(safe_io.read_npz, Path("o.npz"), only=["x"]))
-        with open("bad.npz", "rb") as file:
+        with Path("bad.npz").open("rb") as file:
             rows.append(str(outcome(safe_io.read_npz, file))[:100])
         return rows
 
@@ -846,7 +847,7 @@ def arrays_of_files() -> Any:
                 options = {"mmap": True} if mmap else {}
                 read = safe_io.read_npy(Path(f"{name}.npy"), **options)
                 rows.append([name, read, type(read).__name__, read.dtype.str, read.flags.writeable])
-            with open(f"{name}.npy", "rb") as file:
+            with Path(f"{name}.npy").open("rb") as file:
                 rows.append(safe_io.read_npy(file))
         good = Path("x.npy").read_bytes()
         for number, content in enumerate(

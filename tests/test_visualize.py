@@ -377,6 +377,15 @@ def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
     )
 
 
+@MP4
+@pytest.mark.parametrize("rates", [(10, 20), (20, 10)])
+def test_mp4_of_several_motions_has_the_highest_of_their_frame_rates(tmp_path, rates):
+    write_mp4(tmp_path / "m.mp4", [sway(rate, rate) for rate in rates], size=64)
+    with av.open(str(tmp_path / "m.mp4")) as file:
+        assert float(file.streams.video[0].average_rate or 0) == 20
+        assert len(list(file.decode(video=0))) == 20
+
+
 @pytest.mark.slow
 @MP4
 def test_mp4_has_the_frames_of_the_motion_and_the_colors_of_the_gif(tmp_path, subtests):

@@ -387,6 +387,14 @@ def test_a_checkpoint_names_only_own_classes_and_those_that_the_user_trusts(monk
                     trust({part: hidden})
     monkeypatch.setenv("FLAME_MDM_TRUST", "decimal, fractions ")
     trust({"denoiser": {"_target_": "fractions.Fraction"}})
+    # A name is the whole name of a package
+    for names in ("frac", "fractions.Fraction", "ractions", "fractions2"):
+        monkeypatch.setenv("FLAME_MDM_TRUST", f"decimal,{names}")
+        with (
+            subtests.test(names=names),
+            pytest.raises(UserError, match="FLAME_MDM_TRUST=fractions"),
+        ):
+            trust({"denoiser": {"_target_": "fractions.Fraction"}})
 
 
 def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch, subtests):

@@ -429,7 +429,7 @@ def scores_of_evaluators() -> Any:
     )
     results += [training.poses, training.lengths, training.features]
     near = replace(evaluator, training=training).extract(Motions(["x", "y"], features[1:3]))
-    results.append(near["nearest"].tolist())
+    results.append(near["nearest"].round(decimals=4).tolist())
     features[2] = features[2] * np.nan
     results.append(outcome(lambda: evaluator.extract(Motions(list("abc"), features[:3]))))
     results.append(keys_of(["a", "b"]))

@@ -93,7 +93,8 @@ def check(name: str, case: Case) -> None:
         f"not recorded: PYTHONPATH=tests python tests/test_recorded_{name}.py"
     )
     result = json.loads(json.dumps(summary(case())))
-    assert differences(result, recorded) == []
+    lines = differences(result, recorded)
+    assert not lines, "\n".join(lines[:20])
 
 
 @cache

@@ -204,7 +204,7 @@ def alignments() -> Any:
     results.append(of_features(alignment.MutualInformationDivergence(), **paired))
     x = features()
     fitted = [x["real"], x["real"].roll(1, 1).square(), x["generated"], x["text"]]
-    results.append(alignment.pointwise_mutual_information(*fitted, 1e-3))
+    results.append(alignment.pointwise_mutual_information(*fitted, eps=1e-3))
     for few in (10, 11, 12):
         inputs = {name: features()[name][:few] for name in ("generated", "text", "keys", "real")}
         result = of_features(alignment.MutualInformationDivergence(), **inputs)

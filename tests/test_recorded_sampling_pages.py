@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -283,8 +283,10 @@ def pages_of_runs() -> Any:
             path = folder / f"{rater}{len(rows)}.json"
             path.write_text(
                 Answers(
-                    study="x", rater=rater, ratings=[Rating(a=a, b=b, choice=c) for a, b, c in rows]
-                ).model_dump_json()  # type: ignore[arg-type]
+                    study="x",
+                    rater=rater,
+                    ratings=[Rating(a=a, b=b, choice=cast(Any, c)) for a, b, c in rows],
+                ).model_dump_json()
             )
         files = [folder / "r5.json", folder / "s3.json"]
         results += [

@@ -109,7 +109,7 @@ def averages_of_weights() -> Any:
         }
         chosen = {names[k]: v for k, v in options.items() if k in names and v is not None}
         average = averaging.MovingAverage(options["decay"], **chosen)
-        net = nn.BatchNorm1d(3).double()
+        net: Any = nn.BatchNorm1d(3).double()
         copy = nn.BatchNorm1d(3).double()
         average._average_model = SimpleNamespace(
             module=copy, n_averaged=torch.tensor(options["updates"])
@@ -1019,9 +1019,8 @@ def provenance_of_runs() -> Any:
                     for name in ("provenance.json", "config.yaml")
                 ]
             )
-        rows.append(
-            provenance.WriteProvenance({}).on_train_start(Trainer(is_global_zero=False), task)
-        )  # type: ignore[arg-type, func-returns-value]
+        other: Any = Trainer(is_global_zero=False)
+        rows.append(provenance.WriteProvenance({}).on_train_start(other, task))  # type: ignore[func-returns-value]
     return rows
 
 
@@ -1321,7 +1320,8 @@ def changed_weights() -> Any:
             adapters.changed(weight, {"up": up, "down": down}, [0], *strength),
             adapters.changed(weight, {"vectors": vectors}, [2, 0], *strength),
         ]
-    for is_kept in ({}, {"is_kept": True}, {"is_kept": False}):
+    kept: list[dict[str, Any]] = [{}, {"is_kept": True}, {"is_kept": False}]
+    for is_kept in kept:
         change = adapters.Change([1, 1], vectors=nn.Parameter(vectors), **is_kept)
         rows.append([change(weight), sorted(dict(change.named_parameters()))])
     return rows
@@ -1816,12 +1816,8 @@ def imported_networks() -> Any:
             state = _released_state(arch, **extra)
             if "embed_action.action_embedding" in state:
                 state = {k: v for k, v in state.items() if not k.startswith("embed_text")}
-            result = outcome(
-                released.import_mdm,
-                state,
-                released_options.Options(arch=arch, num_heads=2, **options),
-                **token,
-            )  # type: ignore[arg-type]
+            given: dict[str, Any] = {"arch": arch, "num_heads": 2, **options}
+            result = outcome(released.import_mdm, state, released_options.Options(**given), **token)
             if isinstance(result, str):
                 rows.append([arch, options, result[:200]])
                 continue

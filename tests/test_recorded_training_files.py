@@ -979,7 +979,7 @@ def abandoned_files() -> Any:
             Path(f".link.{machine}-{dead}-{token}").symlink_to("target")
             tokens.add("b" * 16)
             options = {} if is_locked is None else {"is_locked": is_locked}
-            paths.remove_abandoned(Path(), path and Path(path), **options)
+            paths.remove_abandoned(Path(), None if path is None else Path(path), **options)
             tokens.discard("b" * 16)
             left = [kind for kind, name in names.items() if Path(name).exists()]
             rows.append(

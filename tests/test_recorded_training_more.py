@@ -398,8 +398,8 @@ def signatures_of_sources() -> Any:
         ):
             source = signatures.source_file(name)
             rows.append(source and f"{source.parent.name}/{source.name}")
-        found = signatures.definition("recorded_own", "Again")
-        rows.append(found and found[0])
+        definition = signatures.definition("recorded_own", "Again")
+        rows.append(definition and definition[0])
         return without(folder, rows)
 
 

@@ -728,7 +728,7 @@ def clips_of_cmu() -> Any:
     )
     return outcomes(
         clone=of,
-        smpl=lambda: of(motion="smpl", exclude=["02_03", "60_01", "61_01"]),
+        smpl=lambda: of(motion="smpl", exclude=["02_02", "02_03", "60_01", "61_01"]),
         test=lambda: of("test"),
         nothing=lambda: of(None),
         nowhere=lambda: of("nowhere"),

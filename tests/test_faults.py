@@ -165,6 +165,21 @@ def test_a_signal_after_another_one_ends_a_run_at_once_or_is_noted(
     assert killed == [True] * stops
 
 
+@pytest.fixture
+def usual_signals():
+    """Signals have their usual handlers, also if the tests run in the background or under nohup."""
+    usual = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {signum: signal.signal(signum, handler) for signum, handler in usual.items()}
+    yield
+    for signum, handler in before.items():
+        signal.signal(signum, handler)
+
+
+@pytest.mark.usefixtures("usual_signals")
 def test_a_command_ends_with_the_number_of_its_signal_also_if_a_library_reports_another_error():
     def received(signum: signal.Signals, kind: str) -> int:
         with stoppable([signal.SIGTERM, signal.SIGHUP]):
@@ -192,6 +207,7 @@ def test_a_command_ends_with_the_number_of_its_signal_also_if_a_library_reports_
         raise OSError("no signal")
 
 
+@pytest.mark.usefixtures("usual_signals")
 def test_ignored_signals_stay_ignored_and_an_interrupt_is_a_keyboard_interrupt():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

@@ -845,3 +845,9 @@ def test_a_body_is_scaled_by_the_legs_of_its_own_first_frame():
     scale = (lengths[5] + lengths[8]) / SMPL22.bones(growing[:1])[0, [5, 8]].norm(dim=-1).sum()
     moved = decoded[:, 0] - decoded[:1, 0]
     close(moved.norm(dim=-1), scale * root.norm(dim=-1), 1e-4)
+
+
+@pytest.mark.parametrize("shape", [(22, 3), (4, 66), (4, 21, 3), (4, 22, 2), (1, 4, 22, 3)])
+def test_motions_of_another_shape_are_refused_with_the_expected_one(shape: tuple[int, ...]):
+    with pytest.raises(UserError, match=r"expected shape \(frames, 22, 3\) .*, but found \("):
+        HumanML("smpl22").encode(torch.zeros(shape))

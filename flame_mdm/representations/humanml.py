@@ -195,11 +195,12 @@ class HumanML(Representation):
 
         Frames are float64 in the features' unit.
         """
+        size = len(self.skeleton)
         for number, motion in enumerate(motions):
             name = f"motion {number}" if len(motions) > 1 else "motion"
-            if motion.ndim != 3 or motion.shape[1:] != (joints := len(self.skeleton), 3):
+            if motion.ndim != 3 or motion.shape[1:] != (size, 3):
                 raise UserError(
-                    f"{name}: expected shape (frames, {joints}, 3) for {self.name}, but found "
+                    f"{name}: expected shape (frames, {size}, 3) for {self.name}, but found "
                     f"{tuple(motion.shape)}"
                 )
             if len(motion) < 3:

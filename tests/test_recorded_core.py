@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from support.recorded import Case, check, combinations, record
+from support.recorded import REFUSALS, Case, cases_of, check, combinations, record
 from torch import Tensor
 
 from flame_mdm.batch import (
@@ -54,7 +54,7 @@ def refusal(call: Callable[[], Any]) -> str:
     """The text of the error that a call raises, or "accepted"."""
     try:
         call()
-    except Exception as error:
+    except REFUSALS as error:
         return f"{type(error).__name__}: {error}"
     return "accepted"
 
@@ -271,7 +271,7 @@ def joints_by_name() -> Any:
         for names in chosen:
             try:
                 results.append(skeleton.find_joints(tree, names))  # type: ignore[arg-type]
-            except Exception as error:
+            except REFUSALS as error:
                 results.append(str(error))
     return results
 
@@ -695,15 +695,7 @@ def collated_samples() -> Any:
     return [collate(samples, **settings) for samples in sets for settings in options]
 
 
-CASES: list[Case] = [
-    axis_angles_and_quaternions, matrices, six_d_vectors, euler_angles, products_of_quaternions,
-    shortest_arcs, interpolated_rotations, tables_of_skeletons, positions_of_skeletons,
-    joints_by_name, humanml_features, humanml_defaults, humanml_contacts_beside_the_limit,
-    humanml_refusals, smpl_features, raw_poses, motion272_parts, rifke_features, upsampled_motions,
-    statistics_of_frames, motions_that_are_not_finite, masked_errors, lengths_of_bones,
-    losses_of_all_options, feet_at_the_limit_of_contact, dropped_conditions, edits,
-    lengths_and_padding, collated_samples,
-]  # fmt: skip
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -10,13 +10,12 @@ from typing import Any
 
 import pytest
 import torch
-from support.recorded import Case, check, combinations, record
+from support.recorded import Case, cases_of, check, combinations, outcome, record
 from test_recorded_core import CPU, numbers, refusal
 from test_recorded_core_more import (
     BATCH,
     FEATURES,
     MASK,
-    attempt,
     every_process,
     motion,
 )
@@ -103,7 +102,7 @@ def attempts(kind: type[Any], chosen: list[dict[str, Any]]) -> Any:
     for row in chosen:
         options = dict(row)
         width = options.pop("width")
-        results.append((row, attempt(lambda: outputs_of(kind, width, options))))  # noqa: B023
+        results.append((row, outcome(lambda: outputs_of(kind, width, options))))  # noqa: B023
     return results
 
 
@@ -530,7 +529,7 @@ def built_generators() -> Any:
         model.facts, model.condition.seen, model.sampler_options.chosen(), model.describe(),
         model.denoiser.length_unit, plain.facts, plain.condition.seen, list(model.state_dict()),
         {name: list(weight.shape) for name, weight in parts.denoiser.named_parameters()},
-        sizes, [attempt(lambda v=row: sampling_defaults(**v).chosen()) for row in values],
+        sizes, [outcome(lambda v=row: sampling_defaults(**v).chosen()) for row in values],
         refusal(lambda: Parts(linear, FlowMatching(), Words(), Points())),
         model.config == recipe(), model.conditioned_on, generator("none").conditioned_on,
     ]  # fmt: skip
@@ -618,7 +617,7 @@ def states_of_tasks() -> Any:
     return [
         list(state), same, checkpoint, renamed is GeneratorTask, [str(w.message) for w in caught],
         list(nn.ModuleList([task]).state_dict())[:3], task.encoder() is task.generator.condition,
-        task.noun, refusal(lambda: task_module.Missing), Task(optimizer={}, seed=1).describe(),
+        task.noun, Task(optimizer={}, seed=1).describe(),
     ]  # fmt: skip
 
 
@@ -629,11 +628,9 @@ def refused_tasks() -> Any:
         {"num_inference_steps": 0}, {"num_inference_steps": None}, {"sampler": "none"},
     ]  # fmt: skip
     targeted = {"targets": None}
-    base = Task(optimizer={}, seed=1)
     return [
         [refusal(lambda c=change: task_of(task=c)) for change in changes],
         refusal(lambda: task_of(targets=True, task=targeted)),
-        refusal(base.encoder), refusal(lambda: Task.build({}, Points())),
         [
             refusal(lambda c=change: task_of(task=c).on_fit_start())
             for change in changes[2:3] + changes[6:]
@@ -661,7 +658,7 @@ def learning_rates() -> Any:
                 factor = schedule["scheduler"].lr_lambdas[0]
                 return [factor(step) for step in range(12)], schedule["interval"]
 
-            results.append((warmup, decay, attempt(rates)))
+            results.append((warmup, decay, outcome(rates)))
     frozen = task_of()
     frozen.generator.denoiser.requires_grad_(False)
     return results, len(frozen.make_optimizer().param_groups[0]["params"])
@@ -678,7 +675,7 @@ def reports_of_steps() -> Any:
     return [row[1:] for row in results]
 
 
-def clips() -> Any:
+def clips() -> list[SimpleNamespace]:
     return [
         SimpleNamespace(captions=["a man walks", "he walks"], license="open"),
         SimpleNamespace(captions=["she sits"], license="closed"),
@@ -723,7 +720,7 @@ def set_up(task: GeneratorTask, **changes: Any) -> Any:
 
 def tasks_with_data() -> Any:
     results = [
-        attempt(lambda c=changes: set_up(task_of(targets=True), **c))
+        outcome(lambda c=changes: set_up(task_of(targets=True), **c))
         for changes in (
             {}, {"device": "gpu"}, {"licenses": []}, {"precision": "bf16-mixed"},
             {"shortest": -2}, {"shortest": -3}, {"shortest": -5},
@@ -752,15 +749,7 @@ def essential_features_in_a_generator() -> Any:
     return model.double().generate(replace(batch, x=batch.x[..., :0]), seed=3)
 
 
-CASES: list[Case] = [
-    outputs_of_encoders, outputs_of_decoders, outputs_of_flame, outputs_of_other_networks,
-    refused_networks, outputs_of_layers, outputs_in_training, outputs_of_target_encoders,
-    outputs_of_the_parts_of_unets, gradients_with_recomputation, generated_motions,
-    generated_by_default, generated_windows, generated_blocks, joined_blocks, encoded_and_guided,
-    distilled_generators, built_generators, losses_of_tasks, validation_means, states_of_tasks,
-    refused_tasks, learning_rates, reports_of_steps, tasks_with_data,
-    essential_features_in_a_generator,
-]  # fmt: skip
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,12 +1,12 @@
 """Values of processes, samplers, guidance and windows, as recorded."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import count
 from typing import Any
 
 import pytest
 import torch
-from support.recorded import Case, check, combinations, record
+from support.recorded import Case, cases_of, check, combinations, outcome, record
 from test_recorded_core import CPU, Shift, condition, numbers, refusal
 from torch import Tensor
 
@@ -21,14 +21,6 @@ NAME = "core_more"
 BATCH, FRAMES, FEATURES = 3, 6, 4
 MASK = length_mask(torch.tensor([4, 6, 1]))
 STEPS = 12
-
-
-def attempt(call: Callable[[], Any]) -> Any:
-    """The result of a call, or the text of its error."""
-    try:
-        return call()
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
 
 
 def motion(seed: int = 0) -> Tensor:
@@ -200,7 +192,7 @@ def coefficients_of_batches() -> Any:
 
 def selected_steps() -> Any:
     return [
-        attempt(lambda a=total, b=number, c=spacing: schedules.timesteps(a, b, *c))
+        outcome(lambda a=total, b=number, c=spacing: schedules.timesteps(a, b, *c))
         for spacing in ((), ("linspace",), ("stride",))
         for total in (4, 12, 50, 1000)
         for number in (0, 1, 2, 3, 4, 5, 8, 11, 12, 25, 50)
@@ -267,7 +259,7 @@ def edited_diffusion_samples() -> Any:
         process, sampler = processes[chosen.pop("process")], chosen.pop("sampler")
         edit = edit_of(chosen | {"guide": Shift() if chosen["guide"] else None})
         settings = SamplerOptions(sampler=sampler, num_inference_steps=4)
-        results.append((options, attempt(lambda: sampled(process, settings, edit))))  # noqa: B023
+        results.append((options, outcome(lambda: sampled(process, settings, edit))))  # noqa: B023
     return results
 
 
@@ -285,7 +277,7 @@ def flow_samples() -> Any:
         settings = SamplerOptions(sampler=sampler, num_inference_steps=chosen.pop("steps"))
         guide = Shift() if chosen.pop("guide") else None
         edit = None if chosen["mode"] is None else edit_of(chosen | {"guide": guide})
-        results.append((options, attempt(lambda: sampled(process, settings, edit))))  # noqa: B023
+        results.append((options, outcome(lambda: sampled(process, settings, edit))))  # noqa: B023
     plain = edit_of({"mode": "trajectory"})
     settings = SamplerOptions(sampler="euler", num_inference_steps=5)
     results.append(sampled(processes["flow"], settings, plain))
@@ -372,11 +364,11 @@ def refused_samples() -> Any:
     chosen += [("euler", flow), ("dopri5", flow), ("consistency", flow)]
     return {
         "options": [
-            str(attempt(lambda p=process, r=request: sampled(p, SamplerOptions(**r))[2]))
+            str(outcome(lambda p=process, r=request: sampled(p, SamplerOptions(**r))[2]))
             for process in (diffusion, flow) for request in requests
         ],
         "edits": [
-            attempt(lambda p=process, e=edit, s=name: p.check_edit(e, MASK,
+            outcome(lambda p=process, e=edit, s=name: p.check_edit(e, MASK,
             SamplerOptions(sampler=s)))
             for name, process in chosen for edit in edits
         ],
@@ -511,13 +503,7 @@ def windows_of_motions() -> Any:
     return spans, results
 
 
-CASES: list[Case] = [
-    noisy_motions_and_targets, training_losses, variances_and_bounds, refused_processes,
-    tables_of_schedules, coefficients_of_batches, selected_steps, diffusion_samples,
-    edited_diffusion_samples, flow_samples, adaptive_flow_samples, steps_of_samplers,
-    refused_samples, consistency_losses, guided_denoisers, steered_motions, reached_positions,
-    windows_of_motions,
-]  # fmt: skip
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from support.motions import posed
-from support.recorded import Case, check, record
+from support.recorded import Case, cases_of, check, record
 from support.recorded_data import (
     clips_of,
     described,
@@ -968,6 +968,8 @@ def contents_of_archives() -> Any:
         return [bounded.read(4) for _ in range(count)], bounded.total
 
     outside = {"../x.txt": b"a"}
+    with pytest.raises(EOFError, match="it ends too early"):
+        reads(b"abcdefg", 5)
     (root / "text.zip").write_text("no archive at all")
     return outcomes(
         zip=lambda: unpacked(zipped(files)),
@@ -984,7 +986,6 @@ def contents_of_archives() -> Any:
         short=lambda: str(outcome(lambda: unpacked(cut(tarred(files, "gz"), 60))))[:60],
         text=lambda: str(outcome(lambda: unpacked(root / "text.zip")))[:70],
         reads=lambda: reads(b"abcdefg", 4),
-        ended=lambda: reads(b"abcdefg", 5),
         folder=lambda: plain(archives.as_folder(root, temporary(), bool)),
     )
 
@@ -1105,41 +1106,7 @@ def faults_of_clips() -> Any:
     return [results, [adaptation.styled(text, "limp") for text in texts]]
 
 
-CASES: list[Case] = [
-    names_and_hashes,
-    mirrored_texts_and_clips,
-    defaults_of_sources,
-    results_in_order,
-    rows_of_tables,
-    splits_that_are_drawn,
-    descriptions_of_text_files,
-    cuts_of_motions,
-    clips_of_cuts,
-    processed_folders,
-    processed_folders_that_are_damaged,
-    kit_as_in_temos,
-    clips_of_humanact12,
-    action_files_that_are_damaged,
-    clips_of_uestc,
-    front_views,
-    keys_of_amass,
-    recordings_of_amass,
-    folders_of_amass,
-    models_of_bodies,
-    clips_of_an_index,
-    humanml3d_that_is_created,
-    humanml3d_as_smpl,
-    starts_of_labels,
-    clips_of_babel,
-    clips_of_bandai,
-    splits_and_captions_of_bandai,
-    bandai_motions,
-    takes_that_are_refused,
-    contents_of_archives,
-    contents_of_pickles,
-    mixtures,
-    faults_of_clips,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

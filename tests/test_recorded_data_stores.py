@@ -17,7 +17,7 @@ import torch
 from support.asf import write_amc, write_asf
 from support.motions import posed
 from support.others import amass as amass_arrays
-from support.recorded import Case, bodies, check, combinations, record
+from support.recorded import Case, bodies, cases_of, check, combinations, record
 from support.recorded_data import clips_of, folder, outcome, outcomes, plain, projected
 from support.stores import OwnClips, line
 from torch import Tensor, nn
@@ -1220,31 +1220,7 @@ def prompts_as_models_read_them() -> Any:
     return results
 
 
-CASES: list[Case] = [
-    crops_of_all_rules,
-    batches_of_streams,
-    contents_of_stores,
-    batches_of_data_modules,
-    rotations_on_the_device,
-    stores_that_are_refused,
-    options_of_data_modules,
-    data_modules_without_a_split,
-    reports_of_stores,
-    standing_people,
-    clips_of_folders,
-    folders_that_are_refused,
-    lessons,
-    clips_of_cmu,
-    rates_of_cmu,
-    skeletons_of_cmu,
-    learned_tokens,
-    labels_and_no_conditions,
-    pretrained_texts,
-    target_conditions,
-    words_of_captions,
-    sentences_in_parts,
-    prompts_as_models_read_them,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.recorded import Case, bodies, check, combinations, record
+from support.recorded import Case, bodies, cases_of, check, combinations, record
 from support.recorded_data import described, outcome, projected
 
 from flame_mdm.data import (
@@ -326,23 +326,7 @@ def refusals_of_the_synthetic_data() -> Any:
     ]
 
 
-CASES: list[Case] = [
-    motions_of_all_actions,
-    motions_of_all_attributes,
-    examples_of_bodies,
-    cycles_and_simultaneous_actions,
-    clips_of_the_synthetic_data,
-    clips_of_the_synthetic_sequences,
-    earlier_motions,
-    moved_bodies_of_sequences,
-    joined_bodies,
-    curves_of_bodies,
-    reaching_bodies,
-    gaits,
-    captions_of_attributes,
-    grammar_of_the_synthetic_data,
-    refusals_of_the_synthetic_data,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

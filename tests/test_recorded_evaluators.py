@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
-from support.recorded import Case, bodies, check, combinations, record, some_bodies
+from support.recorded import (
+    Case,
+    bodies,
+    cases_of,
+    check,
+    combinations,
+    outcome,
+    record,
+    some_bodies,
+)
 from torch import Tensor
 
 from evaluators import metrics as metrics_package
@@ -35,7 +44,6 @@ from evaluators.metrics import (
     update_metrics,
 )
 from evaluators.metrics import attributes as attribute_rules
-from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.seeds import key
 
@@ -50,14 +58,6 @@ MODULES = (
     accuracy, alignment, attribute_rules, claims, distribution, diversity, memorization, physics,
     published_physics, reconstruction, retrieval,
 )  # fmt: skip
-
-
-def outcome(compute: Callable[[], Any]) -> Any:
-    """The result of a computation, or the text of its refusal."""
-    try:
-        return compute()
-    except (UserError, ValueError) as error:
-        return f"{type(error).__name__}: {error}"
 
 
 @cache
@@ -864,17 +864,7 @@ def accuracies_of_claims() -> Any:
     return results
 
 
-CASES: list[Case] = [
-    distributions, diversities, variances_of_joints, alignments, ranks_with_ties,
-    retrieval_with_equal_captions, retrieval_with_encoded_captions, physical_metrics,
-    static_and_low_motions_beside_limits,
-    published_physical_metrics, floating_of_mbench, transitions, errors_of_edits,
-    errors_of_positions, memorized_motions, declared_properties, refusals_of_metrics,
-    attributes_of_plain_bodies, attributes_of_varied_bodies, attributes_of_fast_bodies,
-    attributes_of_growing_movements, attributes_of_no_bodies, bodies_of_changing_length,
-    views_of_bodies, rises_of_signals,
-    requested_attributes, accuracies_of_attributes, sides_of_bodies, accuracies_of_claims,
-]  # fmt: skip
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from support.recorded import Case, check, combinations, record, some_bodies
+from support.recorded import Case, cases_of, check, combinations, outcome, record, some_bodies
 from torch import Tensor, nn
 
 from evaluators import perturbations
@@ -64,7 +64,6 @@ from evaluators.sources import (
 from flame_mdm.batch import MotionBatch
 from flame_mdm.data.crops import Fixed, Units, Whole
 from flame_mdm.data.store import Entry
-from flame_mdm.errors import UserError
 from flame_mdm.records import Cost, Value
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
@@ -74,14 +73,6 @@ from flame_mdm.schemas import check_shape
 from flame_mdm.seeds import key
 
 NAME = "evaluators_more"
-
-
-def outcome(compute: Callable[[], Any]) -> Any:
-    """The result of a computation, or the text of its refusal."""
-    try:
-        return compute()
-    except (UserError, ValueError, FileNotFoundError) as error:
-        return f"{type(error).__name__}: {error}"
 
 
 class Tiny(Extractor):
@@ -806,13 +797,7 @@ def features_of_classifiers() -> Any:
     return results
 
 
-CASES: list[Case] = [
-    rows_of_protocols, sizes_of_protocols, checks_of_protocols, released_protocols,
-    near_misses_of_clips, changed_joints, wrong_captions, perturbed_sets, scores_of_evaluators,
-    values_of_evaluations, baselines, folders_of_samples, generated_motions, texts_of_results,
-    audits, intervals_of_audits, features_of_motion_clips, noisy_copies_of_motions,
-    features_of_t2m, features_of_classifiers,
-]  # fmt: skip
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

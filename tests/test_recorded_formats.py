@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from support.motions import posed, sway
-from support.recorded import Case, bodies, check, record, some_bodies
-from support.traits import outcome, traits
+from support.recorded import Case, bodies, cases_of, check, outcome, record, some_bodies
+from support.traits import traits
 
 from flame_mdm.formats import (
     body,
@@ -800,27 +800,7 @@ def conversions() -> Any:
     return results
 
 
-CASES: list[Case] = [
-    cleanups_of_spoiled_bodies,
-    cleanups_with_contacts_and_skeletons,
-    steps_of_cleanup,
-    faults_of_spoiled_bodies,
-    depths_of_arms,
-    checks_of_bodies,
-    sizes_at_limits,
-    checks_of_feet_and_order,
-    rest_poses_in_front,
-    grounded_motions,
-    shifts_of_toes,
-    gaits_of_bodies,
-    solved_poses,
-    postures,
-    fitted_bodies,
-    rigs_of_programs,
-    characters_that_follow,
-    rates_and_frames,
-    conversions,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 from support.glb import Glb, changed, odd_character, packed, write_names
 from support.motions import posed, sway
-from support.recorded import Case, bodies, check, combinations, record
+from support.recorded import Case, bodies, cases_of, check, combinations, outcome, record
 from support.recorded_files import folder_of_files, motions, without
-from support.traits import nested_traits, outcome, text_traits, traits
+from support.traits import nested_traits, text_traits, traits
 
 from flame_mdm.formats import (
     animated,
@@ -769,20 +769,7 @@ def parts_of_people() -> Any:
     }
 
 
-CASES: list[Case] = [
-    glb_files,
-    numbers_of_glb_files,
-    tracks_of_animations,
-    fbx_files,
-    nested_fbx_records,
-    characters_with_several_skins,
-    fbx_scenes,
-    usd_files,
-    moving_characters,
-    parts_of_people,
-    pages_of_motions,
-    images_of_motions,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.recorded import Case, check, combinations, record
+from support.recorded import Case, cases_of, check, combinations, outcome, record
 from support.sampled import (
     FEW,
     MODELS,
@@ -16,7 +16,6 @@ from support.sampled import (
     WAVE,
     diffusion,
     dip,
-    error_of,
     flow,
     labeled,
     plain,
@@ -94,11 +93,11 @@ def described(request: SamplingRequest) -> Any:
 
 def requests_and_refusals() -> Any:
     requests = [
-        error_of(lambda one=one: described(SamplingRequest.of("generate", one))) for one in REQUESTS
+        outcome(lambda one=one: described(SamplingRequest.of("generate", one))) for one in REQUESTS
     ]
     extras: list[dict[str, Any]] = [{}, {"loop": True}, {"path": "0,1"}]
     motion = [
-        error_of(lambda extra=extra: SamplingRequest(texts="x", after=walk(), **extra).is_sequence)
+        outcome(lambda extra=extra: SamplingRequest(texts="x", after=walk(), **extra).is_sequence)
         for extra in extras
     ]
     return requests, motion
@@ -125,14 +124,14 @@ EDITS: list[dict[str, Any]] = [
 def edits_and_what_they_keep() -> Any:
     results: list[Any] = []
     for values in EDITS:
-        request = error_of(lambda values=values: EditRequest(**values))
+        request = outcome(lambda values=values: EditRequest(**values))
         if isinstance(request, str):
             results.append(request)
             continue
         row: list[Any] = [request.ranges]
         for length in (37, 8):
             row.append(
-                error_of(
+                outcome(
                     lambda request=request, length=length: [
                         part.double().numpy()
                         for part in kept_parts(diffusion().representation, length, request)
@@ -142,7 +141,7 @@ def edits_and_what_they_keep() -> Any:
         for model in (diffusion(), flow()):
             for options in (SamplerOptions(), SamplerOptions(num_inference_steps=3)):
                 row.append(
-                    error_of(
+                    outcome(
                         lambda model=model, options=options, request=request: method_options(
                             model.process, request, options
                         )
@@ -161,19 +160,19 @@ def keywords_of_edits() -> Any:
         {"joint": "arms"}, {"strength": 0.5, "joints": "arms", "texts": "a @2"}, {"resample": 2},
     ]  # fmt: skip
     return [
-        error_of(lambda one=one: described(SamplingRequest.of("edit", one, editing=True)))
+        outcome(lambda one=one: described(SamplingRequest.of("edit", one, editing=True)))
         for one in listed
     ]
 
 
 def parts_paths_and_ranges() -> Any:
     lengths = [
-        error_of(lambda one=one: _part_length(read_parts(one[0]), one[1], 20.0))
+        outcome(lambda one=one: _part_length(read_parts(one[0]), one[1], 20.0))
         for one in (("a", 37), ("a @1 | b", 50), ("a | b | c", 50), ("a | b | c", 51), ("a @1", 20),
                     ("a @1", 21), ("a @2 | b @1.2 | c | d", 70), ("a @2 | b", 40), ("a@1|b|c", 23))
     ]  # fmt: skip
     written: list[Any] = ["0,1 0.5,-2", " 1e1,2 ", "1;2", [(1, 2), (3.5, 4)], [], [(1,)], "1,2 3"]
-    paths = [error_of(lambda one=one: read_path(one)) for one in [*written, "x" * 900]]
+    paths = [outcome(lambda one=one: read_path(one)) for one in [*written, "x" * 900]]
     targets = [
         path_targets(path, seconds)
         for path in ([(0.0, 1.0), (2.0, 1.0), (2.0, -3.0)], [(0.0, 0.0)], [(1.0, 1.0), (1.0, 1.0)])
@@ -182,7 +181,7 @@ def parts_paths_and_ranges() -> Any:
     pairs = [[0, 1], (1.5, 2), [1], [1, 2, 3], ["a", 1], [0, float("nan")], "ab", None, [1, [2]]]
     return (
         lengths, paths, targets, [is_range(pair) for pair in pairs],
-        [error_of(lambda size=size: check_length("ab " * size)) for size in (666, 667)],
+        [outcome(lambda size=size: check_length("ab " * size)) for size in (666, 667)],
     )  # fmt: skip
 
 
@@ -237,9 +236,9 @@ def resolved_requests() -> Any:
 
                 if collects and not isinstance(values.get("texts", values.get("actions")), list):
                     continue
-                outcome = error_of(call)
+                answer = outcome(call)
                 results[f"{name} {number} {collects}"] = (
-                    outcome, [f"{key}: {error}" for key, error in refused.items()]
+                    answer, [f"{key}: {error}" for key, error in refused.items()]
                 )  # fmt: skip
     return results
 
@@ -256,7 +255,7 @@ def motions_to_continue() -> Any:
                 (one.before, one.edit and one.edit.known, plain(list(one.warnings), folder))
             )
             results.append(
-                error_of(
+                outcome(
                     lambda built=built: (
                         resolve(SamplingRequest(texts=WALK, after=short), built()).is_sequence
                     )
@@ -298,7 +297,7 @@ def lengths_and_windows() -> Any:
                             loop=loop,
                         )
 
-                    results.append(error_of(call))
+                    results.append(outcome(call))
         if context:
             continue
         for loop in (False, True):
@@ -343,7 +342,7 @@ def sampled_motions() -> Any:
         for name in ("diffusion", "flow", "dip"):
             if name == "flow" and number % 2:
                 continue
-            results[f"{name} {number}"] = error_of(
+            results[f"{name} {number}"] = outcome(
                 lambda values=values, name=name: [
                     shown(motion) for motion in generate(MODELS[name](), **{**values, **FEW})
                 ]
@@ -390,8 +389,8 @@ def stages_scores_and_candidates() -> Any:
         score=lambda motions: [float(motion.joints[-1, 3, 0]) for motion in motions],
     )  # fmt: skip
     refused = [
-        error_of(lambda: generate(dip(), WALK, frames=20, stages=[])),
-        error_of(lambda: generate(diffusion(), WALK, frames=20, stages=[], candidates=2)),
+        outcome(lambda: generate(dip(), WALK, frames=20, stages=[])),
+        outcome(lambda: generate(diffusion(), WALK, frames=20, stages=[], candidates=2)),
     ]
     return (
         numbers, [(motion.text, motion.joints.astype(float)) for motion in stages], faulty, chosen,
@@ -413,13 +412,13 @@ def edits_given_to_generate() -> Any:
     ]
     for values, one in listed:
         results.append(
-            error_of(
+            outcome(
                 lambda values=values, one=one: [
                     shown(motion) for motion in generate(diffusion(), **values, **FEW, edit=one)
                 ]
             )
         )
-    results.append(error_of(lambda: generate(dip(), WALK, frames=20, edit=Edit(known, keep))))
+    results.append(outcome(lambda: generate(dip(), WALK, frames=20, edit=Edit(known, keep))))
     return results
 
 
@@ -480,7 +479,7 @@ def edits_of_other_inputs_and_refusals() -> Any:
         lambda: edit(flow(), walk(), WALK, method="flame", joints="head"),
     ]  # fmt: skip
     results: list[Any] = [
-        error_of(lambda call=call: [(shown(one)[:2], one.joints.astype(float)) for one in call()])
+        outcome(lambda call=call: [(shown(one)[:2], one.joints.astype(float)) for one in call()])
         for call in calls
     ]
     request = SamplingRequest.of("edit", {"texts": "a walk | waves", "strength": 1.0}, editing=True)
@@ -489,20 +488,7 @@ def edits_of_other_inputs_and_refusals() -> Any:
     return results
 
 
-CASES: list[Case] = [
-    requests_and_refusals,
-    edits_and_what_they_keep,
-    keywords_of_edits,
-    parts_paths_and_ranges,
-    resolved_requests,
-    motions_to_continue,
-    lengths_and_windows,
-    sampled_motions,
-    stages_scores_and_candidates,
-    edits_given_to_generate,
-    edited_motions,
-    edits_of_other_inputs_and_refusals,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

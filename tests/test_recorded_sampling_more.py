@@ -2,13 +2,22 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
-from support.recorded import Case, check, combinations, record, some_bodies, summary
+from support.recorded import (
+    Case,
+    cases_of,
+    check,
+    combinations,
+    outcome,
+    record,
+    some_bodies,
+    summary,
+)
 
 from flame_mdm.conditions.language import clauses, matching, meaning, morphology, spelling, tables
 from flame_mdm.conditions.language import tokens as words
@@ -20,7 +29,6 @@ from flame_mdm.conditions.language.vectors import WordTable, word_table
 from flame_mdm.conditions.language.wording import attribute_words, caption, predicate
 from flame_mdm.data.synthetic import prompts
 from flame_mdm.demo.chips import _with_action, chips
-from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import KIT21
 from flame_mdm.sampling.motion_request import read_parts
@@ -44,14 +52,6 @@ DIRECTED = {
     "veer": ("left", "right"),
     "lean": ("left", "right"),
 }
-
-
-def error_of(call: Callable[[], Any]) -> Any:
-    """The result of a call, or the text of its refusal."""
-    try:
-        return call()
-    except UserError as error:
-        return f"{type(error).__name__}: {error}"
 
 
 def digest(value: Any) -> str:
@@ -136,7 +136,7 @@ def refusals_of_bodies() -> Any:
         walk[:, :21], walk[:0], walk[0], np.where(walk > 1, np.nan, walk), walk * 1e-4, walk * 2e-3,
         np.where(walk > 1, np.inf, walk),
     ]  # fmt: skip
-    return [error_of(lambda joints=joints: len(Body(joints, 20.0))) for joints in wrong]
+    return [outcome(lambda joints=joints: len(Body(joints, 20.0))) for joints in wrong]
 
 
 def _rows(names: list[str]) -> Any:
@@ -449,7 +449,7 @@ def judgments_of_motions() -> Any:
             [(one.group, one.answer) for one in judging.judge(motion, "turns, then walks").verdicts]
             for motion in motions[:5]
         ],
-        "refused": [error_of(lambda call=call: str(call())) for call in refused],
+        "refused": [outcome(lambda call=call: str(call())) for call in refused],
         "empty": str(judging.judge(motions[0], "paints a wall")),
     }
 
@@ -590,7 +590,7 @@ def readings_of_models() -> Any:
     for number, text in enumerate(TYPED + sentences_of_parts()[:60]):
         for place, (name, reader) in enumerate(readers().items()):
             if number % 4 == place or (number < len(TYPED) and place == 0):
-                results[f"{name}: {text}"] = error_of(
+                results[f"{name}: {text}"] = outcome(
                     lambda reader=reader, text=text: _reading(reader, text)
                 )
     return results
@@ -766,7 +766,7 @@ def chips_of_texts() -> Any:
         for name in ("all", "both", "few"):
             reader = readers()[name]
             parts = read_parts(text)
-            page = error_of(
+            page = outcome(
                 lambda reader=reader, parts=parts: chips(
                     reader.abilities, parts, [reader.read(phrase) for phrase, _ in parts]
                 )
@@ -776,37 +776,7 @@ def chips_of_texts() -> Any:
     return results, [kept.action, dict(kept.attributes)], chips(Abilities(facts()), [], [])
 
 
-CASES: list[Case] = [
-    bodies_as_the_referee_sees_them,
-    refusals_of_bodies,
-    measurements_of_movements,
-    measurements_of_postures,
-    measurements_of_contacts,
-    measurements_of_directions_and_sides,
-    measurements_of_counts,
-    helpers_of_measurements,
-    bodies_on_the_floor_and_with_folded_limbs,
-    evidence_in_signals,
-    readings_of_sides,
-    claims_in_sentences,
-    claims_in_combined_sentences,
-    changed_claims,
-    bands_of_all_kinds,
-    verdicts_on_sentences,
-    decisions_at_ends_for_durations_and_in_order,
-    judgments_of_motions,
-    understood_sentences,
-    understood_combined_sentences,
-    readings_of_models,
-    abilities_of_models,
-    words_and_typos,
-    distances_of_words,
-    meanings_of_words,
-    tables_of_words,
-    tokens_phrases_and_clauses,
-    wordings_of_actions,
-    chips_of_texts,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -12,8 +12,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from support.pages import a_run, data_of, motions, put, result
-from support.recorded import Case, check, record
-from support.sampled import diffusion, dip, error_of, facts, labeled, plain, walk
+from support.recorded import Case, cases_of, check, outcome, record
+from support.sampled import diffusion, dip, facts, labeled, plain, walk
 
 from flame_mdm.commands import (
     above_zero,
@@ -240,7 +240,7 @@ def pages_of_runs() -> Any:
             page = comparing.comparison(compared, shown).replace(str(folder), "FOLDER")
             results.append((page.count("<td>"), page.count("<svg"), page.count("srcdoc")))
             for seed in (0, 1):
-                rating = error_of(
+                rating = outcome(
                     lambda compared=compared, shown=shown, seed=seed: study.rating_page(
                         compared, shown, seed
                     )
@@ -262,8 +262,8 @@ def pages_of_runs() -> Any:
         ]
         results += plain(
             [
-                error_of(lambda: comparing.find([first])),
-                error_of(lambda: comparing.find([first, first])),
+                outcome(lambda: comparing.find([first])),
+                outcome(lambda: comparing.find([first, first])),
             ],
             folder,
         )
@@ -291,7 +291,7 @@ def pages_of_runs() -> Any:
         files = [folder / "r5.json", folder / "s3.json"]
         results += [
             plain(
-                error_of(lambda some=some: [pair.model_dump() for pair in study.tally(some)]),
+                outcome(lambda some=some: [pair.model_dump() for pair in study.tally(some)]),
                 folder,
             )
             for some in (files, files[::-1], files[:1] * 2, [folder / "t1.json"], [])
@@ -464,7 +464,7 @@ LINKS = [
 def links_of_the_demo() -> Any:
     results: list[Any] = []
     for link in LINKS:
-        request = error_of(lambda link=link: parse_query(query_pairs(link)))
+        request = outcome(lambda link=link: parse_query(query_pairs(link)))
         results.append(str(request) if isinstance(request, str) else request.query())
         if isinstance(request, str):
             continue
@@ -472,22 +472,22 @@ def links_of_the_demo() -> Any:
             results.append([(source, str(keywords)) for source, keywords in request.steps(kind)])
             results.append(request.targets(kind) if request.path else None)
         results += [request.python("text", device) for device in ("cpu", "cuda:1")]
-        results.append(error_of(lambda request=request: studio.check_length(request)))
+        results.append(outcome(lambda request=request: studio.check_length(request)))
         for model in (diffusion(), labeled()):
             results.append(
-                error_of(lambda model=model, request=request: str(studio._plan(model, request)))
+                outcome(lambda model=model, request=request: str(studio._plan(model, request)))
             )
     long = [
         checked({"text": text, "seconds": seconds})
         for text in ("a @15 | b", "a | b")
         for seconds in (None, 15, 15.01)
     ]
-    results += [error_of(lambda one=one: studio.check_length(one)) for one in long]
+    results += [outcome(lambda one=one: studio.check_length(one)) for one in long]
     results += [
-        error_of(lambda count=count: len(query_pairs("&".join(["a=1"] * count))))
+        outcome(lambda count=count: len(query_pairs("&".join(["a=1"] * count))))
         for count in (50, 51)
     ]
-    results.append([error_of(lambda n=n: studio._numbered([walk()], n).id) for n in (0, 1)])
+    results.append([outcome(lambda n=n: studio._numbered([walk()], n).id) for n in (0, 1)])
     return results
 
 
@@ -502,7 +502,7 @@ def parts_of_the_page() -> Any:
             {"actions": []},
         )
     ]
-    examples = [error_of(lambda model=model: list(_examples(model))) for model in models]
+    examples = [outcome(lambda model=model: list(_examples(model))) for model in models]
     pages = [
         _buttons({"a<b": "", "c": "data:x"}),
         _links([("a?b", "N"), ("c", "M")]),
@@ -584,7 +584,7 @@ def live_streams() -> Any:
         (255, "wave", (), 120.1),
     ):
         time[0] += seconds
-        block = error_of(
+        block = outcome(
             lambda begin=begin, text=text, path=path: live.block(name, text, begin, path)
         )
         if isinstance(block, str):
@@ -601,7 +601,7 @@ def live_streams() -> Any:
                 kept.joints.astype(float),
             )
         )
-    results += [error_of(lambda end=end: live.file("x", end)) for end in (".exe", ".bvh")]
+    results += [outcome(lambda end=end: live.file("x", end)) for end in (".exe", ".bvh")]
     return results
 
 
@@ -651,7 +651,7 @@ def checks_of_commands() -> Any:
             settings: Any = SimpleNamespace(format=ending, character=character)
             results.append(
                 plain(
-                    error_of(
+                    outcome(
                         lambda settings=settings: str(
                             convert._targets(settings, folder, Path("out"))
                         )
@@ -666,19 +666,7 @@ def checks_of_commands() -> Any:
     return results
 
 
-CASES: list[Case] = [
-    numbers_on_pages,
-    axes_and_plots,
-    results_of_runs,
-    pages_of_runs,
-    cards_of_audits,
-    clips_that_are_found,
-    links_of_the_demo,
-    parts_of_the_page,
-    addresses_and_limits,
-    live_streams,
-    checks_of_commands,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.recorded import Case, check, record, some_bodies
+from support.recorded import Case, cases_of, check, outcome, record, some_bodies
 from support.runs import TINY, untrained
 from support.sampled import (
     FEW,
@@ -21,7 +21,6 @@ from support.sampled import (
     WAVE,
     diffusion,
     dip,
-    error_of,
     facts,
     labeled,
     plain,
@@ -76,7 +75,7 @@ def streams_of_texts() -> Any:
         results.append(blocks_of(running, 4))
         results.append((running.frames, running.text, running.reached))
         if cleanup:
-            results.append(error_of(lambda running=running: running.go_back(1.0)))
+            results.append(outcome(lambda running=running: running.go_back(1.0)))
             continue
         back = running.frames - min(9, 2 * running._streams.block)
         running.go_back(back / 20)
@@ -87,9 +86,9 @@ def streams_of_texts() -> Any:
         running.lead([])
         results.append(blocks_of(running, 1))
         results += [
-            error_of(lambda at=at, running=running: running.go_back(at)) for at in (-0.05, 99.0)
+            outcome(lambda at=at, running=running: running.go_back(at)) for at in (-0.05, 99.0)
         ]
-        results.append(error_of(lambda running=running: running.change(WALK, at=0.2)))
+        results.append(outcome(lambda running=running: running.change(WALK, at=0.2)))
     return results
 
 
@@ -107,7 +106,7 @@ def refusals_of_streams() -> Any:
         lambda: waypoints.Route([(float("nan"), 1)]), lambda: waypoints.Route([(1, 2)]).points,
     ]  # fmt: skip
     return [
-        str(error_of(call))[:300] if number != 16 else call() for number, call in enumerate(calls)
+        str(outcome(call))[:300] if number != 16 else call() for number, call in enumerate(calls)
     ]
 
 
@@ -237,12 +236,11 @@ TARGETS: list[dict[str, Any]] = [
 def targets_and_refusals() -> Any:
     representation = diffusion().representation
     results: list[Any] = [
-        error_of(lambda one=one: shown_targets(read_targets(representation, one)))
-        for one in TARGETS
+        outcome(lambda one=one: shown_targets(read_targets(representation, one))) for one in TARGETS
     ]
     many = [{"time": 60.0 + k, "position": [k * 0.1, 2.0]} for k in range(301)]
     results += [
-        error_of(lambda rows=rows: shown_targets(read_targets(representation, {"root": rows})))
+        outcome(lambda rows=rows: shown_targets(read_targets(representation, {"root": rows})))
         for rows in (many[:300], many)
     ]
     with temporary() as folder:
@@ -255,7 +253,7 @@ def targets_and_refusals() -> Any:
             (folder / "t.json").write_text(json.dumps({"poses": [{**pose, **extra}]}))
             results.append(
                 plain(
-                    error_of(
+                    outcome(
                         lambda folder=folder: shown_targets(
                             read_targets(representation, folder / "t.json")
                         )
@@ -286,9 +284,9 @@ def windows_of_targets() -> Any:
             torch.tensor([0.8]).double(), torch.tensor([[1.0, 0.0, -2.0]]).double()
         )
         results.append(root_target(window, frames, placement))
-    results += [error_of(lambda n=n: posed.check_end(n, 20.0)) for n in (68, 69, 20)]
+    results += [outcome(lambda n=n: posed.check_end(n, 20.0)) for n in (68, 69, 20)]
     results.append(
-        error_of(lambda: Targets(targets.positions, ((99, torch.ones(3)),)).check_end(80, 30.0))
+        outcome(lambda: Targets(targets.positions, ((99, torch.ones(3)),)).check_end(80, 30.0))
     )
     empty = Targets(Positions(*(x[:0] for x in vars(targets.positions).values())), posed.poses)
     for one in (posed, targets, empty):
@@ -321,7 +319,7 @@ def prompt_files() -> Any:
         for content in contents:
             path = folder / "prompts.txt"
             path.write_text(content, encoding="utf-8")
-            file = error_of(lambda path=path: PromptFile.read(str(path)))
+            file = outcome(lambda path=path: PromptFile.read(str(path)))
             if isinstance(file, str):
                 results.append(plain(file, folder))
                 continue
@@ -329,7 +327,7 @@ def prompt_files() -> Any:
             file.refuse({0: UserError("not\nthis")})
             results.append((file.accepted, plain(file.report(), folder)))
             results += [
-                error_of(lambda file=file, lengths=lengths: file.lengths("seconds", lengths))
+                outcome(lambda file=file, lengths=lengths: file.lengths("seconds", lengths))
                 for lengths in (None, 3, list(range(len(file.lines))), [1, 2, 3])
             ]
     return results
@@ -339,7 +337,7 @@ def outputs_of_commands() -> Any:
     results: list[Any] = []
     models = [diffusion(), labeled(), dip()]
     for model in models:
-        results.append(error_of(lambda model=model: output.refuse_no_condition(model)))
+        results.append(outcome(lambda model=model: output.refuse_no_condition(model)))
     for title, rest in (
         ("A person walks!", ()),
         ("a person walks!", (1, "x")),
@@ -391,20 +389,18 @@ def motions_that_are_read() -> Any:
     for name in names:
         results.append(
             plain(
-                error_of(
-                    lambda name=name: shown(read_motion(representation, name, data_root=root))
-                ),
+                outcome(lambda name=name: shown(read_motion(representation, name, data_root=root))),
                 root,
             )
         )
     slow = SimpleNamespace(name=representation.name, fps=12.5)
     other: Any = slow
-    results.append(plain(error_of(lambda: read_motion(other, names[0], data_root=root)), root))
+    results.append(plain(outcome(lambda: read_motion(other, names[0], data_root=root)), root))
     cuts: list[Any] = [[0.2, 1.4], [0, 1.85], [0, 1.9], [1, 1], [-0.1, 1], "ab", [1, 2, 3]]
     for cut in cuts:
-        results.append(error_of(lambda cut=cut: shown(part_of(representation, walk(), cut))))
+        results.append(outcome(lambda cut=cut: shown(part_of(representation, walk(), cut))))
     unnamed = replace(walk(), id="")
-    results.append(error_of(lambda: part_of(representation, unnamed, [0, 99])))
+    results.append(outcome(lambda: part_of(representation, unnamed, [0, 99])))
     with temporary() as folder:
         walk().save(folder / "walk.bvh")
         walk().save(folder / "walk.npz")
@@ -429,7 +425,7 @@ def motions_that_are_read() -> Any:
         Motion(walk().joints[:1], 20.0), Motion(walk().joints[:2], 20.0), Motion(walk().joints * 0.4, 20.0),
     ]  # fmt: skip
     for motion in wrong:
-        results.append(error_of(lambda motion=motion: shown(with_features(representation, motion))))
+        results.append(outcome(lambda motion=motion: shown(with_features(representation, motion))))
     features = torch.from_numpy(walk().features).clone()
     features[3:7, 70:80] = 0
     results.append(shown(decoded(representation, features, "x", "y")))
@@ -464,7 +460,7 @@ def sets_and_refusals() -> Any:
             path.write_text(SET.replace(old, new) if old else SET)
             results.append(
                 plain(
-                    error_of(lambda path=path: motion_sets.read_set(str(path)).model_dump()), folder
+                    outcome(lambda path=path: motion_sets.read_set(str(path)).model_dump()), folder
                 )
             )
         path.write_text(SET)
@@ -475,10 +471,10 @@ def sets_and_refusals() -> Any:
     ]  # fmt: skip
     for values in changes:
         results.append(
-            error_of(lambda values=values: motion_sets.changed(content, **values).model_dump())
+            outcome(lambda values=values: motion_sets.changed(content, **values).model_dump())
         )
     results += [
-        error_of(lambda name=name: str(motion_sets.read_set(name)))
+        outcome(lambda name=name: str(motion_sets.read_set(name)))
         for name in ("locomotio", "a.json")
     ]
     results.append(motion_sets.read_set("locomotion").model_dump())
@@ -561,22 +557,7 @@ def sets_of_a_model() -> Any:
     )  # fmt: skip
 
 
-CASES: list[Case] = [
-    streams_of_texts,
-    refusals_of_streams,
-    several_streams,
-    schedules,
-    placements,
-    paths_that_bend_to_waypoints,
-    targets_and_refusals,
-    windows_of_targets,
-    prompt_files,
-    outputs_of_commands,
-    motions_that_are_read,
-    sets_and_refusals,
-    clips_of_sets,
-    sets_of_a_model,
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from support.recorded import Case, check, combinations, record
+from support.recorded import Case, cases_of, check, combinations, record
 
 from flame_mdm.seeds import key, seed_generator
 
@@ -26,7 +26,7 @@ def draws_of_seeds() -> Any:
     return draws
 
 
-CASES: list[Case] = [keys_of_parts, draws_of_seeds]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 from lightning import Callback, LightningModule
-from support.outcomes import outcome, printed, without, workspace
-from support.recorded import Case, check, combinations, record
+from support.outcomes import printed, without, workspace
+from support.recorded import Case, cases_of, check, combinations, outcome, record
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
@@ -159,8 +159,10 @@ def schedules_of_checkpoints() -> Any:
             if trainer.global_step == options["signal"]:
                 callback.stop.signum = 15
             trainer.should_stop = trainer.global_step == options["stop"]
-            end = outcome(callback.on_train_batch_end, trainer, task)
-            if end:
+            try:
+                callback.on_train_batch_end(trainer, task)
+            except callbacks.Interrupted as interruption:
+                end = str(interruption)
                 break
         rows.append([options, trainer.saved, end])
     stop = callbacks.Interrupted(2, 7)
@@ -556,7 +558,8 @@ def last_lines_of_training() -> Any:
         ("none", {"dataset": "synthetic"}, {}, True),
     ):
         task: Any = mock.Mock(spec=callbacks.GeneratorTask)
-        task.facts, task.config, task.generator = facts, {}, SimpleNamespace(conditioned_on=kind)
+        task.facts = {"actions": [], **facts}
+        task.config, task.generator = {}, SimpleNamespace(conditioned_on=kind)
         trainer: Any = Trainer(callback_metrics=metrics, is_global_zero=zero, global_step=7)
         with mock.patch.object(callbacks, "write_report", lambda folder: f"{folder}/r.html"):
             rows.append(printed(callbacks.Report(Path("run x")).on_fit_end, trainer, task))
@@ -682,7 +685,7 @@ def newest_checkpoints() -> Any:
         io = checkpointing.AtomicCheckpoints(
             Path("k/checkpoints"), checkpointing.Resumed(Path("p"), 3, {"a": 1})
         )
-        rows += [io.load_checkpoint("x"), io.resumed is None, str(outcome(io.load_checkpoint, "x"))]
+        rows += [io.load_checkpoint("x"), io.resumed is None]
         for name in ("last.ckpt", "last.ckpt", "step=1.ckpt", "step=1.ckpt"):
             io.save_checkpoint(_checkpoint(), Path("k/checkpoints", name))
         Path("k/other").write_text("")
@@ -2421,15 +2424,7 @@ def recipes_of_adaptations() -> Any:
     return rows
 
 
-CASES: list[Case] = [
-    value
-    for name, value in list(globals().items())
-    if callable(value)
-    and getattr(value, "__module__", "") == __name__
-    and not name.startswith("_")
-    and not isinstance(value, type)
-    and name not in ("drawn", "hub_file", "re_first")
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

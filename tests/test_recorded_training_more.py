@@ -11,8 +11,8 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from support.outcomes import outcome, printed, without, workspace
-from support.recorded import Case, check, record
+from support.outcomes import printed, without, workspace
+from support.recorded import Case, cases_of, check, outcome, record
 
 from flame_mdm import errors
 from flame_mdm.config import building, command_line, composition, jobs, options, signatures, sweeps
@@ -1009,14 +1009,7 @@ def fields_of_options() -> Any:
     return rows
 
 
-CASES: list[Case] = [
-    value
-    for name, value in list(globals().items())
-    if callable(value)
-    and getattr(value, "__module__", "") == __name__
-    and not name.startswith("_")
-    and not isinstance(value, type)
-]
+CASES = cases_of(globals())
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,4 +1,4 @@
-"""Results of calls that may be refused, and what they print, without the path of a temporary folder."""
+"""Printed lines and working folders, for tests with recorded results."""
 
 import io
 import os
@@ -8,13 +8,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
-
-def outcome(action: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """The result of a call, or its error with the class."""
-    try:
-        return action(*arguments, **options)
-    except (Exception, SystemExit) as error:
-        return f"{type(error).__name__}: {error}"
+from support.recorded import outcome
 
 
 def printed(action: Callable[..., Any], *arguments: Any, **options: Any) -> list[Any]:

@@ -5,6 +5,7 @@ varied inputs. `tests/golden/recorded/NAME.json` contains the summaries of their
 the module with `PYTHONPATH=tests python tests/test_recorded_NAME.py`, look at the difference and commit the file.
 """
 
+import inspect
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.data.synthetic import example
 from flame_mdm.data.synthetic_actions import ACTIONS
+from flame_mdm.errors import UserError
 from support.fixtures import GOLDEN
 
 FOLDER = GOLDEN / "recorded"
@@ -28,7 +30,18 @@ RTOL, ATOL = 1e-4, 1e-6
 # The joint on the other side of each joint
 MIRRORED = [0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20]
 
+# Errors with which the product refuses its input. All other errors are bugs, and end the test.
+REFUSALS = (UserError, ValueError, OSError, SystemExit)
+
 Case = Callable[[], Any]
+
+
+def outcome(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Returns the result of a call, or the kind and the text of its refusal."""
+    try:
+        return call(*arguments, **options)
+    except REFUSALS as error:
+        return f"{type(error).__name__}: {error}"
 
 
 def summary(value: Any) -> Any:
@@ -84,6 +97,20 @@ def differences(value: Any, recorded: Any, path: str = "") -> list[str]:
         near = abs(value - recorded) <= ATOL + RTOL * abs(recorded)
         return [] if near else [f"{path}: {value}, recorded: {recorded}"]
     return [] if value == recorded else [f"{path}: {value}, recorded: {recorded}"]
+
+
+def cases_of(namespace: Mapping[str, Any]) -> list[Case]:
+    """Returns the cases of a test module: its public functions without parameters that return Any."""
+    cases: list[Case] = []
+    for name, value in namespace.items():
+        function = inspect.unwrap(value) if callable(value) else None
+        if not inspect.isfunction(function) or name.startswith("_"):
+            continue
+        signature = inspect.signature(function)
+        is_defined_here = function.__module__ == namespace["__name__"]
+        if is_defined_here and not signature.parameters and signature.return_annotation is Any:
+            cases.append(value)
+    return cases
 
 
 def check(name: str, case: Case) -> None:

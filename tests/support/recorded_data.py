@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flame_mdm.data import Clip
+from support.recorded import REFUSALS
 
 
 @cache
@@ -38,7 +39,7 @@ def outcome(call: Callable[[], Any]) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return call()
-    except Exception as error:
+    except REFUSALS as error:
         return f"{type(error).__name__}: {plain(error)}"
 
 

@@ -13,7 +13,6 @@ import torch
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.standing import standing
 from flame_mdm.data.synthetic import prompts
-from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.reading import with_features
@@ -23,14 +22,6 @@ from support.runs import TINY, TINY_DIP, untrained
 
 FEW: dict[str, Any] = {"num_inference_steps": 2}
 WALK, WAVE = "a person walks forward", "a person waves"
-
-
-def error_of(call: Callable[[], Any]) -> Any:
-    """The result of a call, or the text of its refusal."""
-    try:
-        return call()
-    except UserError as error:
-        return f"{type(error).__name__}: {error}"
 
 
 @contextmanager

@@ -2,13 +2,10 @@
 
 import hashlib
 import re
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-
-from flame_mdm.errors import UserError
 
 NUMBER = re.compile(r"(?<![A-Za-z_\d])-?\d+\.?\d*(?:e[-+]?\d+)?")
 
@@ -25,14 +22,6 @@ def traits(values: Any, parts: int = 5) -> list[float]:
         weights = np.random.default_rng(part.size).standard_normal(part.size)
         sums.append(float(part.ravel() @ weights / np.sqrt(part.size)))
     return sums
-
-
-def outcome(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """The result of a function, or the message of its refusal."""
-    try:
-        return function(*arguments, **options)
-    except (UserError, ValueError, FileNotFoundError) as error:
-        return f"{type(error).__name__}: {error}"
 
 
 def text_traits(text: str) -> list[Any]:

@@ -3,6 +3,8 @@
 See docs/benchmarks/speed.md.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -87,12 +89,12 @@ class CheapDropout(nn.Module):
     The probability is rounded to a multiple of 2^-15. On a CPU, torch's dropout draws one random
     number per element in a single thread, which takes a fifth of the time of a training step.
 
-    A random number is split into four 16-bit integers x, and each of them becomes eight integers
-    a x + b (modulo 2^16) with random a (odd) and b, which are the same for all elements of a call.
-    Any two of these integers are independent (Carter and Wegman 1979, universal hashing).
+    A random number is split into four 16-bit integers x. Each of them becomes eight integers
+    a x + b (modulo 2^16). The eight odd numbers a and the eight numbers b are drawn once per call.
+    Any two of the integers are independent, because x and b are uniformly distributed.
     """
 
-    # 16-bit integers that are computed from a drawn one
+    # Number of 16-bit integers that are computed from each drawn one
     COPIES = 8
     # The number 1 in bfloat16
     ONE = torch.ones((), dtype=torch.bfloat16).view(torch.int16).item()
@@ -117,9 +119,10 @@ class CheapDropout(nn.Module):
 
     def _random_integers(self, count: int) -> Tensor:
         """Returns random 16-bit integers (count,)."""
-        words = torch.empty(-(-count // (4 * self.COPIES)), dtype=torch.int64)
+        words = torch.empty(math.ceil(count / (4 * self.COPIES)), dtype=torch.int64)
         words.random_(-(2**63), None)
-        factors, offsets = torch.randint(2**15, (2, self.COPIES, 1), dtype=torch.int16)
+        shape = (2, self.COPIES, 1)
+        factors, offsets = torch.randint(-(2**15), 2**15, shape, dtype=torch.int16)
         numbers = words.view(torch.int16) * (2 * factors + 1) + offsets
         return numbers.flatten()[:count]
 

@@ -85,7 +85,7 @@ def pool() -> Iterator[GlooPool]:
 
 @pytest.fixture
 def composed_once(monkeypatch) -> None:
-    """What tables and pages read from recipes comes from recipes that are composed once."""
+    """Tables and pages read recipes that are composed only once."""
     monkeypatch.setattr("flame_mdm.reporting.tables.settings.compose", recipe)
 
 

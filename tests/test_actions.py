@@ -45,7 +45,7 @@ from flame_mdm.runs import read_history
 
 
 class Attack:
-    """What a hostile pickle does: calls a function when it is read."""
+    """A hostile pickle, which calls a function when it is read."""
 
     def __init__(self, function, *arguments):
         self.call = function, arguments
@@ -434,7 +434,7 @@ def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
     ]
     result = measure(tmp_path / "real.json", *words)
     assert result["ground_truth"]["accuracy"]["mean"] > 0.5, "motions that were not trained on"
-    assert result["values"]["accuracy"]["mean"] < 0.2, "those of other actions"
+    assert result["values"]["accuracy"]["mean"] < 0.2, "the labels belong to other actions"
     assert all(value["mean"] is not None for value in result["values"].values())
     assert result["extractor"]["data"] == result["data"]["fingerprint"]
 

@@ -278,7 +278,7 @@ def unsafe_calls(text: str) -> list[str]:
 
 
 ON_DEMAND = ["torch.load(path, map_location='cpu', weights_only=not run_code)"]
-"""What `run_code_in_file=true` asks for, in `flame_mdm.checkpoints` alone."""
+"""Uses of `run_code_in_file=true`, which only `flame_mdm.checkpoints` may have."""
 
 
 def test_no_untrusted_file_or_word_is_executed():

@@ -65,7 +65,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(package: Path, requests: list[Any], folder: Path) -> list[Any]:
-    """What tests/support/blender_extension.py finds: names and joints (F, J, 3) of each motion, or an error."""
+    """Name and joints (F, J, 3) of each motion in tests/support/blender_extension.py, or an error."""
     (folder / "requests.json").write_text(json.dumps(requests))
     command = [
         blender(),

@@ -44,7 +44,7 @@ def twisting() -> Motion:
 
 
 def largest_angle(motion: Motion, expected: torch.Tensor) -> float:
-    """Largest angle in radians between the rotations of a file's bones and those of a body, (F, 22, 3, 3)."""
+    """Largest angle, in radians, between a file's bones and the rotations of a body (F, 22, 3, 3)."""
     assert motion.bones.poses is not None, motion.bones.reason
     between = expected.mT @ motion.bones.poses.rotations
     vectors = Rotation.from_matrix(between.reshape(-1, 3, 3).numpy()).as_rotvec()

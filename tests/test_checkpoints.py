@@ -884,7 +884,7 @@ def test_a_card_requests_what_the_model_is_conditioned_on_and_lists_the_parts_of
     assert "| weights: averaged | False |" in card
     assert "| CC0 | 3 | 1.5 | run | CC0: no conditions. |" in card
     assert "| of my own | 20 | 0.0 |" in card
-    assert "license: cc-by-nc-4.0" not in card, "the terms are those of the parts"
+    assert "license: cc-by-nc-4.0" not in card, "each part has its own license"
 
 
 @pytest.mark.parametrize("is_moved", [True, False])

@@ -19,11 +19,11 @@ STANDS, LIES = "stands", "lies"
 
 @dataclass
 class Row:
-    """What commands say of a file.
+    """A file and the messages of all commands about it.
 
     Attributes:
         result: whether the body of the motion stands or lies; "" if the file is refused.
-        says: what is printed about the file by every command, a regular expression.
+        says: regular expression of the message that every command prints about the file.
         keys: keys of the command; `prepare` finds them in skeleton.yaml.
         refused_by_prepare: what `prepare` says if it alone refuses the file.
     """

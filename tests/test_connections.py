@@ -74,7 +74,7 @@ def served(**limits: Any) -> Iterator[Client]:
 
 
 def received(client: socket.socket, end: bytes = b"") -> bytes:
-    """What the server sends until `end`, or until it closes the connection."""
+    """All bytes that the server sends until `end`, or until it closes the connection."""
     content = b""
     with contextlib.suppress(ConnectionResetError):
         while part := client.recv(2**16):

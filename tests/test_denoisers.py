@@ -1,4 +1,4 @@
-"""What every denoiser of `experiments/denoiser` promises."""
+"""Properties that every denoiser of `experiments/denoiser` must have."""
 
 from dataclasses import replace
 from functools import partial

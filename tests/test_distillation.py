@@ -686,7 +686,7 @@ def test_files_contain_the_changes_of_later_layers_and_for_actions_of_all(tmp_pa
 
 @pytest.mark.parametrize("rank", [2, 32])
 def test_a_new_adapter_changes_nothing_and_its_first_gradients_do_not_depend_on_the_width(rank):
-    """`up` is zero, and the variance of `down` is that of a usual linear layer, whatever the rank."""
+    """`up` is zero, and `down` has the variance of a usual linear layer at every rank."""
     about: About = {**ABOUT, "rank": rank, "rows": [3, 5]}
     model = build("denoiser.ff_size=400")
     before = {name: value.clone() for name, value in model.state_dict().items()}

@@ -647,7 +647,7 @@ def scored(evaluation: Evaluation, inputs: Any) -> list[Any]:
 
 
 def test_motions_of_others_are_compared_with_the_real_motions_of_the_same_clips():
-    """In the first replication all motions are there, in the second one those of two clips."""
+    """The first replication contains all motions, the second one the motions of two clips."""
     rows = rows_of([5, 5, 5, 5])
     protocol: Any = SimpleNamespace(
         rows=lambda clips, seed, replication: rows, smoothing=None, metrics={}
@@ -1019,8 +1019,8 @@ def metrics_of_protocols() -> dict[str, SampleMetric]:
     return metrics
 
 
-# Units of values and directions in which they improve, which are not those of most values: "" and
-# "higher", or "lower" of a distance, an error or a fault.
+# Units of values, and the direction in which they improve, where they differ from most values.
+# Most values have the unit "" and improve upward; distances, errors and faults improve downward.
 UNITS: dict[str, str] = {
     **{"MutualInformationDivergence": "nats", "JointVariance": "m^2", "Jitter": "m/s^3"},
     **dict.fromkeys(("Penetration", "Floating", "DisplacementErrors", "KeptDrift"), "m"),
@@ -1332,7 +1332,7 @@ def test_results_of_baselines_and_files_have_names_that_state_how_they_differ(mo
         assert plan.path == Path("x/y/p-1-01234567.json")
         assert (plan.protocol.replications, plan.protocol.samples) == (3, None)
         assert plan.protocol.resized_samples == (samples is not None)
-    assert plan_of(batch_size=8).batch_size == 8, "that of a protocol that measures time"
+    assert plan_of(batch_size=8).batch_size == 8, "batches of 1 are for protocols that measure time"
     assert plan_of().batch_size == 1
 
 

@@ -369,7 +369,7 @@ KILLS = int(os.environ.get("FLAME_MDM_KILLS", "4"))
 
 
 def result(folder: Path) -> Any:
-    """What must be the same after kills."""
+    """Results that must be the same after a run was killed and resumed."""
     content = read_checkpoint(folder / "checkpoints" / LAST)
     states = content["state_dict"], content["current_model_state"]
     return content["global_step"], [

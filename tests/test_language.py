@@ -1,4 +1,4 @@
-"""What sentences are understood to ask for, and what a model makes of them."""
+"""How sentences are understood, and the words that a model gets for them."""
 
 import hashlib
 import json
@@ -803,7 +803,7 @@ WITH_CHIPS = [
 
 
 def golden() -> dict[str, dict[str, Any]]:
-    """What the committed file holds."""
+    """Contents of the committed file of understood and rewritten sentences."""
     readers = models()
     return {
         "understood": {text: shown_understanding(text) for text in all_texts()},

@@ -353,7 +353,7 @@ class Numbered:
 
 @pytest.fixture
 def shown(model, monkeypatch) -> list[tuple[Motion, int]]:
-    """What the player gets of numbered streams at 30 frames per second: motions and numbers of frames before."""
+    """Motions of numbered streams that the player gets at 30 fps, with the number of frames before each."""
     packed: list[tuple[Motion, int]] = []
     monkeypatch.setattr(model.representation, "fps", 30.0)
     monkeypatch.setattr(making, "stream", lambda model, text: Numbered(30.0))

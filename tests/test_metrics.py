@@ -861,7 +861,7 @@ def test_every_frame_transition_has_the_same_weight_in_the_physics_of_several_mo
 
 @pytest.mark.parametrize(("point", "share"), [(4.0, 1), (4.001, 0), (-2.0, 1), (-2.001, 0)])
 def test_the_manifold_of_a_sample_ends_at_its_third_neighbor(point: float, share: int):
-    """The third neighbors of 0 and of 2 are 2 away, those of the samples between them less."""
+    """The third neighbors of 0 and 2 are 2 away; the samples between them have nearer ones."""
     samples = torch.tensor([[0.0], [1.0], [1.5], [2.0]], dtype=torch.float64)
     points = torch.tensor([[point]], dtype=torch.float64)
     assert distribution.manifold_coverage(points, samples).item() == share

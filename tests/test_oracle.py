@@ -21,7 +21,7 @@ GENERATION = [
 
 
 def family(name: str) -> str:
-    """What decides how a recipe's motions are sampled."""
+    """Options of a recipe that change how its motions are sampled."""
     config, task = recipe(name), recipe(name)["task"]
     return repr(
         [config["process"], config["representation"], task["sampler"], task["num_inference_steps"]]
@@ -46,7 +46,7 @@ def traveller(representation: Representation) -> Tensor:
             len(raw), -1, -1
         )
         features = representation.encode(skeleton.assemble(bones, raw[:, [0, 2, 1]]))
-        # The std is as small as for real velocities, so that normalized features reach beyond 1.
+        # The std is as small as for real velocities, so that normalized features exceed 1.
         representation.std.fill_(0.05)
     return representation.normalize(features.double())[None]
 

@@ -223,7 +223,7 @@ def test_a_missing_source_or_another_set_is_refused_with_where_to_get_it(
 
 
 def words_of(data: str, takes: Path, root: Path) -> list[str]:
-    """What names a small generated set on the command line; its parts are read by one process."""
+    """Command-line options of a small generated set whose parts are read by one process."""
     if data == "bandai":
         return [f"source={takes}", "data.source.workers=1"]
     if data in ("humanml3d", "kit"):

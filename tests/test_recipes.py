@@ -124,7 +124,7 @@ def shortened(name: str) -> dict[str, Any]:
 
 
 def decisive(name: str) -> str:
-    """What decides how a training step is computed."""
+    """Options of a recipe that change how a training step is computed."""
     config = shortened(name)
     options = [config["task"]["cond_drop_prob"] > 0, config["losses"], config["optimizer"]]
     return repr(

@@ -557,7 +557,7 @@ def memorized_motions() -> Any:
 
 
 def declared_properties() -> Any:
-    """What every metric declares about its values and inputs."""
+    """Declarations of every metric about its values and inputs."""
     results = {}
     for module in MODULES:
         for name, kind in inspect.getmembers(module, inspect.isclass):
@@ -667,7 +667,7 @@ def seen_in(kind: str) -> dict[str, dict[str, Any]]:
 
 
 def brief(seen: Mapping[str, Any]) -> str:
-    """What was seen, in one line."""
+    """The attributes of a motion and the results of its checks, in one line."""
     parts = [" ".join(map(str, value.values())) for value in seen.get("checks", {}).values()]
     shown = " ".join(str(seen[name]) for name in seen if name != "checks")
     return f"{shown} | {', '.join(parts)}"

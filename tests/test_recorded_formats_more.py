@@ -35,7 +35,7 @@ RIGS = (None, "mixamo", "unreal", "unity", "rigify", "lafan1", "soma", "cmu", "1
 
 
 def read_traits(recording: Any) -> Any:
-    """What a reader returns, or its refusal."""
+    """Summary of the motion that a reader returns, or its error message."""
     if isinstance(recording, str):
         return recording
     read = recording.motion

@@ -1065,6 +1065,6 @@ def test_the_command_marks_frames_of_the_motion_and_counts_all_verdicts(
     for name, text in texts.items():
         marks = [m for v in judgments[name].verdicts for m in v.marks(FPS, 60)]
         assert [mark[:3] for mark in shown[text]] == [list(mark[:3]) for mark in marks]
-    # A text on the command line replaces those of the files
+    # A text on the command line replaces the texts of the files
     assert main(["judge", "motions", "page.html", f"text={texts['a']}"]) == 0
     assert {motion["caption"] for motion in Page(tmp_path / "page.html").motions} == {texts["a"]}

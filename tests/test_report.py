@@ -1,4 +1,4 @@
-"""What a run tells while it trains, and the page that shows it."""
+"""Messages of a run while it trains, and the page that shows them."""
 
 import contextlib
 import io
@@ -70,7 +70,7 @@ def run(folder: Path, data_root: Path, *words: str, recipe: str = "quickstart") 
 
 @pytest.fixture(scope="module")
 def printed() -> io.StringIO:
-    """What the run `evaluated` printed."""
+    """Text that the run `evaluated` printed."""
     return io.StringIO()
 
 

@@ -663,7 +663,7 @@ def test_meshes_of_a_character_keep_their_parts_materials_and_images(kick: Motio
     # The second part is bound to no joint, so it follows its node.
     assert second.bones.tolist() == [[0]] * len(second.points)
     np.testing.assert_array_equal(second.binds, np.eye(4)[None])
-    # It has no normals, so they are computed; the first part has those of the same surface.
+    # It has no normals, so they are computed. The first part has the normals of the same surface.
     np.testing.assert_allclose(np.linalg.norm(second.normals, axis=1), 1)
     assert (first.normals * second.normals).sum(1).mean() > 0.98
 

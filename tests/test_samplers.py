@@ -530,9 +530,9 @@ def test_a_guide_sees_estimates_at_the_time_of_the_step_and_steers_no_further_th
 def test_blended_parts_are_as_noisy_as_the_rest_and_each_noisy_step_is_resampled(
     blend, resample, sampler, subtests
 ):
-    """What the denoiser sees of a kept part is the known motion, corrupted to exactly the step it is told.
+    """A denoiser sees a kept part as the known motion, corrupted to exactly the given step.
 
-    So is what it sees of the rest at the second visit of a step, if it knows the motion.
+    At the second visit of a step, the rest is as noisy, if the denoiser knows the motion.
     """
     process, known = GaussianDiffusion(100), torch.full((1, 1, 4000), 2.0)
     seen = []

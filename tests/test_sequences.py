@@ -113,7 +113,7 @@ def test_windows_share_half_a_second_but_at_most_a_third_of_the_longest_motion(
 
 
 def sized(fps: float, longest: int, context: int = 0) -> Any:
-    """What lengths depend on: a model of motions of up to `longest` frames."""
+    """A model of motions of up to `longest` frames, which determine the lengths of parts."""
     return SimpleNamespace(
         representation=SimpleNamespace(fps=fps),
         facts={"max_frames": longest},

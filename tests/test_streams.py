@@ -487,7 +487,7 @@ def test_times_are_rounded_to_the_nearest_frame(model):
 
 
 def test_a_path_is_straight_from_where_the_last_block_ended(model, monkeypatch):
-    """The way to a target starts at the root of the last frame."""
+    """The path to a target starts at the root of the last frame."""
     starts, ends = [], []
     window = Targets.window
 

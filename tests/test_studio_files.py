@@ -186,7 +186,7 @@ def seconds(fps: float) -> str:
 
 
 def in_blender(out: Path, fps: float, files: list[Path]) -> list[dict[str, Any]]:
-    """What tests/support/blender_import.py finds in files."""
+    """Contents of files as tests/support/blender_import.py reads them in Blender."""
     script = ROOT / "tests/support/blender_import.py"
     words = [str(out), f"{fps:g}", ",".join(map(str, FRAMES)), *map(str, files)]
     subprocess.run([blender(), str(script), *words], capture_output=True, check=True)

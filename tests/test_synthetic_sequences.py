@@ -102,7 +102,7 @@ def test_the_clips_do_not_change():
 
 
 def test_nothing_jumps_where_motions_meet(clips: list[Clip]):
-    """Speed and jerk of all joints are at most those of clips with one motion, which have no seam."""
+    """No joint has a larger speed or jerk than in clips with one motion, which have no seam."""
     single = [Synthetic(240, seed=2, actions="all").clip(n, FPS).motion for n in range(240)]
 
     def largest(motions: list[np.ndarray], order: int) -> float:

@@ -254,7 +254,7 @@ WRITERS: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "adapt": (adapter, ["mine.safetensors"]),
     "convert": (motion_files, [f"walk{ending}" for ending in CONVERTED]),
 }
-"""What the product writes in a folder of others, and the names of the files."""
+"""Functions that write into a folder of others, with the names of their files."""
 
 CASES = [(writer, name) for writer, (_, names) in WRITERS.items() for name in names]
 FOLDERS = sorted({(writer, name.partition("/")[0]) for writer, name in CASES if "/" in name})

@@ -73,7 +73,7 @@ def models() -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the scripts of the page understand of all texts, and the choices that they offer."""
+    """Readings of all texts by the scripts of the page, and the choices that they offer."""
     folder = tmp_path_factory.mktemp("language")
     for path in (ROOT / "tools" / "web").glob("language_*.js"):
         shutil.copy(path, folder)

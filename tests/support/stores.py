@@ -133,7 +133,7 @@ VIDEOS = [
 
 
 def write_uestc(folder: Path, **changed) -> Path:
-    """What ACTOR hands out: one pickle of three lists of float32 arrays, and text files beside it."""
+    """Files as ACTOR publishes them: one pickle of three lists of float32 arrays, and text files."""
     (folder / "info").mkdir(parents=True)
     lengths = [60 + 3 * k for k in range(len(VIDEOS) - 2)] + [70, 50]
     rng = np.random.default_rng(0)
@@ -210,7 +210,7 @@ def write_body(path: Path, seed: int) -> None:
 
 
 def write_downloads(root: Path) -> Path:
-    """What a user has before HumanML3D is made: amass/, bodies/ and the repository HumanML3D/."""
+    """Files of a user before HumanML3D is built: amass/, bodies/ and the repository HumanML3D/."""
     for name, content in RECORDINGS.items():
         path = root / "amass" / f"{name}.npz"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -10,8 +10,9 @@ import torch
 from support.asf import write_amc, write_asf
 from support.motions import bvh_text, posed, sway
 from support.others import COLLECTED, amass
+from support.outcomes import temporary_folder
 from support.recorded import Case, cases_of, check, combinations, outcome, record
-from support.recorded_files import folder_of_files, motions, without
+from support.recorded_files import motions, without_paths
 from support.traits import nested_traits, text_traits, traits
 
 from flame_mdm import formats
@@ -85,21 +86,21 @@ def tree_traits(tree: bvh.Bvh) -> Any:
 
 def bvh_files_of_rigs() -> Any:
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, name in enumerate(RIGS):
             path = folder / f"{number}.bvh"
             source = motions()[number % 6]
             line = source.save(path, rest_pose=number % 2 == 0, rig=name)
             tree = bvh.read(path)
             results[str(name)] = [
-                without(folder, line),
+                without_paths(folder, line),
                 tree.joints,
                 [len(channels) for channels in tree.channels],
                 traits(tree.offsets),
                 traits(tree.frames),
                 traits(tree.positions()),
                 tree.fps,
-                without(
+                without_paths(
                     folder,
                     read_traits(
                         outcome(readers.read_recording, path, 30.0 if number % 3 else None)
@@ -141,13 +142,13 @@ def damaged_bvh_files() -> Any:
         "less": ("CHANNELS 6", "CHANNELS 5"),
     }
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for name, change in changes.items():
             path = folder / f"{name}.bvh"
             path.write_text(text.replace(*change))
             tree = outcome(bvh.read, path)
             results[name] = (
-                without(folder, tree)
+                without_paths(folder, tree)
                 if isinstance(tree, str)
                 else [tree.fps, tree.joints[0], len(tree.frames)]
             )
@@ -159,7 +160,7 @@ def damaged_bvh_files() -> Any:
         ):
             path = folder / f"{name}.bvh"
             path.write_bytes(content)
-            results[name] = without(folder, outcome(bvh.read, path))
+            results[name] = without_paths(folder, outcome(bvh.read, path))
     rng = np.random.default_rng(5)
     orders = (
         ("Xrotation", "Zposition", "Yrotation"),
@@ -200,7 +201,7 @@ def read_files() -> Any:
         unit=(None, 0.01, 1.0),
         resample_to=(None, 12.5, 20.0),
     )
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, (skeleton, text) in enumerate(skeletons.items()):
             inner = folder / skeleton
             inner.mkdir()
@@ -270,7 +271,7 @@ def read_files() -> Any:
                     {"fps": 15.0, "as_smpl": True},
                 ):
                     label = f"{skeleton} {path.name} {chosen}"
-                    results[label] = without(
+                    results[label] = without_paths(
                         folder, read_traits(outcome(readers.read_recording, path, **chosen))
                     )
     # The many refusals are the same in all folders.
@@ -281,12 +282,12 @@ def read_files() -> Any:
 
 def files_of_other_programs() -> Any:
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, (name, write) in enumerate(COLLECTED.items()):
             path = folder / name
             write(path)
             rate = {"resample_to": 30.0} if number % 2 else {}
-            results[name] = without(
+            results[name] = without_paths(
                 folder, read_traits(outcome(readers.read_recording, path, **rate))
             )
         (folder / "02.asf").unlink(missing_ok=True)
@@ -295,7 +296,7 @@ def files_of_other_programs() -> Any:
             write_amc(folder / f"{name}.amc", frames, frames)
             for fps in (None, 120.0, 59.94):
                 read = outcome(readers.read_recording, folder / f"{name}.amc", 30.0, fps=fps)
-                results[f"{name} {fps}"] = without(folder, read_traits(read))
+                results[f"{name} {fps}"] = without_paths(folder, read_traits(read))
         results["tree"] = tree_traits(asf.read(folder / "02_01.amc", 60.0))
     return results
 
@@ -323,7 +324,7 @@ def damaged_asf_files() -> Any:
         ("amc", "head", "# head"),
         ("amc", "\n2\n", "\n2\nhead 1\n"),
     )
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         inner = folder
         for number, (ending, old, new) in enumerate(changes):
             inner = folder / str(number)
@@ -334,7 +335,7 @@ def damaged_asf_files() -> Any:
             path.write_text(path.read_text().replace(old, new))
             tree = outcome(asf.read, inner / "02_01.amc", 120.0)
             results[f"{number} {new}"] = (
-                without(folder, tree)
+                without_paths(folder, tree)
                 if isinstance(tree, str)
                 else [traits(tree.frames), traits(tree.offsets), tree.channels]
             )
@@ -342,7 +343,7 @@ def damaged_asf_files() -> Any:
         write_amc(inner / "04_01.amc", 1)
         write_amc(inner / "03_01.amc", 1)
         results["skeletons"] = [
-            without(folder, str(outcome(asf.skeleton_of, inner / name)))
+            without_paths(folder, str(outcome(asf.skeleton_of, inner / name)))
             for name in ("03_07.amc", "03.amc", "04_01.amc")
         ]
     return results
@@ -389,11 +390,11 @@ def arrays_of_files() -> Any:
         ),
     ]
     results: list[Any] = []
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for content in contents:
             np.savez(folder / "a.npz", **content)
             data = outcome(arrays.read_arrays, folder / "a.npz")
-            results.append(without(folder, nested_traits(data)))
+            results.append(without_paths(folder, nested_traits(data)))
             if not isinstance(data, str) and "poses" in data:
                 results += [
                     [traits(part) for part in arrays.smpl_motion(data, fps)] for fps in (None, 30.0)
@@ -410,7 +411,7 @@ def arrays_of_files() -> Any:
         for text in texts:
             (folder / "a.json").write_text(text)
             results.append(
-                without(folder, nested_traits(outcome(arrays.read_arrays, folder / "a.json")))
+                without_paths(folder, nested_traits(outcome(arrays.read_arrays, folder / "a.json")))
             )
     for kind in ("i4", "f2", "u8", "c8", "f8", "?", "U3"):
         results.append(arrays.is_real(np.zeros(2, kind)))
@@ -432,7 +433,7 @@ def features_in_files() -> Any:
     rng = np.random.default_rng(8)
     results: dict[str, Any] = {}
     source = motions()[2]
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for name, width in (*readers.ROTATED.items(), ("hml263", 263), ("smpl147", 150)):
             features = rng.normal(size=(24, width))
             np.savez(
@@ -445,7 +446,7 @@ def features_in_files() -> Any:
             )
             for chosen in ({}, {"resample_to": 30.0}, {"unit": 2.0}):
                 read = outcome(readers.read_recording, folder / "a.npz", **chosen)
-                results[f"{name} {width} {chosen}"] = without(folder, read_traits(read))
+                results[f"{name} {width} {chosen}"] = without_paths(folder, read_traits(read))
         source.save(folder / "b.npz")
         np.savez(
             folder / "c.npz",
@@ -460,7 +461,7 @@ def features_in_files() -> Any:
             **{**np.load(folder / "b.npz"), "poses": np.ones((3, 156)), "trans": np.ones((3, 3))},
         )
         for name in "bcd":
-            results[name] = without(
+            results[name] = without_paths(
                 folder, read_traits(outcome(readers.read_recording, folder / f"{name}.npz"))
             )
     return results
@@ -471,7 +472,7 @@ def saved_motions() -> Any:
     results: dict[str, Any] = {}
     known = posed(5, 1.1, heading=np.linspace(2, 4, 5), left_elbow=[0, 40.0, 10], neck=[20.0, 0, 5])
     known.text, known.id = "a text", "an id"
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for ending in (".bvh", ".glb", ".fbx", ".npz", ".json", ".npy", ".xyz", ".vrma", ".gif"):
             for chosen in combinations(
                 9,
@@ -484,7 +485,7 @@ def saved_motions() -> Any:
                 if ending in (".npz", ".json", ".npy", ".gif") and not any(chosen.values()):
                     continue
                 message = outcome(motions()[1].save, folder / f"a{ending}", **chosen)
-                results[f"{ending} {chosen}"] = without(folder, message)
+                results[f"{ending} {chosen}"] = without_paths(folder, message)
         for number, source in enumerate(
             (known, motions()[3], sway(4, skeleton=KIT21), sway(4, skeleton=SKELETONS["smpl24"]))
         ):
@@ -492,7 +493,7 @@ def saved_motions() -> Any:
                 path = folder / f"{number}{ending}"
                 message = outcome(source.save, path, **({"seed": 7} if ending == ".npz" else {}))
                 if number:
-                    results[path.name] = [without(folder, message)]
+                    results[path.name] = [without_paths(folder, message)]
                 else:
                     results[path.name] = [
                         message.partition("mean joint error")[0].replace(str(folder), "")
@@ -563,7 +564,7 @@ def rotations_of_bones() -> Any:
         neck=[0, 30.0, 0],
         right_knee=[40.0, 0, 0],
     )
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, name in enumerate(RIGS):
             path = folder / f"{name}.bvh"
             known.save(path, rig=name, rest_pose=number % 2 == 0)
@@ -588,8 +589,8 @@ def rotations_of_bones() -> Any:
 
 
 def files_in_folders() -> Any:
-    with folder_of_files() as folder:
-        empty = without(folder, str(outcome(formats.motion_files, folder)))
+    with temporary_folder() as folder:
+        empty = without_paths(folder, str(outcome(formats.motion_files, folder)))
         for name in (
             "b.BVH",
             "a.npz",

@@ -12,8 +12,9 @@ import pytest
 from PIL import Image
 from support.glb import Glb, changed, odd_character, packed, write_names
 from support.motions import posed, sway
+from support.outcomes import temporary_folder
 from support.recorded import Case, bodies, cases_of, check, combinations, outcome, record
-from support.recorded_files import folder_of_files, motions, without
+from support.recorded_files import motions, without_paths
 from support.traits import nested_traits, text_traits, traits
 
 from flame_mdm.formats import (
@@ -63,7 +64,7 @@ def glb_contents(path: Path) -> Any:
 
 def glb_files() -> Any:
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, (name, ending, root_motion) in enumerate(
             (
                 (None, ".glb", False),
@@ -118,7 +119,7 @@ def glb_files() -> Any:
             changed(path, change)
             nodes = outcome(glb_animation.read, path)
             results[name] = (
-                without(folder, nodes)
+                without_paths(folder, nodes)
                 if isinstance(nodes, str)
                 else [nodes.fps, traits(nodes.positions), nodes.names[:4], nodes.animation]
             )
@@ -131,9 +132,8 @@ def glb_files() -> Any:
             ("binary", packed(b'{"asset":{"version":"2.0"}}', b"1234")[:-2]),
         ):
             (folder / name).write_bytes(content)
-            results[name] = without(
-                folder, str(outcome(glb.read, folder / name))[:150].partition(" object at")[0]
-            )
+            refusal = without_paths(folder, str(outcome(glb.read, folder / name)))
+            results[name] = refusal[:120].partition(" object at")[0]
     return results
 
 
@@ -253,7 +253,7 @@ def record_traits(record: fbx.Record) -> Any:
 
 def fbx_files() -> Any:
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, (name, fps, root_motion) in enumerate(
             ((None, 30.0, False), ("unreal", 59.94, True), ("soma", 120.0, False))
         ):
@@ -315,7 +315,7 @@ def fbx_files() -> Any:
         }
         for name, data in wrong.items():
             (folder / name).write_bytes(data)
-            results[name] = without(
+            results[name] = without_paths(
                 folder, str(outcome(fbx.read, folder / name)).partition("<flame")[0]
             )
     return results
@@ -323,14 +323,16 @@ def fbx_files() -> Any:
 
 def nested_fbx_records() -> Any:
     results: list[Any] = []
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for depth in (1, 31, 32, 33, 34):
             root = record_of_level = fbx.Record("")
             for number in range(depth):
                 record_of_level = record_of_level.add(f"level {number}", fbx.Int(number))
             fbx.write(folder / "a.fbx", root)
             read = outcome(fbx.read, folder / "a.fbx")
-            results.append(without(folder, read) if isinstance(read, str) else record_traits(read))
+            results.append(
+                without_paths(folder, read) if isinstance(read, str) else record_traits(read)
+            )
     return results
 
 
@@ -343,7 +345,7 @@ def characters_with_several_skins() -> Any:
         [joints[:5], joints[5:]],
         [joints[:5], joints[9:], joints[3:12]],
     ):
-        with folder_of_files() as folder:
+        with temporary_folder() as folder:
             path = folder / "a.glb"
             motions()[0].save(path, rig="mixamo")
 
@@ -354,7 +356,7 @@ def characters_with_several_skins() -> Any:
                 ]
 
             changed(path, change)
-            results.append(without(folder, message_or_map(path)))
+            results.append(without_paths(folder, message_or_map(path)))
     return results
 
 
@@ -432,11 +434,11 @@ def fbx_scenes() -> Any:
             objects.add("AnimationLayer", 22, "Layer 2", "")
             connections.add("C", "OO", 22, 20)
             connections.add("C", "OO", 30, 22)
-        with folder_of_files() as folder:
+        with temporary_folder() as folder:
             fbx.write(folder / "a.fbx", root)
             nodes = outcome(fbx_scene.read, folder / "a.fbx")
             results[str(number)] = (
-                without(folder, nodes)
+                without_paths(folder, nodes)
                 if isinstance(nodes, str)
                 else [
                     nodes.names,
@@ -471,7 +473,7 @@ def fbx_scenes() -> Any:
 def usd_files() -> Any:
     pytest.importorskip("pxr")
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         poses = motions()[5].posed()
         contacts = np.random.default_rng(4).uniform(size=(24, 2)) > 0.4
         for number, name in enumerate((None, "soma")):
@@ -496,13 +498,12 @@ def message_or_map(path: Path) -> Any:
 
 def moving_characters() -> Any:
     results: dict[str, Any] = {}
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for number, turned in enumerate((True, False)):
             path = folder / f"odd{number}.glb"
             odd_character(path, posed(), turned)
-            results[f"unknown {number}"] = without(
-                folder, str(outcome(characters.read, path))[-300:]
-            )
+            refusal = without_paths(folder, str(outcome(characters.read, path)))
+            results[f"unknown {number}"] = refusal[-300:]
             write_names(path.with_suffix(".yaml"))
             character = characters.read_skinned(path)
             results[f"character {number}"] = [
@@ -516,7 +517,9 @@ def moving_characters() -> Any:
             for ending in (".glb", ".fbx", ".bvh"):
                 saved = folder / f"moved{number}{ending}"
                 results[f"{number} {ending}"] = [
-                    without(folder, outcome(motions()[number].save, saved, character=character))
+                    without_paths(
+                        folder, outcome(motions()[number].save, saved, character=character)
+                    )
                 ]
                 if ending == ".glb":
                     results[f"{number} {ending}"] += [
@@ -549,14 +552,14 @@ def moving_characters() -> Any:
             ("d", {"neck": None, "left_foot": None}),
         ):
             write_names(path.with_suffix(".yaml"), **other)
-            results[f"names {name}"] = without(folder, message_or_map(path))
+            results[f"names {name}"] = without_paths(folder, message_or_map(path))
         for name in RIGS[1:5]:
             tree = folder / f"{name}.bvh"
             motions()[2].save(tree, rig=name)
             character = characters.read(tree)
             message = motions()[4].save(folder / "out.bvh", character=character)
             results[f"tree {name}"] = [
-                without(folder, message),
+                without_paths(folder, message),
                 traits(bvh.read(folder / "out.bvh").frames),
                 character.floor,
                 traits(character.rig.positions),
@@ -570,7 +573,7 @@ def moving_characters() -> Any:
             ("OFFSET ", "OFFSET -"),
         ):
             tree.write_text(text.replace(*change))
-            results[f"tree {change}"] = without(folder, message_or_map(tree))
+            results[f"tree {change}"] = without_paths(folder, message_or_map(tree))
     return results
 
 
@@ -612,7 +615,7 @@ def pages_of_motions() -> Any:
         for skeleton in SKELETONS.values()
     ]
     results["targets"] = [str(outcome(body.target, "a/b", listed)) for listed in ([], [figure])]
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         player.write_player(folder / "a.html", [figure], title="T", columns=3)
         written = (folder / "a.html").read_text()
         results["written"] = written == player.player_page([figure], "T", columns=3)
@@ -670,7 +673,7 @@ def images_of_motions() -> Any:
         rng.integers(0, 12, (14, 3)),
     )
     results["rasterized"] = traits(image, 10)
-    with folder_of_files() as folder:
+    with temporary_folder() as folder:
         for count, size in ((1, 48), (2, 40), (4, 32)):
             path = folder / f"{count}.gif"
             shown = [

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.outcomes import temporary_folder, without
 from support.recorded import Case, cases_of, check, combinations, outcome, record
 from support.sampled import (
     FEW,
@@ -18,10 +19,8 @@ from support.sampled import (
     dip,
     flow,
     labeled,
-    plain,
     shown,
     shown_targets,
-    temporary,
     walk,
 )
 
@@ -246,13 +245,13 @@ def resolved_requests() -> Any:
 def motions_to_continue() -> Any:
     short = replace(walk(), joints=walk().joints[:5], features=walk().features[:5])
     results = []
-    with temporary() as folder:
+    with temporary_folder() as folder:
         walk().save(folder / "walk.npz")
         request = SamplingRequest(texts=WALK, after=folder / "walk.npz")
         for built in (diffusion, flow, dip):
             one = resolve(request, built())
             results.append(
-                (one.before, one.edit and one.edit.known, plain(list(one.warnings), folder))
+                (one.before, one.edit and one.edit.known, without(folder, list(one.warnings)))
             )
             results.append(
                 outcome(

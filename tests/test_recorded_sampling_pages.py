@@ -11,9 +11,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from support.outcomes import without
 from support.pages import a_run, data_of, motions, put, result
 from support.recorded import Case, cases_of, check, outcome, record
-from support.sampled import diffusion, dip, facts, labeled, plain, walk
+from support.sampled import diffusion, dip, facts, labeled, walk
 
 from flame_mdm.commands import (
     above_zero,
@@ -227,7 +228,8 @@ def pages_of_runs() -> Any:
             )
             results.append(comparing.in_all(shown))
             runs = comparing.only_runs(compared)
-            results += plain(
+            results += without(
+                folder,
                 [
                     list(map(str, comparing._facts(runs))),
                     comparing._differences(runs),
@@ -235,7 +237,6 @@ def pages_of_runs() -> Any:
                     list(comparing.grouped(runs)),
                     compare._tested(runs),
                 ],
-                folder,
             )
             page = comparing.comparison(compared, shown).replace(str(folder), "FOLDER")
             results.append((page.count("<td>"), page.count("<svg"), page.count("srcdoc")))
@@ -260,12 +261,12 @@ def pages_of_runs() -> Any:
             bool(report._player(run, None)),
             report.write_report(first).name,
         ]
-        results += plain(
+        results += without(
+            folder,
             [
                 outcome(lambda: comparing.find([first])),
                 outcome(lambda: comparing.find([first, first])),
             ],
-            folder,
         )
         ratings = [
             ("a", "b", "a"),
@@ -290,9 +291,8 @@ def pages_of_runs() -> Any:
             )
         files = [folder / "r5.json", folder / "s3.json"]
         results += [
-            plain(
-                outcome(lambda some=some: [pair.model_dump() for pair in study.tally(some)]),
-                folder,
+            without(
+                folder, outcome(lambda some=some: [pair.model_dump() for pair in study.tally(some)])
             )
             for some in (files, files[::-1], files[:1] * 2, [folder / "t1.json"], [])
         ]
@@ -650,19 +650,19 @@ def checks_of_commands() -> Any:
         for ending, character in (("glb", None), (None, None), (None, "x.BVH"), ("npz", "x.glb")):
             settings: Any = SimpleNamespace(format=ending, character=character)
             results.append(
-                plain(
+                without(
+                    folder,
                     outcome(
                         lambda settings=settings: str(
                             convert._targets(settings, folder, Path("out"))
                         )
                     ),
-                    folder,
                 )
             )
         (folder / "b" / "a.glb").unlink()
         for ending, character in (("glb", None), (None, "x.BVH")):
             settings = SimpleNamespace(format=ending, character=character)
-            results.append(plain(str(convert._targets(settings, folder, Path("out"))), folder))
+            results.append(without(folder, str(convert._targets(settings, folder, Path("out")))))
     return results
 
 

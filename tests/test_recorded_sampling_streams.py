@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.outcomes import temporary_folder, without
 from support.recorded import Case, cases_of, check, outcome, record, some_bodies
 from support.runs import TINY, untrained
 from support.sampled import (
@@ -23,10 +24,8 @@ from support.sampled import (
     dip,
     facts,
     labeled,
-    plain,
     shown,
     shown_targets,
-    temporary,
     walk,
     with_usual_motions,
 )
@@ -243,7 +242,7 @@ def targets_and_refusals() -> Any:
         outcome(lambda rows=rows: shown_targets(read_targets(representation, {"root": rows})))
         for rows in (many[:300], many)
     ]
-    with temporary() as folder:
+    with temporary_folder() as folder:
         walk().save(folder / "pose.npz")
         pose: dict[str, Any] = {"time": 0.6, "file": "pose.npz"}
         for extra in (
@@ -252,13 +251,13 @@ def targets_and_refusals() -> Any:
         ):  # fmt: skip
             (folder / "t.json").write_text(json.dumps({"poses": [{**pose, **extra}]}))
             results.append(
-                plain(
+                without(
+                    folder,
                     outcome(
                         lambda folder=folder: shown_targets(
                             read_targets(representation, folder / "t.json")
                         )
                     ),
-                    folder,
                 )
             )
     return results
@@ -315,17 +314,17 @@ def prompt_files() -> Any:
         "walks\n\n  waves  \nsits @0\n" + "x" * 2001 + "\na | \nbows @2", "\ufeffwalks\r\nruns", "\n \n",
         "walk\0", "", "one",
     )  # fmt: skip
-    with temporary() as folder:
+    with temporary_folder() as folder:
         for content in contents:
             path = folder / "prompts.txt"
             path.write_text(content, encoding="utf-8")
             file = outcome(lambda path=path: PromptFile.read(str(path)))
             if isinstance(file, str):
-                results.append(plain(file, folder))
+                results.append(without(folder, file))
                 continue
             results.append((file.lines, sorted(file.refused), file.accepted))
             file.refuse({0: UserError("not\nthis")})
-            results.append((file.accepted, plain(file.report(), folder)))
+            results.append((file.accepted, without(folder, file.report())))
             results += [
                 outcome(lambda file=file, lengths=lengths: file.lengths("seconds", lengths))
                 for lengths in (None, 3, list(range(len(file.lines))), [1, 2, 3])
@@ -353,7 +352,7 @@ def outputs_of_commands() -> Any:
     results.append(output.degenerate_notes(motions))
     for listed in (motions, motions[:1]):
         results += [output.summary(Path("a/b"), listed, mp4=mp4) for mp4 in (False, True)]
-    with temporary() as folder:
+    with temporary_folder() as folder:
         for listed, stages in ((motions, motions[:1]), ([replace(motions[1], text="")], None)):
             output.write_motions(folder / "out", listed, {"seed": 3}, stages)
             files = sorted(path.name for path in (folder / "out").iterdir())
@@ -388,20 +387,20 @@ def motions_that_are_read() -> Any:
     names = ("synthetic:synthetic_0_000003", "synthetic:synthetic_0_000030", "nothing", "a.txt")
     for name in names:
         results.append(
-            plain(
-                outcome(lambda name=name: shown(read_motion(representation, name, data_root=root))),
+            without(
                 root,
+                outcome(lambda name=name: shown(read_motion(representation, name, data_root=root))),
             )
         )
     slow = SimpleNamespace(name=representation.name, fps=12.5)
     other: Any = slow
-    results.append(plain(outcome(lambda: read_motion(other, names[0], data_root=root)), root))
+    results.append(without(root, outcome(lambda: read_motion(other, names[0], data_root=root))))
     cuts: list[Any] = [[0.2, 1.4], [0, 1.85], [0, 1.9], [1, 1], [-0.1, 1], "ab", [1, 2, 3]]
     for cut in cuts:
         results.append(outcome(lambda cut=cut: shown(part_of(representation, walk(), cut))))
     unnamed = replace(walk(), id="")
     results.append(outcome(lambda: part_of(representation, unnamed, [0, 99])))
-    with temporary() as folder:
+    with temporary_folder() as folder:
         walk().save(folder / "walk.bvh")
         walk().save(folder / "walk.npz")
         files: list[tuple[str, dict[str, Any]]] = [
@@ -412,7 +411,7 @@ def motions_that_are_read() -> Any:
         for name, extra in files:
             motion = read_motion(representation, folder / name, **extra)
             results.append(
-                (plain(motion.id, folder), len(motion.joints), motion.notes, motion.features)
+                (without(folder, motion.id), len(motion.joints), motion.notes, motion.features)
             )
     for fps in (20.0, 30.0, 59.94, 12.5):
         joints = next(iter(some_bodies(1, 20.0, 9).values()))
@@ -449,7 +448,7 @@ motions:
 
 def sets_and_refusals() -> Any:
     results: list[Any] = []
-    with temporary() as folder:
+    with temporary_folder() as folder:
         path = folder / "set.yaml"
         for old, new in (
             ("", ""), ("stand: Idle", "stand: Walk"), ("stand: Idle", "stand: None"), (", degrees: 90", ""),
@@ -459,8 +458,8 @@ def sets_and_refusals() -> Any:
         ):  # fmt: skip
             path.write_text(SET.replace(old, new) if old else SET)
             results.append(
-                plain(
-                    outcome(lambda path=path: motion_sets.read_set(str(path)).model_dump()), folder
+                without(
+                    folder, outcome(lambda path=path: motion_sets.read_set(str(path)).model_dump())
                 )
             )
         path.write_text(SET)
@@ -527,7 +526,7 @@ def clips_of_sets() -> Any:
         entry = motion_sets._entry(clip, still, {"a": "b"})
         results.append((entry, motion_sets.closure(still), motion.id, motion.text, motion.joints))
     results.append(len(gaits.with_neighbors(clips, 20)[0]))
-    with temporary() as folder:
+    with temporary_folder() as folder:
         content = motion_sets.MotionSet(
             stand="X", motions={"X": motion_sets.SetMotion(text="x", kind="loop")}, prefix="P_",
             format="glb", rig="mixamo", fps=20.0,

@@ -31,6 +31,13 @@ def workspace() -> Iterator[Path]:
             os.chdir(before)
 
 
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Yields the full path of an empty folder, which is deleted after the block."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder).resolve()
+
+
 def without(folder: Path, value: Any) -> Any:
     """A result in which the path of a folder is replaced in all texts."""
     if isinstance(value, str | Path):

@@ -1,34 +1,28 @@
 """Temporary files and short motions, for tests with recorded results."""
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from flame_mdm.formats.motion import Motion
+from support.outcomes import without
 from support.recorded import some_bodies
 
 
-@contextmanager
-def folder_of_files() -> Iterator[Path]:
-    with TemporaryDirectory(prefix="recorded") as folder:
-        yield Path(folder).resolve()
-
-
-def without(folder: Path, value: Any) -> Any:
-    """The value with a short name for a folder in all its texts."""
-    if isinstance(value, str):
-        named = re.sub(r"[./]*FOLDER", "FOLDER", value.replace(str(folder), "FOLDER"))
-        # Labels name a skeleton file by its path from the working folder.
-        return re.sub(r"\([^()]*/skeleton\.yaml\)", "(skeleton.yaml)", named)
+def without_paths(folder: Path, value: Any) -> Any:
+    """A value whose texts have short names for a folder and for skeleton files."""
     if isinstance(value, dict):
-        return {key: without(folder, entry) for key, entry in value.items()}
-    return [without(folder, entry) for entry in value] if isinstance(value, list | tuple) else value
+        return {key: without_paths(folder, entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_paths(folder, entry) for entry in value]
+    if not isinstance(value, str):
+        return value
+    text = re.sub(r"[./]*FOLDER", "FOLDER", without(folder, value))
+    # Labels name a skeleton file by its path from the working folder.
+    return re.sub(r"\([^()]*/skeleton\.yaml\)", "(skeleton.yaml)", text)
 
 
 @cache

@@ -1,10 +1,7 @@
 """Small models with random weights for recorded results, and summaries of what they sample."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -22,21 +19,6 @@ from support.runs import TINY, TINY_DIP, untrained
 
 FEW: dict[str, Any] = {"num_inference_steps": 2}
 WALK, WAVE = "a person walks forward", "a person waves"
-
-
-@contextmanager
-def temporary() -> Iterator[Path]:
-    with TemporaryDirectory() as folder:
-        yield Path(folder)
-
-
-def plain(value: Any, folder: Path) -> Any:
-    """A value whose texts do not name the temporary folder."""
-    if isinstance(value, str | Path):
-        return str(value).replace(str(folder), "FOLDER")
-    if isinstance(value, list | tuple):
-        return [plain(entry, folder) for entry in value]
-    return value
 
 
 # Models ----------------------------------------------------------------------------------------

@@ -881,7 +881,7 @@ def precision_of_fast_training() -> Any:
     class Recurrent(nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.gru = nn.GRU(2, 2)
+            self.gru = nn.GRU(2, 2, bidirectional=True)
 
     for options in combinations(
         4,

@@ -13,6 +13,7 @@ from torch import nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
+from evaluators.extractors.action_gru import ActionGRU
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import Config, compose, instantiate
@@ -23,6 +24,7 @@ from flame_mdm.seeds import seed_generator
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training import speed
 from flame_mdm.training.averaging import MovingAverage
+from flame_mdm.training.recurrence import FastGRU
 from flame_mdm.training.speed import CheapDropout, attention
 
 CPU = torch.device("cpu")
@@ -256,14 +258,77 @@ def test_bfloat16_is_chosen_where_the_processor_computes_with_it(monkeypatch, su
             assert speed.accelerate(*parts(config), config) == chosen
 
 
-def test_a_gru_is_trained_in_float32_on_a_cpu(monkeypatch):
+def test_only_grus_that_are_not_replaced_are_trained_in_float32_on_a_cpu(monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": True})
-    chosen = {}
     for name in ("mdm_encoder_small", "mdm_unet_small", "mdm_gru_small"):
         config = compose("quickstart", ["trainer.accelerator=cpu", f"denoiser={name}"])
-        chosen[name] = speed.accelerate(*parts(config), config)
-    assert chosen.pop("mdm_gru_small") == "32-true"
-    assert set(chosen.values()) == {"bf16-mixed"}
+        task, data = parts(config)
+        assert speed.accelerate(task, data, config) == "bf16-mixed"
+    task.add_module("other", nn.Sequential(nn.GRU(2, 2, bidirectional=True)))
+    assert speed.accelerate(task, data, config) == "32-true"
+
+
+@pytest.mark.parametrize("batch_first", [False, True])
+@pytest.mark.parametrize("has_state", [False, True])
+def test_the_fast_gru_has_the_results_and_gradients_of_torch(batch_first, has_state):
+    gru = nn.GRU(5, 7, 3, batch_first=batch_first).double()
+    fast = FastGRU(gru)
+    x = torch.randn(4, 9, 5, dtype=torch.float64, requires_grad=True)
+    rows = 4 if batch_first else 9
+    state = torch.randn(3, rows, 7, dtype=torch.float64, requires_grad=True) if has_state else None
+    inputs = [x, *gru.parameters(), *([] if state is None else [state])]
+
+    results = []
+    for network in (gru, fast):
+        output, last = network(x, state)
+        total = (output * torch.arange(7)).sin().sum() + last[1].square().sum()
+        results.append([output, last, *torch.autograd.grad(total, inputs)])
+    for of_torch, of_ours in zip(*results, strict=True):
+        torch.testing.assert_close(of_ours, of_torch)
+    assert fast.state_dict().keys() == gru.state_dict().keys()
+    assert all(a is b for a, b in zip(fast.parameters(), gru.parameters(), strict=True))
+
+
+def test_the_fast_gru_recurs_in_float32_when_inputs_are_multiplied_in_bfloat16():
+    gru = nn.GRU(16, 16, 2)
+    x = torch.randn(30, 2, 16)
+    expected = torch.autograd.grad(gru(x)[0].square().sum(), list(gru.parameters()))
+    with torch.autocast("cpu", torch.bfloat16):
+        output, _ = FastGRU(gru)(x)
+    assert output.dtype == torch.float32
+    gradients = torch.autograd.grad(output.square().sum(), list(gru.parameters()))
+    torch.testing.assert_close(output, gru(x)[0], atol=0.01, rtol=0)
+    for gradient, of_torch in zip(gradients, expected, strict=True):
+        error = (gradient - of_torch).norm() / of_torch.norm()
+        assert 0 < error < 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "is_replaced"),
+    [
+        ({}, True),
+        ({"num_layers": 2, "batch_first": True}, True),
+        ({"bidirectional": True}, False),
+        ({"bias": False}, False),
+        ({"num_layers": 2, "dropout": 0.1}, False),
+    ],
+)
+def test_grus_that_run_forward_are_replaced(options, is_replaced):
+    network = nn.Sequential(nn.GRU(2, 3, **options)).eval()
+    speed._simplify(network)
+    assert isinstance(network[0], FastGRU) == is_replaced
+    assert not network[0].training
+
+
+def test_a_classifier_with_a_fast_gru_computes_the_same():
+    network = ActionGRU(num_joints=3, hidden=8, num_actions=2)
+    joints = torch.randn(4, 6, 3, 3)
+    mask = torch.arange(6) < torch.tensor([[6], [2], [1], [5]])
+    state = network.random_state([1, 2, 3, 4])
+    expected = network.logits(joints, mask, state)
+    speed._simplify(network)
+    torch.testing.assert_close(network.logits(joints, mask, state), expected)
+    assert torch.equal(network.random_state([1, 2, 3, 4]), state)
 
 
 def parts(config: Config) -> tuple[GeneratorTask, MotionDataModule]:

@@ -170,6 +170,35 @@ def test_steps_of_all_kinds_of_models_do_not_wait_for_the_device(recipe, data_ro
     assert recorded.seen == []
 
 
+class Mixtures(TorchDispatchMode):
+    """Records sums, differences and products of tensors of different precision."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[tuple[str, list[tuple[int, ...]]]] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name.removeprefix("aten::").rstrip("_")
+        operands = [x for x in args if isinstance(x, Tensor) and x.is_floating_point() and x.ndim]
+        if name in ("add", "sub", "mul") and len({x.dtype for x in operands}) > 1:
+            self.seen.append((name, [tuple(x.shape) for x in operands]))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_no_operation_of_fast_steps_mixes_precisions(recipe, data_root):
+    """On a CPU, such operations take up to 10 times as long as a conversion."""
+    words = [*RECIPES[recipe], "speed=fast", f"data_root={data_root}"]
+    config, data, task = built(words, recipe)
+    accelerate(task, data, config)
+    batch = next(iter(data.train_dataloader()))
+    with Mixtures() as recorded:
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = task.train().training_step(batch, 0)
+        loss.backward()
+    assert recorded.seen == []
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_losses_copy_nothing_from_the_host_to_the_device(recipe, data_root, monkeypatch):
     """The device is torch's "meta", whose tensors have no values to wait for."""

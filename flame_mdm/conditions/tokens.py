@@ -200,12 +200,11 @@ class LearnedTokens(ConditionEncoder):
         query, key, value = qkv.unflatten(2, (3, attention.num_heads, -1)).permute(2, 0, 3, 1, 4)
         dropout = attention.dropout if self.training else 0.0
         y = self.attend(query, key, value, attn_mask=token_mask[:, None, None], dropout_p=dropout)
-        x = x + layer.dropout1(
-            attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, index))
-        )
-        x = x + layer.dropout2(
-            layer.linear2(layer.dropout(functional.gelu(layer.linear1(layer.norm2(x)))))
-        )
+        y = y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, index)
+        # On a CPU, adding tensors of different precision takes longer than converting one.
+        x = x + layer.dropout1(attention.out_proj(y)).to(x.dtype)
+        y = layer.dropout(functional.gelu(layer.linear1(layer.norm2(x))))
+        x = x + layer.dropout2(layer.linear2(y)).to(x.dtype)
         return pad(self.norm(x))
 
     def _null(self) -> Condition:

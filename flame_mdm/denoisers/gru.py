@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
-from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
+from flame_mdm.denoisers.layers import TimeAndCondition, add_sinusoid
 
 
 class MDMGRU(Denoiser):
@@ -58,8 +58,6 @@ class MDMGRU(Denoiser):
         """See `Denoiser.forward`."""
         frames = x_t.shape[1]
         token = self.condition(t, cond.pooled)[:, None].expand(-1, frames, -1)
-        x = self.input(torch.cat([x_t, token], -1))
-        x = self.dropout(
-            x + sinusoid(torch.arange(frames, device=x.device), x.shape[-1]).to(x_t.dtype)
-        )
+        x = self.input(torch.cat([x_t, token], -1)).to(x_t.dtype)
+        x = self.dropout(add_sinusoid(x))
         return self.output(self.gru(x)[0])

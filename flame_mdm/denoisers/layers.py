@@ -22,6 +22,18 @@ def sinusoid(position: Tensor, features: int) -> Tensor:
     return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
 
 
+def add_sinusoid(x: Tensor, positions: Tensor | None = None) -> Tensor:
+    """Adds the embeddings of positions (N,) to a sequence (B, N, C). Default: positions 0 to N - 1.
+
+    The embeddings are converted to the precision of the sequence. With autocast, convert the
+    sequence to float32 first: on a CPU, adding tensors of different precision takes 10 times as
+    long as converting one of them.
+    """
+    if positions is None:
+        positions = torch.arange(x.shape[1], device=x.device)
+    return x + sinusoid(positions, x.shape[-1]).to(x.dtype)
+
+
 def with_prefix(mask: Tensor, prefix: int) -> Tensor:
     """Prepends `prefix` real entries to a mask (B, N)."""
     return torch.cat([mask.new_ones(mask.shape[0], prefix), mask], 1)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
-from flame_mdm.denoisers.layers import TimeAndCondition, Transformer, sinusoid, with_prefix
+from flame_mdm.denoisers.layers import TimeAndCondition, Transformer, add_sinusoid, with_prefix
 from flame_mdm.denoisers.target_encoders import TARGET_ENCODERS, TargetEncoder
 from flame_mdm.errors import UserError
 
@@ -95,7 +95,7 @@ class MDMEncoder(Denoiser):
         positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])
         frames = self.input(x_t)
         x = torch.cat([prefix, frames + prefix[:, :1] if self.condition_frames else frames], 1)
-        x = self.dropout(x + sinusoid(positions, x.shape[-1]).to(x_t.dtype))
+        x = self.dropout(add_sinusoid(x.to(x_t.dtype), positions))
         frame_mask = mask if self.mask_padding else torch.ones_like(mask)
         x = self.transformer(x, with_prefix(torch.cat([token_mask, frame_mask], 1), 1))
         return self.output(x[:, size:])
@@ -214,9 +214,7 @@ class MDMDecoder(Denoiser):
             x = torch.cat([self.condition.add(time, cond.pooled)[:, None], x], 1)
         elif self.input_token == "time":
             x = torch.cat([time[:, None], x], 1)
-        x = self.dropout(
-            x + sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype)
-        )
+        x = self.dropout(add_sinusoid(x.to(x_t.dtype)))
 
         memory, memory_mask = self._memory(time, cond)
         before = x.shape[1] - x_t.shape[1]

@@ -78,7 +78,7 @@ class MDMUNet(Denoiser):
         skips = []
         for level, block in enumerate(self.down):
             if level:
-                x = self.downsample[level - 1](x * masks[level - 1])
+                x = self.downsample[level - 1](masked(x, masks[level - 1]))
             x = block(x, token, masks[level])
             skips.append(x)
         for block in self.middle:
@@ -87,9 +87,15 @@ class MDMUNet(Denoiser):
             x = self.up[level](torch.cat([x, skips[level]], 1), token, masks[level])
             if level:
                 x = x.repeat_interleave(2, -1)[..., : masks[level - 1].shape[-1]]
-                x = self.upsample[level - 1](x * masks[level - 1])
+                x = self.upsample[level - 1](masked(x, masks[level - 1]))
         x = functional.silu(self.output_norm(x, masks[0]))
         return self.output(x * masks[0]).transpose(1, 2)
+
+
+def masked(x: Tensor, mask: Tensor) -> Tensor:
+    """Sets padded frames of x (B, C, F) to 0. Returns it in the precision of the mask (B, 1, F)."""
+    # On a CPU, multiplying tensors of different precision takes longer than converting one.
+    return x.to(mask.dtype) * mask
 
 
 class ResidualBlock(nn.Module):
@@ -123,7 +129,7 @@ class ResidualBlock(nn.Module):
             mask: (B, 1, F), 1 = real frame, 0 = padding.
         """
         y = self.conv1(functional.silu(self.norm1(x, mask)) * mask)
-        scale, shift = self.scale_shift(token)[..., None].chunk(2, 1)
+        scale, shift = self.scale_shift(token).to(mask.dtype)[..., None].chunk(2, 1)
         y = functional.silu(self.norm2(y, mask) * (1 + scale) + shift)
         return self.skip(x) + self.conv2(self.dropout(y) * mask)
 
@@ -143,7 +149,7 @@ class MaskedGroupNorm(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Normalizes x (B, C, F). The mask (B, 1, F) is 1 for real frames and 0 for padding."""
-        groups = x.unflatten(1, (self.num_groups, -1))
+        groups = x.to(mask.dtype).unflatten(1, (self.num_groups, -1))
         mask = mask[:, None]
         count = groups.shape[2] * mask.sum(-1, keepdim=True).clamp(min=1)
         centered = groups - (groups * mask).sum((2, 3), keepdim=True) / count

@@ -1,4 +1,4 @@
-"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention.
+"""`speed=fast`: bfloat16, compilation, and cheaper dropout, attention and GRUs.
 
 See docs/benchmarks/speed.md.
 """
@@ -15,6 +15,7 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Attention
 from flame_mdm.errors import say
 from flame_mdm.task import GeneratorTask, Task
+from flame_mdm.training.recurrence import FastGRU
 
 COMPILED_FROM = 5000
 """Minimum number of training steps in runs that compile the network.
@@ -36,10 +37,10 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On CUDA, training uses bfloat16 if the device supports it. In runs of at least `COMPILED_FROM`
     steps, it also uses a compiled denoiser.
 
-    On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights) and,
-    if the CPU has instructions for bfloat16 products, bfloat16. GRUs are trained in float32, because
-    they take longer in bfloat16 on a CPU. The denoiser is not compiled, because compilation made no
-    difference on CPUs.
+    On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights),
+    `FastGRU` and, if the CPU has instructions for bfloat16 products, bfloat16. Networks with an
+    `nn.GRU` that `FastGRU` does not replace are trained in float32, because `nn.GRU` takes longer
+    in bfloat16 on a CPU. The denoiser is not compiled, because compilation takes minutes on a CPU.
 
     If the recipe sets a precision other than 32-true, this precision is kept.
     """
@@ -68,20 +69,22 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
             denoiser.compile(dynamic=False)
     elif device == "cpu":
         has = torch.cpu.get_capabilities()
+        _simplify(task)
         recurs = any(isinstance(module, nn.GRU) for module in task.modules())
         supported = (has.get("avx512_bf16") or has.get("amx_bf16")) and not recurs
-        _simplify(task)
     return "bf16-mixed" if supported and trainer["precision"] == "32-true" else trainer["precision"]
 
 
 def _simplify(network: nn.Module) -> None:
-    """Replaces all dropout layers with `CheapDropout`, and attention with `attention`."""
+    """Replaces dropout with `CheapDropout`, attention with `attention` and GRUs with `FastGRU`."""
     for module in list(network.modules()):
         if isinstance(module, Attention | LearnedTokens):
             module.attend = attention
         for name, child in module.named_children():
             if isinstance(child, nn.Dropout):
                 setattr(module, name, CheapDropout(child.p).train(child.training))
+            elif isinstance(child, nn.GRU) and FastGRU.replaces(child):
+                setattr(module, name, FastGRU(child).train(child.training))
 
 
 class CheapDropout(nn.Module):

@@ -116,6 +116,7 @@ def built(words: list[str], name: str) -> tuple[Config, MotionDataModule, Genera
     data: MotionDataModule = instantiate(
         config["data"], representation=representation, seed=config["seed"]
     )
+    data.prepare_data()
     data.setup("fit")
     torch.manual_seed(config["seed"])
     task: GeneratorTask = get_class(config["task"]["_target_"]).build(config, representation)

@@ -94,10 +94,12 @@ class Recurrence(torch.autograd.Function):
         states = gates.new_empty(frames + 1, rows, size)
         states[0] = first
 
-        # Views of single frames are made here, because they take time in the loop.
-        parts = [x.split((2 * size, size), -1) for x in (gates, products)]
-        views = [x.unbind() for x in (products, *parts[0], *parts[1], states[:-1], states[1:])]
-        for u, g_rz, g_n, u_rz, u_n, before, after in zip(*views, strict=True):
+        # Views of single frames are created before the loop, where they take less time.
+        g_parts = gates.split((2 * size, size), -1)
+        u_parts = products.split((2 * size, size), -1)
+        tensors = (products, *g_parts, *u_parts, states[:-1], states[1:])
+        views = zip(*(x.unbind() for x in tensors), strict=True)
+        for u, g_rz, g_n, u_rz, u_n, before, after in views:
             u.addmm_(before, transposed)
             r, z = torch.add(g_rz, u_rz).sigmoid_().chunk(2, -1)
             n = torch.addcmul(g_n, r, u_n).tanh_()
@@ -118,25 +120,26 @@ class Recurrence(torch.autograd.Function):
         r, z = torch.add(g_rz, u_rz).sigmoid_().chunk(2, -1)
         n = torch.addcmul(g_n, r, u_n).tanh_()
 
-        # Derivatives of a new state with respect to the arguments of r, z and n, and to u_n
+        # Derivatives of a new state with respect to the arguments of r, z and n, and to u
         by_n = (1 - z) * (1 - n.square())
         by_r = by_n * u_n * r * (1 - r)
         by_z = (states[:-1] - n) * z * (1 - z)
-        by_product = torch.stack([by_r, by_z, by_n * r], 2)
+        by_u = torch.stack([by_r, by_z, by_n * r], 2)  # (F, B, 3, H)
 
-        of_states = torch.empty_like(gradient)
-        of_products = torch.empty_like(by_product)
-        later = torch.zeros_like(states[0])
-        flat_products = of_products.flatten(2)
-        views = [
-            x.unbind() for x in (gradient, of_states, by_product, of_products, flat_products, z)
-        ]
-        for g, of_state, by, of_product, flat, z_now in reversed(list(zip(*views, strict=True))):
-            torch.add(g, later, out=of_state)
-            torch.mul(of_state[:, None], by, out=of_product)
-            later = torch.addmm(of_state * z_now, flat, weight)
+        state_gradients = torch.empty_like(states[1:])
+        u_gradients = torch.empty_like(by_u)
+        flat_gradients = u_gradients.view_as(products)
+        from_later = torch.zeros_like(states[0])
+        tensors = (gradient, z, by_u, state_gradients, u_gradients, flat_gradients)
+        views = list(zip(*(x.unbind() for x in tensors), strict=True))
+        for from_output, z_now, by_u_now, of_state, of_u, flat_of_u in reversed(views):
+            torch.add(from_output, from_later, out=of_state)
+            torch.mul(of_state[:, None], by_u_now, out=of_u)
+            from_later = torch.addmm(of_state * z_now, flat_of_u, weight)
 
-        of_products = flat_products
-        of_gates = torch.cat([of_products[..., : 2 * size], of_states * by_n], -1)
-        of_weight = of_products.flatten(0, 1).t() @ states[:-1].flatten(0, 1)
-        return of_gates, later, of_weight, of_products.sum((0, 1))
+        gate_gradients = torch.cat(
+            [flat_gradients[..., : 2 * size], state_gradients * by_n],
+            -1,
+        )
+        weight_gradient = flat_gradients.flatten(0, 1).t() @ states[:-1].flatten(0, 1)
+        return gate_gradients, from_later, weight_gradient, flat_gradients.sum((0, 1))

@@ -50,7 +50,7 @@ SMALL = {
 # The transformers are trained on few clips, because their steps take longest.
 LARGE = {
     16: {"MDM, GRU": ["humanml3d/mdm_gru"], "MDM, U-Net": ["humanml3d/mdm_unet"]},
-    4: {
+    2: {
         "MDM, decoder": ["humanml3d/mdm_decoder"],
         "MDM, decoder + token": ["humanml3d/mdm_decoder_token"],
         "FLAME": ["humanml3d/flame"],
@@ -294,7 +294,7 @@ def measure(settings: Settings) -> Section:
             for row in backbones(recipes, rng.integers(40, 197, clips), ROUNDS, device)
         ]
     if device == "cpu":
-        tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 100, 2)
+        tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 60, 2)
 
     authors = (
         "The authors' step runs their code with zeros instead of CLIP's features. "

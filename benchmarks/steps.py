@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
+from operator import truediv
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -168,20 +169,22 @@ def full_size(settings: Settings) -> tuple[list[Row], str]:
     steps |= {f"speed={speed}": recipe_step(config, speed, device) for speed in SPEEDS}
 
     drawn = drawn_lengths(rows, 1 if settings.quick else BATCHES)
-    seconds = dict.fromkeys(steps, 0.0)
+    seconds: dict[str, list[float]] = {name: [] for name in steps}
     for lengths in drawn:
         turns = {}
         for name, (step, multiple) in steps.items():
             frames = padded_length(int(lengths.max()), multiple, LONGEST)
             turns[name] = partial(step, batch_of(lengths, frames, device))
         for name, taken in take_turns(turns, 1, device).items():
-            seconds[name] += taken / len(drawn)
+            seconds[name].append(taken)
 
-    slowest = next(iter(seconds.values()))
+    peer = next(iter(seconds.values()))
     real = sum(int(lengths.sum()) for lengths in drawn) / len(drawn)
     table: list[Row] = []
-    for name, taken in seconds.items():
-        row: Row = {"training": name, "ms per step": 1000 * taken, "times as fast": slowest / taken}
+    for name, times in seconds.items():
+        taken = statistics.mean(times)
+        ratio = statistics.median(map(truediv, peer, times))
+        row: Row = {"training": name, "ms per step": 1000 * taken, "times as fast": ratio}
         table.append(row | {"frames per second": real / taken})
 
     padded = statistics.mean(padded_length(int(lengths.max()), 1, LONGEST) for lengths in drawn)
@@ -307,7 +310,8 @@ def measure(settings: Settings) -> Section:
         are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
         the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips in
         float32, padded to 196 frames as in the published code. On each of {BATCHES} batches, all implementations
-        take turns in a warm-up round and a timed round. All other networks are trained without a text encoder, and
+        take turns in a warm-up round and a timed round. Times are means over the batches, and ratios are medians of
+        the ratios of all batches. All other networks are trained without a text encoder, and
         the two speeds take turns for {ROUNDS} rounds. The quickstart is trained by the complete framework, with its
         text encoder.""",
         summary(full),

@@ -86,7 +86,7 @@ def step_seconds(folder: Path, processes: int, steps: int, number: int) -> float
 
 
 def measure(settings: Settings) -> Section:
-    rounds, steps = (1, 10) if settings.quick else (2, 100)
+    rounds, steps = (1, 10) if settings.quick else (2, 60)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "clock.py").write_text(CLOCK)

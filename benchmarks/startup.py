@@ -75,7 +75,7 @@ def minimal_work(folder: Path, command: str, numbers: itertools.count) -> None:
 def measure(settings: Settings) -> Section:
     """Times the startup of commands and returns the page section."""
     commands = ["sample"] if settings.quick else list(WORK)
-    rounds = 1 if settings.quick else 3
+    rounds = 1 if settings.quick else 2
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         # The training also prepares the data for the other commands.

@@ -310,10 +310,9 @@ def measure(settings: Settings) -> Section:
         are uniform from 40 to 196 frames, in multiples of 4, similar to HumanML3D's lengths, and batches are drawn by
         the framework's sampler. {authors}Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips in
         float32, padded to 196 frames as in the published code. On each of {BATCHES} batches, all implementations
-        take turns in a warm-up round and a timed round. Times are means over the batches, and ratios are medians of
-        the ratios of all batches. All other networks are trained without a text encoder, and
-        the two speeds take turns for {ROUNDS} rounds. The quickstart is trained by the complete framework, with its
-        text encoder.""",
+        take turns in a warm-up round and a timed round. Times are means over the batches, and ratios are medians
+        over the batches. The other networks are trained without a text encoder, and the two speeds take turns for
+        {ROUNDS} rounds. The quickstart is trained by the complete framework, with its text encoder.""",
         summary(full),
         tables,
     )

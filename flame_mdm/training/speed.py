@@ -40,7 +40,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights),
     `FastGRU` and, if the CPU has instructions for bfloat16 products, bfloat16. Networks with an
     `nn.GRU` that `FastGRU` does not replace are trained in float32, because `nn.GRU` takes longer
-    in bfloat16 on a CPU. The denoiser is not compiled, because compilation takes minutes on a CPU.
+    in bfloat16 on a CPU. The denoiser is not compiled: on a CPU, compilation takes minutes and
+    does not make the steps faster.
 
     If the recipe sets a precision other than 32-true, this precision is kept.
     """
@@ -95,7 +96,8 @@ class CheapDropout(nn.Module):
 
     A random number is split into four 16-bit integers x. Each of them becomes eight integers
     a x + b (modulo 2^16). The eight odd numbers a and the eight numbers b are drawn once per call.
-    Any two of the integers are independent, because x and b are uniformly distributed.
+    Any two of the integers are independent, because x and b are uniformly distributed (universal
+    hashing, Carter and Wegman 1979).
     """
 
     # Number of 16-bit integers that are computed from each drawn one

@@ -105,8 +105,8 @@ def measure(settings: Settings) -> Section:
         are gathered from memory. The loader collates clips in the training process or in workers. A training step of
         the small MDM encoder takes {1000 * wait:.0f} ms on one core. The target is {GOAL:,} clips per second per
         worker. Values are medians over {rounds} rounds of {count} batches each.""",
-        f"A resident batch is ready {load / gather:.1f} times as fast as a batch from the loader, and takes "
-        f"{gather / wait:.1%} of the time of a small training step.",
+        f"Gathering a resident batch is {load / gather:.1f} times as fast as preparing it in the loader, "
+        f"and takes {100 * gather / wait:.1f} % of the time of a small training step.",
         {"batches": rows},
     )
 

@@ -46,7 +46,7 @@ def traveller(representation: Representation) -> Tensor:
             len(raw), -1, -1
         )
         features = representation.encode(skeleton.assemble(bones, raw[:, [0, 2, 1]]))
-        # The std is as small as for real velocities, so that normalized features exceed 1.
+        # Real velocities have a std this small, so some normalized features exceed 1.
         representation.std.fill_(0.05)
     return representation.normalize(features.double())[None]
 

@@ -3,23 +3,30 @@
 The network is a transformer with one layer of width 16 and no text encoder, so most of the time is
 spent outside the network. The framework is compared with bare Lightning, which trains the same
 network with the same masked loss, fused optimizer and gradient clipping on batches in memory. Bare
-Lightning logs nothing and has no averaged weights, loggers or checkpoints. All measurements run on
-one thread and alternate.
+Lightning logs nothing and has no averaged weights, loggers or checkpoints.
 
-The time of a step is the mean over all steps after the first `WARM` steps. It therefore includes
-work that is done once for several steps, such as planning batches, logging values and checking
-losses. Times are thread times, which exclude other programs on the machine. The parts of the
-framework's step are timed one by one, without Lightning.
+Each training has its own process with one thread. After the first `WARM` steps, the processes take
+turns: one of them trains for as many steps as lie between two logs, while the others wait. A turn
+takes a fraction of a second, so a processor that becomes slower or faster affects all trainings
+alike. The time of a step is the mean over a turn. It therefore includes work that is done once for
+several steps, such as planning batches, logging values and checking losses. Times are thread times,
+which exclude waiting. The parts of the framework's step are timed one by one, without Lightning.
 """
 
 import io
 import itertools
+import multiprocessing
+import os
 import statistics
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import connection
+from operator import truediv
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,21 +74,63 @@ class Measured(Exception):
     """Raised to end training as soon as the last step has been timed."""
 
 
+@dataclass(frozen=True)
+class Turns:
+    """The turns of one of several processes.
+
+    Attributes:
+        length: number of steps in a turn.
+        semaphore: released when the turn of this process begins.
+        next_semaphore: the semaphore of the process whose turn is next.
+    """
+
+    length: int
+    semaphore: Any
+    next_semaphore: Any
+
+    def wait(self) -> None:
+        """Waits until the turn of this process begins. On Linux, all turns use the same core."""
+        self.semaphore.acquire()
+        # Another program may slow down one of the cores.
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+    def end(self) -> None:
+        """Lets the next process train."""
+        self.next_semaphore.release()
+
+
 class Clock(Callback):
-    """Measures the mean thread time from the end of one step to the end of the next."""
+    """Measures the mean thread time from the end of one step to the end of the next, for each turn.
+
+    Args:
+        steps: number of training steps.
+    """
+
+    turns: Turns | None = None
+    """The turns of this process. None: one turn with all steps after the warm-up steps."""
 
     def __init__(self, steps: int) -> None:
-        self.first, self.last = min(WARM, steps // 2), steps
-        self.step, self.begin, self.seconds = 0, 0.0, 0.0
+        self.first = WARM if self.turns else min(WARM, steps // 2)
+        self.last = steps
+        self.step, self.begin = 0, 0.0
+        self.seconds: list[float] = []
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Starts the clock after the warm-up steps, and ends training after the last step."""
+        """Times the turns after the warm-up steps, and ends training after the last step."""
         self.step += 1
-        if self.step == self.first:
-            self.begin = time.thread_time()
-        elif self.step == self.last:
-            self.seconds = (time.thread_time() - self.begin) / (self.last - self.first)
+        length = self.turns.length if self.turns else self.last - self.first
+        if self.step < self.first or (self.step - self.first) % length:
+            return
+        if self.step > self.first:
+            self.seconds.append((time.thread_time() - self.begin) / length)
+            if self.turns:
+                self.turns.end()
+        if self.step == self.last:
             raise Measured
+        if self.turns:
+            self.turns.wait()
+        self.begin = time.thread_time()
 
     @contextmanager
     def ending(self) -> Iterator[None]:
@@ -136,8 +185,8 @@ class Bare(LightningModule):
         return self.task[0].make_optimizer()
 
 
-def bare(steps: int, folder: Path) -> float:
-    """Trains with bare Lightning and returns the time per step in seconds."""
+def bare(steps: int, folder: Path) -> list[float]:
+    """Trains with bare Lightning and returns the seconds per step of each turn."""
     batches, task = built(folder)
     stream = itertools.islice(itertools.cycle(batches), steps)
     clock = Clock(steps)
@@ -157,22 +206,22 @@ def bare(steps: int, folder: Path) -> float:
     return clock.seconds
 
 
-def framework(steps: int, folder: Path, *words: str) -> float:
-    """Trains with the complete framework and returns the time per step in seconds.
+def framework(steps: int, folder: Path, changes: Sequence[str] = ()) -> list[float]:
+    """Trains with the complete framework and returns the seconds per step of each turn.
 
     Args:
         steps: number of training steps.
         folder: folder for the data and the run.
-        words: additional overrides of the recipe.
+        changes: additional overrides of the recipe.
     """
     run = Path(tempfile.mkdtemp(dir=folder))
-    words = (
+    words = [
         *TINY,
         f"data_root={folder / 'data'}",
         f"run.dir={run}",
         f"trainer.max_steps={steps}",
-        *words,
-    )
+        *changes,
+    ]
     clock = Clock(steps)
     config = compose("quickstart", words)
     config["callbacks"]["clock"] = {"_target_": f"{__name__}.clock"}
@@ -182,8 +231,8 @@ def framework(steps: int, folder: Path, *words: str) -> float:
     return clock.seconds
 
 
-def loop(steps: int, folder: Path) -> float:
-    """Trains the same network in a plain PyTorch loop and returns the time per step in seconds."""
+def loop(steps: int, folder: Path) -> list[float]:
+    """Trains the same network in a plain PyTorch loop and returns the seconds per step of each turn."""
     batches, task = built(folder)
     optimizer, parameters = task.make_optimizer(), list(task.parameters())
     clock = Clock(steps)
@@ -232,45 +281,77 @@ def parts(steps: int, folder: Path) -> dict[str, float]:
     return {name: statistics.median(taken[len(taken) // 4 :]) for name, taken in times.items()}
 
 
+TRAININGS: dict[str, Callable[[int, Path], list[float]]] = {
+    BARE: bare,
+    PLAIN: partial(framework, changes=["ema=null"]),
+    FRAMEWORK: framework,
+    LOOP: loop,
+}
+
+
+def train(name: str, steps: int, folder: Path, turns: Turns, results: Any) -> None:
+    """Runs one of `TRAININGS` in its own process, and puts its name and its times into a queue."""
+    warnings.filterwarnings("ignore")
+    torch.set_num_threads(1)
+    Clock.turns = turns
+    results.put((name, TRAININGS[name](steps, folder)))
+
+
+def alternating(count: int, length: int, folder: Path) -> dict[str, list[float]]:
+    """Runs all trainings, which take turns, and returns the seconds per step of each turn.
+
+    Args:
+        count: number of turns.
+        length: number of steps in a turn.
+        folder: folder for the data and the runs.
+    """
+    context = multiprocessing.get_context("spawn")
+    semaphores = [context.Semaphore(0) for _ in TRAININGS]
+    results = context.Queue()
+    processes = []
+    for number, name in enumerate(TRAININGS):
+        turns = Turns(length, semaphores[number], semaphores[(number + 1) % len(semaphores)])
+        arguments = (name, WARM + count * length, folder, turns, results)
+        process = context.Process(target=train, args=arguments, name=name, daemon=True)
+        process.start()
+        processes.append(process)
+
+    semaphores[0].release()
+    running = {process.sentinel: process for process in processes}
+    while running:
+        for sentinel in connection.wait(list(running)):
+            process = running.pop(sentinel)
+            process.join()
+            # The other processes would wait forever. They end together with this process.
+            if process.exitcode:
+                raise SystemExit(f"{process.name}: this training failed")
+    taken = dict(results.get() for _ in processes)
+    return {name: taken[name] for name in TRAININGS}
+
+
 def measure(settings: Settings) -> Section:
     """Times the framework's share of a step and returns the page section."""
-    steps, rounds = (12, 1) if settings.quick else (150, 10)
+    count, length = (2, 3) if settings.quick else (40, log_interval())
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        runs: dict[str, Callable[[], float]] = {
-            BARE: lambda: bare(steps, folder),
-            PLAIN: lambda: framework(steps, folder, "ema=null"),
-            FRAMEWORK: lambda: framework(steps, folder),
-            LOOP: lambda: loop(steps, folder),
-        }
-        taken: dict[str, list[float]] = {name: [] for name in runs}
-        for number in range(rounds):
-            # In every other round, the order is reversed, so that a processor that becomes slower
-            # or faster affects all runs alike.
-            for name in list(runs)[:: -1 if number % 2 else 1]:
-                taken[name].append(runs[name]())
-        split = parts(4 * steps, folder)
+        built(folder)  # prepares the data for all trainings
+        taken = alternating(count, length, folder)
+        split = parts(count * length // 2, folder)
 
     times = {name: statistics.median(values) for name, values in taken.items()}
+    relative = {
+        name: statistics.median(map(truediv, values, taken[BARE])) for name, values in taken.items()
+    }
+    rows: list[Row] = [
+        {"training": name, "ms per step": 1000 * times[name], "ratio": ratio}
+        for name, ratio in relative.items()
+    ]
     split["everything else, mostly batches and Lightning"] = times[FRAMEWORK] - sum(split.values())
     shares: list[Row] = [
         {"part": name, "ms": 1000 * value, "share": f"{value / times[FRAMEWORK]:.0%}"}
         for name, value in split.items()
-    ]
-    # Other programs on the machine can only slow a run down.
-    fastest = {name: min(values) for name, values in taken.items()}
-    relative = {name: value / fastest[BARE] for name, value in fastest.items()}
-    rows: list[Row] = [
-        {
-            "training": name,
-            "ms per step, median": 1000 * times[name],
-            "ratio of the medians": times[name] / times[BARE],
-            "ms per step, fastest run": 1000 * fastest[name],
-            "ratio of the fastest runs": ratio,
-        }
-        for name, ratio in relative.items()
     ]
     return section(
         "Host cost of a training step",
@@ -279,13 +360,13 @@ def measure(settings: Settings) -> Section:
         of torch, the framework and Lightning. Bare Lightning trains the same network with the same masked loss, fused
         optimizer and gradient clipping on batches in memory. It logs nothing and has no averaged weights, loggers or
         checkpoints. The complete framework cuts and gathers its batches, checks losses, averages weights, shows its
-        progress and logs every {log_interval()} steps. Each run takes {steps} steps on one thread, and the mean thread
-        time per step is measured. The runs take turns in {rounds} rounds. The fastest runs are compared as
-        well, because other programs on the machine can only slow a run down. For the second table, the parts of the
-        framework's step are timed one by one, without Lightning.""",
-        f"In the fastest run, an almost empty training step takes {1000 * fastest[FRAMEWORK]:.1f} ms, "
-        f"which is {relative[FRAMEWORK]:.2f} times as long as in bare Lightning with the same network. "
-        f"Without averaged weights, it takes {relative[PLAIN]:.2f} times as long.",
+        progress and logs every {log_interval()} steps. Each training has its own process with one thread, and the
+        processes take turns of {length} steps. The thread time of a step is measured. Times and ratios are medians over
+        {count} turns. For the second table, the parts of the framework's step are timed one by one, without
+        Lightning.""",
+        f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms, which is {relative[FRAMEWORK]:.2f} "
+        "times as long as in bare Lightning with the same network. Without averaged weights, it takes "
+        f"{relative[PLAIN]:.2f} times as long.",
         {"steps": rows, "parts of the framework": shares},
     )
 

@@ -1,7 +1,7 @@
 """`speed=fast` and the moving average."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 from lightning import LightningModule
 from lightning.pytorch.callbacks import EMAWeightAveraging, WeightAveraging
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
@@ -23,9 +23,10 @@ from flame_mdm.errors import UserError
 from flame_mdm.seeds import seed_generator
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training import speed
+from flame_mdm.training.attention import attention
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.recurrence import FastGRU
-from flame_mdm.training.speed import CheapDropout, attention
+from flame_mdm.training.speed import CheapDropout
 
 CPU = torch.device("cpu")
 
@@ -67,13 +68,40 @@ def test_cheap_dropout_is_a_function_of_the_seed_and_passes_gradients():
     assert layer.train()(x.to(torch.bfloat16)).dtype == torch.bfloat16
 
 
-def test_attention_by_matrix_products_is_the_fused_one(subtests):
-    query, key, value = torch.randn(3, 2, 4, 9, 8, dtype=torch.float64)
-    mask = torch.arange(9) < torch.tensor([9, 4])[:, None, None, None]
-    for m in (None, mask):
-        with subtests.test(masked=m is not None):
-            expected = functional.scaled_dot_product_attention(query, key, value, attn_mask=m)
-            torch.testing.assert_close(attention(query, key, value, attn_mask=m), expected)
+def attended(
+    attend: Callable[..., Tensor], inputs: Sequence[Tensor], mask: Tensor | None
+) -> list[Tensor]:
+    """Returns the result of attention and the gradients of its query, key and value."""
+    inputs = [x.detach().requires_grad_() for x in inputs]
+    result = attend(*inputs, attn_mask=mask)
+    result.square().sum().backward()
+    return [result, *(x.grad for x in inputs if x.grad is not None)]
+
+
+@pytest.mark.parametrize("keys", [9, 33])
+def test_attention_by_matrix_products_is_the_fused_one(keys, subtests):
+    """Short and long rows of weights take different paths in the backward pass."""
+    query = torch.randn(2, 9, 4, 8, dtype=torch.float64).transpose(1, 2)
+    key, value = torch.randn(2, 2, 4, keys, 8, dtype=torch.float64)
+    of_keys = torch.arange(keys) < torch.tensor([keys, 4])[:, None, None, None]
+    of_pairs = torch.rand(2, 1, 9, keys) > 0.3
+    for name, mask in {"none": None, "keys": of_keys, "pairs": of_pairs}.items():
+        inputs = [query, key, value]
+        expected = attended(functional.scaled_dot_product_attention, inputs, mask)
+        with subtests.test(mask=name):
+            torch.testing.assert_close(attended(attention, inputs, mask), expected)
+        with subtests.test("in bfloat16", mask=name):
+            half = attended(attention, [x.bfloat16() for x in inputs], mask)
+            assert all(x.dtype == torch.bfloat16 for x in half)
+            for x, y in zip(half, expected, strict=True):
+                assert (x - y).norm() < 0.02 * y.norm()
+
+
+def test_attention_multiplies_in_the_precision_of_autocast():
+    query, key, value = torch.randn(3, 2, 4, 9, 8)
+    with torch.autocast("cpu", torch.bfloat16):
+        result = attention(query, key, value)
+    assert torch.equal(result, attention(query.bfloat16(), key.bfloat16(), value.bfloat16()))
 
 
 def test_a_simplified_network_computes_the_same_without_dropout():

@@ -164,12 +164,12 @@ class GaussianDiffusion(Process):
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor
     ) -> dict[str, Tensor]:
         """Returns the losses "mse" (FLAME, eq. 3) and, if the variance is learned, "vlb"."""
-        # With `skip`, an error in the output is the error in the noise divided by the signal.
-        scale = self.schedule.at("signal", t, x) if self.skip else 1.0
-        error = masked_mse(
-            scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), mask
-        )
-        terms = {"mse": self._snr_weight(t) * error}
+        prediction, target = output[..., : x.shape[-1]], self.target(x, noise, t)
+        if self.skip:
+            # An error in the output is the error in the noise divided by the signal.
+            signal = self.schedule.at("signal", t, x)
+            prediction, target = signal * prediction, signal * target
+        terms = {"mse": self._snr_weight(t) * masked_mse(prediction, target, mask)}
         if self.variance == "learned_range" and self.vlb_weight:
             terms["vlb"] = (
                 self.vlb_weight

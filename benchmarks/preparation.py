@@ -76,7 +76,7 @@ def measure(settings: Settings) -> Section:
     """Measures the time and memory that the preparation of large data sets takes, and returns the page section."""
     rows: list[Row] = []
     growth: list[tuple[float, float]] = []
-    for size in [2000] if settings.quick else [125_000, 250_000]:
+    for size in [2000] if settings.quick else [100_000, 200_000]:
         clips = size // FRAMES_PER_CLIP
         command = [sys.executable, __file__, "--clips", str(clips)]
         finished = subprocess.run(command, capture_output=True, text=True, check=False)

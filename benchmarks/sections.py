@@ -104,25 +104,26 @@ def take_turns(
     rounds: int,
     device: str = "cpu",
     clock: Callable[[], float] = time.perf_counter,
+    warm_up: bool = True,
 ) -> dict[str, float]:
     """Returns the median time per call of each function, in seconds.
 
-    The functions take turns, so that load on the machine slows down all of them. The first round is
-    a warm-up round and is not counted.
+    The functions take turns, so that load on the machine slows down all of them.
 
     Args:
         runs: the functions, by name.
-                rounds: number of timed calls of each function.
+        rounds: number of timed calls of each function.
         device: cpu or cuda. With cuda, the time of a call includes waiting for the GPU.
         clock: function that returns the time in seconds. With `time.process_time`, other programs
             on the machine are not counted.
+        warm_up: whether another round comes first, which is not counted.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(rounds + 1):
+    for _ in range(rounds + warm_up):
         for name, run in runs.items():
             start = clock()
             run()
             if device == "cuda":
                 torch.cuda.synchronize()
             times[name].append(clock() - start)
-    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
+    return {name: statistics.median(taken[warm_up:]) for name, taken in times.items()}

@@ -90,7 +90,7 @@ def measure(settings: Settings) -> Section:
             turns[f"{command}, minimal work"] = partial(
                 minimal_work, folder, command, itertools.count()
             )
-        times = take_turns(turns, rounds)
+        times = take_turns(turns, rounds, warm_up=False)
 
     rows: list[Row] = [
         {"command": f"`{name}`", "seconds": taken, "ratio": taken / times[TORCH]}

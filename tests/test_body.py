@@ -327,6 +327,7 @@ class StandIn:
 
 
 def test_anny_is_made_once_and_fitted_like_the_mannequin(tmp_path, monkeypatch, subtests):
+    monkeypatch.setattr(StandIn, "built", 0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setitem(sys.modules, "anny", SimpleNamespace(Anny=StandIn))
     body = load_body("anny height=0.9 gender=1")

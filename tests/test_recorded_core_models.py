@@ -380,7 +380,7 @@ def generated_by_default() -> Any:
     tiny = MotionGenerator(
         Parts(model.denoiser, model.process, model.condition, model.representation),
         replace(model.sampler_options, guidance_scale=None),
-    )
+    ).eval()
     long = requests_of((4, 11))
     wide = generator(mask_padding=False)
     edit = Edit(long.x, numbers(74, 2, 11, 66) > 0)

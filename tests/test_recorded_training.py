@@ -1,5 +1,6 @@
 """Results of training callbacks, checkpoints, model files and imports, as recorded."""
 
+import copy
 import errno
 import json
 import math
@@ -1347,7 +1348,6 @@ def rows_of_words() -> Any:
 
 
 def attached_adapters() -> Any:
-    import copy
 
     rows: list[Any] = []
     for condition, layers, action, words in (
@@ -1377,8 +1377,6 @@ def attached_adapters() -> Any:
 
 
 def merged_adapters() -> Any:
-    import copy
-
     rows: list[Any] = []
     with workspace() as folder:
         base = _model()
@@ -2358,7 +2356,7 @@ def plans_of_samplers() -> Any:
 
 def recipes_of_adaptations() -> Any:
     rows: list[Any] = []
-    model = _model()
+    model = copy.deepcopy(_model())
     model.facts["captions"] = [f"base {k}" for k in range(5)]
     captions = [f"c{k}" for k in range(7)]
     for words in (

@@ -1348,7 +1348,6 @@ def rows_of_words() -> Any:
 
 
 def attached_adapters() -> Any:
-
     rows: list[Any] = []
     for condition, layers, action, words in (
         ("learned", 3, False, [3, 7]),

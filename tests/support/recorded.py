@@ -115,7 +115,10 @@ def cases_of(namespace: Mapping[str, Any]) -> list[Case]:
 
 
 def summary_of(case: Case) -> Any:
-    """Returns the summary of a case's results, which do not depend on random numbers that were drawn before."""
+    """Runs a case and returns the summary of its results.
+
+    Global random generators are seeded first, so that the results do not depend on earlier tests.
+    """
     seed_everything(0, verbose=False)
     return summary(case())
 

@@ -6,9 +6,9 @@ network with the same masked loss, fused optimizer and gradient clipping on batc
 Lightning logs nothing and has no averaged weights, loggers or checkpoints.
 
 Each training has its own process with one thread. After the first `WARM` steps, the processes take
-turns: one of them trains for as many steps as lie between two logs, while the others wait. A turn
-takes a fraction of a second, so a processor that becomes slower or faster affects all trainings
-alike. The time of a step is the mean over a turn. It therefore includes work that is done once for
+turns: one of them trains for as many steps as lie between two logs, while the others wait. On
+Linux, all turns use the same core. A turn takes a fraction of a second, so a processor that becomes
+slower or faster affects all trainings alike. The time of a step is the mean over a turn. It therefore includes work that is done once for
 several steps, such as planning batches, logging values and checking losses. Times are thread times,
 which exclude waiting. The parts of the framework's step are timed one by one, without Lightning.
 """
@@ -360,10 +360,10 @@ def measure(settings: Settings) -> Section:
         of torch, the framework and Lightning. Bare Lightning trains the same network with the same masked loss, fused
         optimizer and gradient clipping on batches in memory. It logs nothing and has no averaged weights, loggers or
         checkpoints. The complete framework cuts and gathers its batches, checks losses, averages weights, shows its
-        progress and logs every {log_interval()} steps. Each training has its own process with one thread, and the
-        processes take turns of {length} steps. The thread time of a step is measured. Times and ratios are medians over
-        {count} turns. For the second table, the parts of the framework's step are timed one by one, without
-        Lightning.""",
+        progress and logs every {log_interval()} steps. Each training has its own process with one thread. The
+        processes take turns of {length} steps on one core. The thread time of a step is measured. Times and ratios are
+        medians over {count} turns. For the second table, the parts of the framework's step are timed one by one,
+        without Lightning.""",
         f"An almost empty training step takes {1000 * times[FRAMEWORK]:.1f} ms, which is {relative[FRAMEWORK]:.2f} "
         "times as long as in bare Lightning with the same network. Without averaged weights, it takes "
         f"{relative[PLAIN]:.2f} times as long.",

@@ -8,9 +8,10 @@ Lightning logs nothing and has no averaged weights, loggers or checkpoints.
 Each training has its own process with one thread. After the first `WARM` steps, the processes take
 turns: one of them trains for as many steps as lie between two logs, while the others wait. On
 Linux, all turns use the same core. A turn takes a fraction of a second, so a processor that becomes
-slower or faster affects all trainings alike. The time of a step is the mean over a turn. It therefore includes work that is done once for
-several steps, such as planning batches, logging values and checking losses. Times are thread times,
-which exclude waiting. The parts of the framework's step are timed one by one, without Lightning.
+slower or faster affects all trainings alike. The time of a step is the mean over a turn. It
+therefore includes work that is done once for several steps, such as planning batches, logging
+values and checking losses. Times are thread times, which exclude waiting. The parts of the
+framework's step are timed one by one, without Lightning.
 """
 
 import io

@@ -323,8 +323,10 @@ def alternating(count: int, length: int, folder: Path) -> dict[str, list[float]]
         for sentinel in connection.wait(list(running)):
             process = running.pop(sentinel)
             process.join()
-            # The other processes would wait forever. They end together with this process.
             if process.exitcode:
+                # The other processes would wait forever, and trainings do not end at SIGTERM.
+                for other in running.values():
+                    other.kill()
                 raise SystemExit(f"{process.name}: this training failed")
     taken = dict(results.get() for _ in processes)
     return {name: taken[name] for name in TRAININGS}

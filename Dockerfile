@@ -10,10 +10,10 @@ FROM $BASE
 # On PyPI, torch is built for CUDA and includes the CUDA libraries.
 ARG TORCH_INDEX=https://pypi.org/simple
 
-# torch.compile requires a C compiler.
+# torch.compile requires a C compiler, and a C++ compiler when training on a CPU.
 # hadolint ignore=DL3008
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends gcc libc6-dev \
+    && apt-get install -y --no-install-recommends g++ gcc libc6-dev \
     && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /flame_mdm

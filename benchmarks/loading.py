@@ -62,7 +62,7 @@ def batches_of(data: MotionDataModule, resident: bool, workers: int = 0) -> Iter
 
 def measure(settings: Settings) -> Section:
     """Times the loading of batches and returns the page section."""
-    clips, count, rounds = (100, 3, 1) if settings.quick else (1000, 20, 10)
+    clips, count, rounds = (100, 3, 1) if settings.quick else (1000, 20, 5)
     torch.manual_seed(0)
     torch.set_num_threads(1)
 

@@ -62,7 +62,7 @@ class Size:
     frames: int = 60
     latent_dim: int = 128
     num_layers: int = 4
-    rounds: int = 5
+    rounds: int = 3
     # If a run would take more seconds than this, its time is estimated from a run of 10 steps
     longest: float = 20.0
 

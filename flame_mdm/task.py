@@ -1,7 +1,7 @@
 # pyright: standard
 """Lightning modules that train the models in `flame_mdm.generator`, such as `MotionGenerator`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -236,6 +236,8 @@ class GeneratorTask(Task):
             raise UserError("task.targets and denoiser.target_encoder: set both or neither")
         self.cond_drop_prob, self.compiles = cond_drop_prob, compile
         self.checkpoints_activations = checkpoint_activations
+        self.compiles_steps = False  # set by `speed=fast`
+        self.compiled_loss: Callable[..., dict[str, Tensor]] | None = None
         self.val_losses = torch.nn.ModuleDict()
 
     @classmethod
@@ -376,15 +378,21 @@ class GeneratorTask(Task):
                 terms["target"] = self.targets.error(joints, cond.target, batch.lengths)
             return terms
 
-        return process.loss(
-            self.generator.denoiser,
-            batch.x,
-            batch.mask,
-            cond,
-            t=t,
-            noise=noise,
-            auxiliary=auxiliary,
-        )
+        arguments = self.generator.denoiser, batch.x, batch.mask, cond
+        if not (self.training and self.compiles_steps):
+            return process.loss(*arguments, t=t, noise=noise, auxiliary=auxiliary)
+
+        # The compiler would draw other random numbers.
+        t, noise = process.drawn(batch.x, t, noise)
+        if self.compiled_loss is None:
+            # Tables are copied to the device in the first call, which is therefore not compiled.
+            with torch.random.fork_rng([]):
+                process.loss(*arguments, t=t, noise=noise, auxiliary=auxiliary)
+            self.compiled_loss = torch.compile(process.loss)
+        for x in (batch.x, batch.mask, noise, cond.tokens, cond.token_mask):
+            if x is not None:
+                torch._dynamo.maybe_mark_dynamic(x, 1)
+        return self.compiled_loss(*arguments, t=t, noise=noise, auxiliary=auxiliary)
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
         """Returns the validation losses (B,) of a batch of clips.

@@ -146,6 +146,17 @@ def test_runs_under_bf16_autocast(path: Path) -> None:
     assert error.square().mean().sqrt() < 0.05 * exact[mask].std()
 
 
+@pytest.mark.parametrize(
+    "path", [path for path in CONFIGS if "gru" not in path.stem], ids=lambda path: path.stem
+)
+def test_the_compiler_traces_a_denoiser_as_one_graph(path: Path) -> None:
+    """Each break of the graph costs calls between its parts. Torch does not trace `nn.GRU`."""
+    torch.compiler.reset()
+    denoiser, inputs = tiny(path), batch()
+    traced = torch.compile(denoiser, backend="eager", fullgraph=True)
+    assert torch.equal(traced(*inputs), denoiser(*inputs))
+
+
 def test_group_norm_without_padding_is_torchs() -> None:
     norm, x = MaskedGroupNorm(8, 4), torch.randn(2, 8, 5)
     norm.load_state_dict({"weight": torch.randn(8), "bias": torch.randn(8)})

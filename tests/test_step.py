@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning import Callback, LightningModule, Trainer
 from support.fixtures import ROOT
-from support.runs import TINY, TINY_DIP, built
+from support.runs import RECIPES, SMALL, WIDTHS, built
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -129,25 +129,6 @@ def test_only_steps_that_log_wait_for_the_device(tiny, tmp_path, monkeypatch):
     in_steps = {label for label in recorded.labels() if label is not None}
     # Steps 4 and 8 log. The last one saves the checkpoint, and everything after it counts as its.
     assert in_steps - {0} == {3, 7, 8}
-
-
-SMALL = ["data.source.clips=120", "data.batch_size=4", "trainer.accelerator=cpu"]
-WIDTHS = ["denoiser.latent_dim=16", "denoiser.ff_size=16", "denoiser.num_layers=1"]
-WIDTHS += ["denoiser.num_heads=2"]
-RECIPES = {
-    "quickstart": TINY,
-    "synthetic/flame": [*SMALL, *WIDTHS, "condition=learned"],
-    "synthetic/mdm_decoder": [*SMALL, *WIDTHS, "condition=learned"],
-    "synthetic/mdm_gru": [*SMALL, "condition=none"],
-    "synthetic/mdm_unet": [*SMALL, "condition=none"],
-    "synthetic/mfm": [*SMALL, *WIDTHS, "condition=none"],
-    "synthetic/dip": [
-        *SMALL,
-        *TINY_DIP,
-        "task=generation_targets",
-        "+denoiser.target_encoder=single",
-    ],
-}
 
 
 @pytest.mark.parametrize("recipe", RECIPES)

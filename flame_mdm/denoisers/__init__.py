@@ -46,6 +46,10 @@ class Denoiser(nn.Module, ABC):
     #: `Condition.prefix`.
     context_frames: int = 0
 
+    #: A compiled network has only one graph for all lengths that are multiples of this number of
+    #: frames.
+    frame_multiple: int = 1
+
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         """Returns the prediction (B, F, out_features).

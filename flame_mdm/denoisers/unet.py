@@ -57,6 +57,8 @@ class MDMUNet(Denoiser):
     ):
         super().__init__()
         block = partial(ResidualBlock, features=latent_dim, num_groups=num_groups, dropout=dropout)
+        # With other lengths, the upsampled frames of some levels are cropped.
+        self.frame_multiple = 2 ** (len(channels) - 1)
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
         self.input = nn.Conv1d(in_features, channels[0], 3, padding=1)
         finer = [channels[0], *channels[:-1]]

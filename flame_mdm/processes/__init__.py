@@ -125,10 +125,7 @@ class Process(nn.Module, ABC):
             Per-sample losses (B,), keyed by name: the losses returned by `terms` and `auxiliary`,
             and their sum, "loss".
         """
-        if t is None:
-            t = self.training_times(torch.rand(len(x), device=x.device))
-        if noise is None:
-            noise = torch.randn_like(x)
+        t, noise = self.drawn(x, t, noise)
         averaged = mask
         if self.average_padding:
             noise, averaged = noise * mask[..., None], torch.ones_like(mask)
@@ -138,6 +135,16 @@ class Process(nn.Module, ABC):
         if auxiliary is not None:
             terms |= auxiliary(self.to_x0(output, x_t, t), x, mask)
         return terms | {"loss": torch.stack(list(terms.values())).sum(0)}
+
+    def drawn(
+        self, x: Tensor, t: Tensor | None = None, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Returns times (B,) and noise like x (B, F, D), and draws them if they are missing."""
+        if t is None:
+            t = self.training_times(torch.rand(len(x), device=x.device))
+        if noise is None:
+            noise = torch.randn_like(x)
+        return t, noise
 
     def terms(
         self, output: Tensor, x: Tensor, noise: Tensor, x_t: Tensor, t: Tensor, mask: Tensor

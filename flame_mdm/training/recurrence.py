@@ -86,25 +86,7 @@ class Recurrence(torch.autograd.Function):
             weight: (3H, H), the matrix W.
             bias: (3H,), the vector b.
         """
-        frames, rows, _ = gates.shape
-        size = weight.shape[1]
-        # Products with a transposed view take up to 3 times as long.
-        transposed = weight.t().contiguous()
-        products = bias.expand(frames, rows, -1).clone()
-        states = gates.new_empty(frames + 1, rows, size)
-        states[0] = first
-
-        # Views of single frames are created before the loop, where they take less time.
-        g_parts = gates.split((2 * size, size), -1)
-        u_parts = products.split((2 * size, size), -1)
-        tensors = (products, *g_parts, *u_parts, states[:-1], states[1:])
-        views = zip(*(x.unbind() for x in tensors), strict=True)
-        for u, g_rz, g_n, u_rz, u_n, before, after in views:
-            u.addmm_(before, transposed)
-            r, z = torch.add(g_rz, u_rz).sigmoid_().chunk(2, -1)
-            n = torch.addcmul(g_n, r, u_n).tanh_()
-            torch.lerp(n, before, z, out=after)
-
+        states, products = gru_states(gates, first, weight, bias)
         ctx.save_for_backward(gates, weight, products, states)
         return states[1:]
 
@@ -126,20 +108,81 @@ class Recurrence(torch.autograd.Function):
         by_z = (states[:-1] - n) * z * (1 - z)
         by_u = torch.stack([by_r, by_z, by_n * r], 2)  # (F, B, 3, H)
 
-        state_gradients = torch.empty_like(states[1:])
-        u_gradients = torch.empty_like(by_u)
-        flat_gradients = u_gradients.view_as(products)
-        from_later = torch.zeros_like(states[0])
-        tensors = (gradient, z, by_u, state_gradients, u_gradients, flat_gradients)
-        views = list(zip(*(x.unbind() for x in tensors), strict=True))
-        for from_output, z_now, by_u_now, of_state, of_u, flat_of_u in reversed(views):
-            torch.add(from_output, from_later, out=of_state)
-            torch.mul(of_state[:, None], by_u_now, out=of_u)
-            from_later = torch.addmm(of_state * z_now, flat_of_u, weight)
-
+        state_gradients, u_gradients, of_first = gru_gradients(gradient, z, by_u, weight)
         gate_gradients = torch.cat(
-            [flat_gradients[..., : 2 * size], state_gradients * by_n],
+            [u_gradients[..., : 2 * size], state_gradients * by_n],
             -1,
         )
-        weight_gradient = flat_gradients.flatten(0, 1).t() @ states[:-1].flatten(0, 1)
-        return gate_gradients, from_later, weight_gradient, flat_gradients.sum((0, 1))
+        weight_gradient = u_gradients.flatten(0, 1).t() @ states[:-1].flatten(0, 1)
+        return gate_gradients, of_first, weight_gradient, u_gradients.sum((0, 1))
+
+
+# The compiler does not trace the loops over the frames, because it would unroll them.
+
+
+@torch.library.custom_op("flame_mdm::gru_states", mutates_args=())
+def gru_states(gates: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """Computes the states (F + 1, B, H), with the first one, and the products u (F, B, 3H).
+
+    The arguments are those of `Recurrence.forward`.
+    """
+    frames, rows, _ = gates.shape
+    size = weight.shape[1]
+    # Products with a transposed view take up to 3 times as long.
+    transposed = weight.t().contiguous()
+    products = bias.expand(frames, rows, -1).clone()
+    states = gates.new_empty(frames + 1, rows, size)
+    states[0] = first
+
+    # Views of single frames are created before the loop, where they take less time.
+    g_parts = gates.split((2 * size, size), -1)
+    u_parts = products.split((2 * size, size), -1)
+    tensors = (products, *g_parts, *u_parts, states[:-1], states[1:])
+    views = zip(*(x.unbind() for x in tensors), strict=True)
+    for u, g_rz, g_n, u_rz, u_n, before, after in views:
+        u.addmm_(before, transposed)
+        r, z = torch.add(g_rz, u_rz).sigmoid_().chunk(2, -1)
+        n = torch.addcmul(g_n, r, u_n).tanh_()
+        torch.lerp(n, before, z, out=after)
+    return states, products
+
+
+@gru_states.register_fake
+def _(gates: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    frames, rows, _ = gates.shape
+    return gates.new_empty(frames + 1, *first.shape), gates.new_empty(frames, rows, len(bias))
+
+
+@torch.library.custom_op("flame_mdm::gru_gradients", mutates_args=())
+def gru_gradients(
+    gradient: Tensor, z: Tensor, by_u: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Computes gradients from the last frame to the first.
+
+    Args:
+        gradient: (F, B, H), the gradient of the states as the output of the layer.
+        z: (F, B, H), the derivative of each state with respect to the previous one, without u.
+        by_u: (F, B, 3, H), the derivative of each state with respect to u.
+        weight: (3H, H), the matrix W.
+
+    Returns:
+        The gradients of the states (F, B, H), of u (F, B, 3H) and of the first state (B, H).
+    """
+    state_gradients = torch.empty_like(z, memory_format=torch.contiguous_format)
+    u_gradients = torch.empty_like(by_u, memory_format=torch.contiguous_format)
+    flat_gradients = u_gradients.flatten(2)
+    from_later = torch.zeros_like(state_gradients[0])
+    tensors = (gradient, z, by_u, state_gradients, u_gradients, flat_gradients)
+    views = list(zip(*(x.unbind() for x in tensors), strict=True))
+    for from_output, z_now, by_u_now, of_state, of_u, flat_of_u in reversed(views):
+        torch.add(from_output, from_later, out=of_state)
+        torch.mul(of_state[:, None], by_u_now, out=of_u)
+        from_later = torch.addmm(of_state * z_now, flat_of_u, weight)
+    return state_gradients, flat_gradients, from_later
+
+
+@gru_gradients.register_fake
+def _(gradient: Tensor, z: Tensor, by_u: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    frames, rows, size = z.shape
+    shapes = (frames, rows, size), (frames, rows, 3 * size), (rows, size)
+    return z.new_empty(shapes[0]), z.new_empty(shapes[1]), z.new_empty(shapes[2])

@@ -4,7 +4,6 @@ See docs/benchmarks/speed.md.
 """
 
 import math
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -16,13 +15,9 @@ from flame_mdm.denoisers.layers import Attention
 from flame_mdm.errors import say
 from flame_mdm.task import GeneratorTask, Task
 from flame_mdm.training.attention import attention
+from flame_mdm.training.compilation import COMPILED_FROM, COMPILES, compile_steps
 from flame_mdm.training.recurrence import FastGRU
 
-COMPILED_FROM = 5000
-"""Minimum number of training steps in runs that compile the network.
-
-In shorter runs, compilation would take more time than it saves.
-"""
 PAD_MULTIPLE = 32
 """Batches for a compiled network are padded to multiples of this number of frames.
 
@@ -30,6 +25,11 @@ The network is compiled once per padded length.
 """
 # Maximum number of lengths and modes for which the network is compiled. Torch's default is 8.
 MOST_SHAPES = 64
+
+# Number of 16-bit integers that `CheapDropout` computes from each drawn one
+COPIES = 8
+# Size of a floating-point number in bytes -> the integer of the same size
+INTEGERS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
 def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
@@ -41,12 +41,13 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On a CPU, training uses `CheapDropout`, `attention` (which does not drop attention weights),
     `FastGRU` and, if the CPU has instructions for bfloat16 products, bfloat16. Networks with an
     `nn.GRU` that `FastGRU` does not replace are trained in float32, because `nn.GRU` takes longer
-    in bfloat16 on a CPU. The denoiser is not compiled: on a CPU, compilation takes minutes and
-    does not make the steps faster.
+    in bfloat16 on a CPU. If there is a C++ compiler, runs of at least `COMPILED_FROM` steps in
+    bfloat16 compile the training steps of the denoiser, once for all lengths of motions.
 
     If the recipe sets a precision other than 32-true, this precision is kept.
     """
     trainer, supported = config["trainer"], False
+    is_long = trainer["max_steps"] >= COMPILED_FROM
     device = trainer["accelerator"]
     if device in ("auto", "gpu"):
         device = (
@@ -58,11 +59,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
         )
     if device == "cuda":
         supported = torch.cuda.is_bf16_supported(including_emulation=False)
-        if isinstance(task, GeneratorTask) and trainer["max_steps"] >= COMPILED_FROM:
-            say(
-                "compiling the network: the first steps take longer. In later runs, compilation "
-                "takes less time"
-            )
+        if isinstance(task, GeneratorTask) and is_long:
+            say(COMPILES)
             denoiser = task.generator.denoiser
             # Networks that do not mask padding would learn from it.
             if denoiser.mask_padding:
@@ -74,6 +72,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
         _simplify(task)
         recurs = any(isinstance(module, nn.GRU) for module in task.modules())
         supported = (has.get("avx512_bf16") or has.get("amx_bf16")) and not recurs
+        if isinstance(task, GeneratorTask) and is_long and supported:
+            compile_steps(task, data)
     return "bf16-mixed" if supported and trainer["precision"] == "32-true" else trainer["precision"]
 
 
@@ -101,36 +101,53 @@ class CheapDropout(nn.Module):
     hashing, Carter and Wegman 1979).
     """
 
-    # Number of 16-bit integers that are computed from each drawn one
-    COPIES = 8
-    # Size of a floating-point number in bytes -> the integer of the same size
-    INTEGERS: ClassVar = {2: torch.int16, 4: torch.int32, 8: torch.int64}
-
     def __init__(self, p: float):
         super().__init__()
         self.p = p
-        self.threshold = round((1 - p) * 2**15) - 2**14
 
     def forward(self, x: Tensor) -> Tensor:
         """Drops some elements of `x` and scales the others. Returns `x` in evaluation mode."""
         if not self.training or self.p == 0:
             return x
-        numbers = self._random_integers(x.numel()).view(x.shape)
+        return x * dropout_factors(x.detach(), self.p)
 
-        # Torch compares 16-bit integers and converts booleans without vector instructions. Integer
-        # arithmetic is faster: the sign of the difference becomes all bits of a kept element, and
-        # these bits select the bits of the factor.
-        numbers.bitwise_right_shift_(1)
-        kept = numbers.sub_(self.threshold).bitwise_right_shift_(15)
-        integer = self.INTEGERS[x.element_size()]
-        factor = torch.tensor(1 / (1 - self.p), dtype=x.dtype).view(integer)
-        return x * kept.to(integer).bitwise_and_(factor).view(x.dtype)
 
-    def _random_integers(self, count: int) -> Tensor:
-        """Returns random 16-bit integers (count,)."""
-        words = torch.empty(math.ceil(count / (4 * self.COPIES)), dtype=torch.int64)
-        words.random_(-(2**63), None)
-        shape = (2, self.COPIES, 1)
-        factors, offsets = torch.randint(-(2**15), 2**15, shape, dtype=torch.int16)
-        numbers = words.view(torch.int16) * (2 * factors + 1) + offsets
-        return numbers.flatten()[:count]
+@torch.library.custom_op(
+    "flame_mdm::dropout_factors",
+    mutates_args=(),
+    tags=(torch.Tag.nondeterministic_seeded,),
+)
+def dropout_factors(x: Tensor, p: float) -> Tensor:
+    """Draws a factor for each element of `x`: 0 with probability `p`, otherwise 1 / (1 - p).
+
+    The compiler does not trace this function. Compiled networks therefore draw the same numbers.
+    """
+    numbers = _random_integers(x.numel()).view(x.shape)
+    # Torch compares 16-bit integers and converts booleans without vector instructions. Integer
+    # arithmetic is faster: the sign of the difference becomes all bits of a kept element, and
+    # these bits select the bits of the factor.
+    numbers.bitwise_right_shift_(1)
+    kept = numbers.sub_(_threshold(p)).bitwise_right_shift_(15)
+    integer = INTEGERS[x.element_size()]
+    factor = torch.tensor(1 / (1 - p), dtype=x.dtype).view(integer)
+    return kept.to(integer).bitwise_and_(factor).view(x.dtype)
+
+
+@dropout_factors.register_fake
+def _(x: Tensor, p: float) -> Tensor:
+    return torch.empty(x.shape, dtype=x.dtype)
+
+
+def _threshold(p: float) -> int:
+    """Returns the number below which random 15-bit integers, from -2^14 on, keep an element."""
+    return round((1 - p) * 2**15) - 2**14
+
+
+def _random_integers(count: int) -> Tensor:
+    """Returns random 16-bit integers (count,)."""
+    words = torch.empty(math.ceil(count / (4 * COPIES)), dtype=torch.int64)
+    words.random_(-(2**63), None)
+    shape = (2, COPIES, 1)
+    factors, offsets = torch.randint(-(2**15), 2**15, shape, dtype=torch.int16)
+    numbers = words.view(torch.int16) * (2 * factors + 1) + offsets
+    return numbers.flatten()[:count]

@@ -79,6 +79,25 @@ TINY_DIP = [
 TINY_DIP += ["condition.features=16", "process.num_train_timesteps=4", "task.num_inference_steps=4"]
 """Overrides of the smallest model of `synthetic/dip`."""
 
+SMALL = ["data.source.clips=120", "data.batch_size=4", "trainer.accelerator=cpu"]
+WIDTHS = ["denoiser.latent_dim=16", "denoiser.ff_size=16", "denoiser.num_layers=1"]
+WIDTHS += ["denoiser.num_heads=2"]
+RECIPES = {
+    "quickstart": TINY,
+    "synthetic/flame": [*SMALL, *WIDTHS, "condition=learned"],
+    "synthetic/mdm_decoder": [*SMALL, *WIDTHS, "condition=learned"],
+    "synthetic/mdm_gru": [*SMALL, "condition=none"],
+    "synthetic/mdm_unet": [*SMALL, "condition=none"],
+    "synthetic/mfm": [*SMALL, *WIDTHS, "condition=none"],
+    "synthetic/dip": [
+        *SMALL,
+        *TINY_DIP,
+        "task=generation_targets",
+        "+denoiser.target_encoder=single",
+    ],
+}
+"""One recipe of each kind of model -> overrides of its smallest model."""
+
 TWO = ["trainer.devices=2", "trainer.strategy=ddp"]
 
 ALARM = """

@@ -20,7 +20,7 @@ from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.recomputation import recompute_activations
-from flame_mdm.errors import UserError, renamed_names
+from flame_mdm.errors import UserError, renamed_names, say
 from flame_mdm.generator import Model, MotionGenerator, Parts, sampling_defaults
 from flame_mdm.losses import MotionLosses
 from flame_mdm.representations import Representation
@@ -392,7 +392,13 @@ class GeneratorTask(Task):
         for x in (batch.x, batch.mask, noise, cond.tokens, cond.token_mask):
             if x is not None:
                 torch._dynamo.maybe_mark_dynamic(x, 1)
-        return self.compiled_loss(*arguments, t=t, noise=noise, auxiliary=auxiliary)
+        try:
+            return self.compiled_loss(*arguments, t=t, noise=noise, auxiliary=auxiliary)
+        except torch._dynamo.exc.TorchDynamoException as error:  # type: ignore[attr-defined]
+            reason = " ".join(str(error).strip().splitlines()[:2])
+            say(f"training without compilation, which takes longer: the compiler failed ({reason})")
+            self.compiles_steps = False
+        return process.loss(*arguments, t=t, noise=noise, auxiliary=auxiliary)
 
     def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
         """Returns the validation losses (B,) of a batch of clips.

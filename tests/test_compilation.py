@@ -23,6 +23,7 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.task import GeneratorTask
 from flame_mdm.training import compilation, speed
 from flame_mdm.training.compilation import FastConvolution, FastReLU
+from flame_mdm.training.distillation import DistillationTask
 from flame_mdm.training.recurrence import gru_gradients, gru_states
 from flame_mdm.training.speed import dropout_factors
 
@@ -38,8 +39,7 @@ def _settings_of_the_compiler(monkeypatch):
     """A CPU that multiplies in bfloat16, and a compiler that has not compiled anything yet."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": True})
     torch.compiler.reset()
-    with torch._dynamo.config.patch(suppress_errors=False):
-        yield
+    yield
     torch.compiler.reset()
 
 
@@ -47,7 +47,6 @@ def accelerated(words: list[str], recipe: str) -> tuple[MotionDataModule, Genera
     """Returns the data and the task of a recipe, after `speed=fast` has prepared them."""
     config, data, task = built(words, recipe)
     assert speed.accelerate(task, data, config) == "bf16-mixed"
-    torch._dynamo.config.suppress_errors = False
     return data, task
 
 
@@ -90,12 +89,7 @@ def test_steps_are_not_compiled_without_a_compiler(
 
 def test_a_task_with_a_loss_of_its_own_is_not_compiled(monkeypatch, capsys):
     monkeypatch.setattr(compilation, "missing_tool", lambda: None)
-
-    class Other(GeneratorTask):
-        def loss_terms(self, *_: Any, **__: Any) -> dict[str, Tensor]:
-            raise NotImplementedError
-
-    task: Any = object.__new__(Other)
+    task: Any = object.__new__(DistillationTask)
     nn.Module.__init__(task)
     task.checkpoints_activations, task.compiles_steps = False, False
     compilation.compile_steps(task, SimpleNamespace())  # type: ignore[arg-type]
@@ -140,6 +134,24 @@ def test_only_training_steps_are_compiled(data_root, monkeypatch):
     assert graphs.frame_count == 0
     task.train().training_step(batch, 0)
     assert graphs.frame_count == 1
+
+
+def test_training_goes_on_if_the_compiler_fails(data_root, monkeypatch, capsys):
+    monkeypatch.setattr(compilation, "missing_tool", lambda: None)
+
+    def backend(*_: Any) -> Any:
+        raise RuntimeError("no space left")
+
+    monkeypatch.setattr("flame_mdm.task.torch.compile", partial(torch.compile, backend=backend))
+    words = [*RECIPES["quickstart"], f"data_root={data_root}", LONG]
+    data, task = accelerated(words, "quickstart")
+    batch = next(iter(data.train_dataloader()))
+    losses = [task.train().training_step(batch, 0) for _ in range(2)]
+    output = capsys.readouterr().out
+    assert output.count("the compiler failed") == 1
+    assert "no space left" in output
+    assert not task.compiles_steps
+    assert torch.equal(*losses)
 
 
 @needs_compiler

@@ -40,8 +40,6 @@ def compile_steps(task: GeneratorTask, data: MotionDataModule) -> None:
         return
 
     say(COMPILES)
-    # If a part of a step cannot be compiled, it is computed without compilation.
-    torch._dynamo.config.suppress_errors = True
     # The compiler looks at the gradients of all inputs, such as encoded captions.
     warnings.filterwarnings("ignore", "The .grad attribute of a Tensor that is not a leaf")
     denoiser = task.generator.denoiser

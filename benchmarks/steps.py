@@ -222,7 +222,7 @@ def backbones(
     Args:
         recipes: name of each network -> its recipe, followed by changes of the recipe.
         lengths: (rows,), the length of each clip in the batch.
-        rounds: number of rounds in which the two speeds take turns.
+        rounds: number of rounds in which the steps take turns.
         device: the device.
         compiles: whether to also time the compiled steps of `speed=fast`.
     """

@@ -42,7 +42,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     `FastGRU` and, if the CPU has instructions for bfloat16 products, bfloat16. Networks with an
     `nn.GRU` that `FastGRU` does not replace are trained in float32, because `nn.GRU` takes longer
     in bfloat16 on a CPU. If there is a C++ compiler, runs of at least `COMPILED_FROM` steps in
-    bfloat16 compile the training steps of the denoiser, once for all lengths of motions.
+    bfloat16 compile the denoiser and its losses, once for all lengths of motions.
 
     If the recipe sets a precision other than 32-true, this precision is kept.
     """
